@@ -1,0 +1,1 @@
+"""The farm: what is learned, and how learner and workers speak."""

@@ -1,0 +1,32 @@
+"""What can go wrong, as a tree.
+
+    FarmError                 anything we can say in one line
+      ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
+      MessageError            bytes from the network that are not what they should be
+      CheckpointError         a run folder that cannot be continued
+      RunError                a run that cannot go on (exit status 1)
+"""
+
+
+class FarmError(Exception):
+    """One clear line: what was wrong, what was expected, what to do."""
+
+
+class ConfigError(FarmError):
+    """A setting that makes no sense."""
+
+
+class MessageError(FarmError):
+    """A message that is malformed, oversized, or of another version."""
+
+    def __init__(self, text: str, kind: str = "bad") -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+class CheckpointError(ConfigError):
+    """A run folder that cannot be continued or read."""
+
+
+class RunError(FarmError):
+    """A run that cannot go on; what was learnt so far is saved."""

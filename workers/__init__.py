@@ -1,0 +1,1 @@
+"""Who simulates: a worker joins the farm, takes pairs, runs them, answers."""
