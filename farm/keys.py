@@ -1,0 +1,68 @@
+"""The key space of a farm, in one place. Pure.
+
+    <farm>/live/worker/<worker>        liveliness token of a worker, <worker> = <name>/<instance>
+    <farm>/live/learner/<run>          liveliness token of a learner
+    <farm>/want/<worker>               a worker's credits
+    <farm>/pairs/<worker>              a worker's inbox: chunks of jobs
+    <farm>/run/<run>/spec              queryable: what is simulated
+    <farm>/run/<run>/generation        published and queryable: the round that is on
+    <farm>/run/<run>/result/<worker>   results
+"""
+
+import re
+from typing import Final
+
+from farm.errors import ConfigError
+
+_NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,100}")
+
+
+def checked(kind: str, name: str) -> str:
+    """The name, if it can be one part of a key.
+
+    Raises:
+      ConfigError: it has other characters than letters, digits, `_`, `.` and `-`.
+    """
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"{kind} {name!r} is not a name; expected 1 to 100 letters, digits, '_', '.' or '-'")
+    return name
+
+
+def worker_token(farm: str, worker: str) -> str:
+    """Liveliness of a worker; `**` for all."""
+    return f"{farm}/live/worker/{worker}"
+
+
+def learner_token(farm: str, run: str) -> str:
+    """Liveliness of a run's learner; `*` for all."""
+    return f"{farm}/live/learner/{run}"
+
+
+def want(farm: str, worker: str) -> str:
+    """Where a worker says how much it wants; `**` for all."""
+    return f"{farm}/want/{worker}"
+
+
+def inbox(farm: str, worker: str) -> str:
+    """Where jobs for a worker are published."""
+    return f"{farm}/pairs/{worker}"
+
+
+def spec(farm: str, run: str) -> str:
+    """Where a run's specification is answered."""
+    return f"{farm}/run/{run}/spec"
+
+
+def generation(farm: str, run: str) -> str:
+    """Where the round that is on is published and answered; run `*` for all."""
+    return f"{farm}/run/{run}/generation"
+
+
+def result(farm: str, run: str, worker: str) -> str:
+    """Where results of a run are published; worker `**` for all."""
+    return f"{farm}/run/{run}/result/{worker}"
+
+
+def tail(key: str, prefix: str) -> str:
+    """What follows the prefix in a key: `tail(key, worker_token(farm, ""))` is the worker."""
+    return key.removeprefix(prefix)

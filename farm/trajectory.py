@@ -1,0 +1,32 @@
+"""One rollout as it is shown: where everything was and what was felt, frame by frame. Pure."""
+
+from dataclasses import dataclass
+
+from farm.arrays import FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """A rollout at control rate or at physics rate; frame 0 is the moment of release.
+
+    F frames, B drawn bodies (in the order of `Scene.bodies`); a rollout that ended early has fewer frames.
+    """
+
+    times: FloatArray
+    """Since the release [s], (F,)"""
+    bodies: FloatArray
+    """Position [m] and quaternion wxyz of each drawn body in the world, (F, B, 7)"""
+    joints: FloatArray
+    """Joint positions [rad], (F, 8)"""
+    targets: FloatArray
+    """Joint targets that led there [rad], (F, 8)"""
+    images: FloatArray
+    """Taxels [N], (F, 3, 18)"""
+    points: FloatArray
+    """Contact points in each fingertip's frame [fingertip radii], (F, 3, 3)"""
+    terms: FloatArray
+    """Reward terms of the control step that led there, (F, 5); zero at the release"""
+    value: float
+    """The rollout's return"""
+    success: bool
+    """Whether the gait succeeded"""

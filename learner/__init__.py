@@ -1,0 +1,1 @@
+"""Who learns and shows: asks an algorithm, keeps the books, records."""

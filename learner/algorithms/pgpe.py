@@ -1,0 +1,251 @@
+"""PGPE, policy gradients with parameter-based exploration, as ask and tell on a frozen state.
+
+Rollouts of theta = mu + eps and mu - eps are compared, and mu and sigma follow the better one
+(Sehnke 2010; Plage 2016, algorithm 1). The defaults are the paper's rule as the thesis states it;
+ranks with ClipUp (Toklu 2020) or Adam are the modern one. Shapes: P parameters, N pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args, get_type_hints
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from learner.algorithms.checks import check_count, check_number, finite_rows
+from learner.algorithms.gradients import (
+    Normaliser,
+    baseline_contrast,
+    centred_ranks,
+    level,
+    middle_returns,
+    optimal_baseline,
+    pair_contrast,
+    plain_contrast,
+    sigma_characteristic,
+    weighted_sum,
+)
+from learner.algorithms.optimisers import SigmaRule, adam, clipup, step_sigma
+from learner.algorithms.pgpe_state import Diverged, PGPEState, StateValue
+
+__all__ = ["PGPE", "Diverged", "PGPEState"]
+
+# The authors' code: b = 0.9 b + 0.1 mean return.
+_BASELINE_MEMORY = 0.9
+
+_TINY, _BELOW_ONE = math.ulp(0.0), math.nextafter(1.0, 0.0)
+_RANGES = (
+    ("learning_rate_mu", (0.0, math.inf), "0 or more"),
+    ("learning_rate_sigma", (0.0, math.inf), "0 or more"),
+    ("momentum", (0.0, _BELOW_ONE), "0 or more and below 1"),
+    ("second_moment_decay", (0.0, _BELOW_ONE), "0 or more and below 1"),
+    ("max_speed", (_TINY, math.inf), "above 0"),
+    ("initial_mu", (-math.inf, math.inf), "of any sign"),
+    ("initial_sigma", (_TINY, math.inf), "above 0"),
+    ("sigma_floor", (_TINY, math.inf), "above 0"),
+    ("sigma_cap", (_TINY, 1.0), "above 0 and at most 1"),
+)
+_CHOICES = ("estimator", "normaliser", "baseline", "sigma_rule", "shaping", "optimiser")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PGPE:
+    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+
+    pairs: int = 15
+    """Pairs of rollouts a generation, N: 2N rollouts with either estimator."""
+    estimator: Literal["symmetric", "plain"] = "symmetric"
+    """Pairs mu + eps and mu - eps, or 2N single rollouts mu + eps (Plage 2016, eq. 3.1)."""
+    normaliser: Normaliser = "sehnke"
+    """Scale of raw returns: by the distance to the best return, or as the thesis prints it."""
+    baseline: Literal["moving-average", "optimal", "none"] = "moving-average"
+    """Return that counts as neither good nor bad: 0.9 b + 0.1 mean, least variance, or 0."""
+    sigma_rule: SigmaRule = "positive"
+    """Sigma learns from better than the baseline only, from both but capped, or from both."""
+    shaping: Literal["raw", "ranks"] = "raw"
+    """Returns as they are and sums over the pairs, or centred ranks and means over the pairs."""
+    optimiser: Literal["sgd", "clipup", "adam"] = "sgd"
+    """How mu follows its gradient; sigma always takes a plain step."""
+    learning_rate_mu: float = 0.1
+    """Step size of mu, alpha_mu."""
+    learning_rate_sigma: float = 0.2
+    """Step size of sigma, alpha_sigma."""
+    momentum: float = 0.9
+    """Part of the last step that is kept, of ClipUp and Adam (its first decay)."""
+    second_moment_decay: float = 0.999
+    """Part of the mean squared gradient that Adam keeps."""
+    max_speed: float = 0.2
+    """Longest step of mu with ClipUp, a Euclidean norm in units of the parameters."""
+    initial_mu: float = 1.0
+    """First mean of every parameter."""
+    initial_sigma: float = 2.0
+    """First standard deviation of every parameter."""
+    sigma_floor: float = 1e-3
+    """Least standard deviation, in units of the parameters."""
+    sigma_cap: float = 0.2
+    """Largest relative change of a sigma in one generation, of the capped rule."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        check_count("pairs", self.pairs)
+        hints = get_type_hints(type(self))
+        for name in _CHOICES:
+            value, known = getattr(self, name), get_args(hints[name])
+            if value not in known:
+                raise ValueError(f"{name} is {value!r}, expected one of {', '.join(known)}")
+        for name, bounds, expected in _RANGES:
+            check_number(name, getattr(self, name), bounds, expected)
+        if self.initial_sigma < self.sigma_floor:
+            raise ValueError(
+                f"initial_sigma is {self.initial_sigma}, expected sigma_floor "
+                f"({self.sigma_floor}) or more"
+            )
+
+    @property
+    def returns_shape(self) -> tuple[int, int]:
+        """Shape of the returns of a generation: (N, 2), columns (+, -), or (2N, 1)."""
+        return (self.pairs, 2) if self.estimator == "symmetric" else (2 * self.pairs, 1)
+
+    def init(self, size: int) -> PGPEState:
+        """Return the state before the first generation, of `size` parameters."""
+        check_count("size", size)
+        memory = dict.fromkeys(self._memory(), np.zeros(size))
+        mu, sigma = np.full(size, float(self.initial_mu)), np.full(size, float(self.initial_sigma))
+        return PGPEState(mu=mu, sigma=sigma, baseline=None, best=None, generation=0, **memory)
+
+    def restore(self, values: Mapping[str, StateValue]) -> PGPEState:
+        """Return the state that `to_dict` told, checked against this configuration."""
+        state = PGPEState.from_dict(values)
+        self._check_memory(state)
+        return state
+
+    def ask(self, state: PGPEState, rng: np.random.Generator) -> FloatArray:
+        """Draw eps ~ N(0, diag(sigma^2)): (N, P) for pairs, (2N, P) for single rollouts.
+
+        The thesis prints eps ~ N(mu, I sigma^2), and theta- = mu eps without its minus; around mu
+        it has to be N(0, .), with theta+ = mu + eps and theta- = mu - eps.
+        """
+        return state.sigma * rng.standard_normal((self.returns_shape[0], state.mu.size))
+
+    def tell(self, state: PGPEState, eps: FloatArray, returns: FloatArray) -> PGPEState:
+        """Return the state after one update; the given one stays as it is.
+
+        Args:
+            state: the state `eps` was drawn from.
+            eps: what `ask` gave, (N, P) or (2N, P).
+            returns: `returns_shape`, row n belongs to eps[n]; all finite.
+
+        Raises:
+            ValueError: a shape is wrong, or a value not finite.
+            Diverged: the update would not be finite.
+        """
+        self._check_memory(state)
+        rows, columns = self.returns_shape
+        eps = finite_rows("eps", eps, (rows, state.mu.size))
+        returns = finite_rows("returns", returns, (rows, columns))
+        best = float(returns.max()) if state.best is None else max(state.best, float(returns.max()))
+        with np.errstate(all="ignore"):
+            to_mu, to_sigma, baseline = self._factors(state, eps, returns, best)
+            # The thesis prints mu + alpha S r_T; it has to be T r_T with T_ij = eps_i^j.
+            gradient_mu = weighted_sum(to_mu, eps)
+            gradient_sigma = weighted_sum(to_sigma, sigma_characteristic(eps, state.sigma))
+            if self.shaping == "ranks":  # a mean; the paper's rule does not divide by N
+                gradient_mu, gradient_sigma = gradient_mu / rows, gradient_sigma / rows
+            moved = self._moved(state, gradient_mu, gradient_sigma)
+        for value in (gradient_mu, gradient_sigma, *moved.values(), baseline or 0.0):
+            if not np.isfinite(value).all():
+                raise Diverged(f"the update after generation {state.generation} is not finite")
+        generation = state.generation + 1
+        return PGPEState(**moved, baseline=baseline, best=best, generation=generation)
+
+    def _factors(
+        self, state: PGPEState, eps: FloatArray, returns: FloatArray, best: float
+    ) -> tuple[FloatArray, FloatArray, float | None]:
+        """Return what each row counts for mu and for sigma, (R,) each, and the next baseline."""
+        if self.shaping == "ranks":
+            ranks = centred_ranks(returns)
+            to_sigma, baseline = middle_returns(ranks), None
+            single = returns.shape[1] == 1
+            to_mu = to_sigma if single else (ranks[:, 0] - ranks[:, 1]) / 2.0
+        else:
+            to_mu, to_sigma, baseline = self._raw_factors(state, eps, returns, best)
+        if self.sigma_rule == "positive":
+            to_sigma = np.maximum(to_sigma, 0.0)
+        return to_mu, to_sigma, baseline
+
+    def _raw_factors(
+        self, state: PGPEState, eps: FloatArray, returns: FloatArray, best: float
+    ) -> tuple[FloatArray, FloatArray, float | None]:
+        middle = middle_returns(returns)
+        used, following = self._baselines(state, eps, middle)
+        to_sigma = baseline_contrast(middle, used, best)
+        if self.estimator == "symmetric":
+            to_mu = pair_contrast(returns, best, self.normaliser)
+        elif self.normaliser == "sehnke":
+            to_mu = to_sigma
+        else:
+            to_mu = plain_contrast(middle, used)
+            to_sigma = np.zeros_like(to_mu) if level(best, used) else to_mu
+        if self.baseline == "moving-average" and state.baseline is None:
+            to_sigma = np.zeros_like(to_sigma)  # the first generation only sets the baseline
+        return to_mu, to_sigma, following
+
+    def _baselines(
+        self, state: PGPEState, eps: FloatArray, middle: FloatArray
+    ) -> tuple[float, float | None]:
+        """Return the baseline of this update and the one to remember."""
+        if self.baseline == "none":
+            return 0.0, None
+        if self.baseline == "optimal":
+            best_fit = optimal_baseline(middle, eps, state.sigma)
+            return best_fit, best_fit
+        mean = float(middle.mean())
+        if state.baseline is None:
+            return mean, mean
+        return state.baseline, _BASELINE_MEMORY * state.baseline + (1.0 - _BASELINE_MEMORY) * mean
+
+    def _moved(
+        self, state: PGPEState, gradient_mu: FloatArray, gradient_sigma: FloatArray
+    ) -> dict[str, FloatArray]:
+        """Return the arrays of the next state, by name."""
+        step = self.learning_rate_sigma * gradient_sigma
+        sigma = step_sigma(
+            state.sigma, step, self.sigma_rule, cap=self.sigma_cap, floor=self.sigma_floor
+        )
+        rate = self.learning_rate_mu
+        if self.optimiser == "sgd":
+            return {"mu": state.mu + rate * gradient_mu, "sigma": sigma}
+        if self.optimiser == "clipup":
+            velocity = clipup(
+                gradient_mu,
+                state.velocity,
+                learning_rate=rate,
+                momentum=self.momentum,
+                max_speed=self.max_speed,
+            )
+            return {"mu": state.mu + velocity, "sigma": sigma, "velocity": velocity}
+        step, first, second = adam(
+            gradient_mu,
+            (state.first_moment, state.second_moment),
+            count=state.generation + 1,
+            learning_rate=rate,
+            decays=(self.momentum, self.second_moment_decay),
+        )
+        mu = state.mu + step
+        return {"mu": mu, "sigma": sigma, "first_moment": first, "second_moment": second}
+
+    def _memory(self) -> tuple[str, ...]:
+        """Name the state's arrays that this optimiser keeps."""
+        kept = {"sgd": (), "clipup": ("velocity",), "adam": ("first_moment", "second_moment")}
+        return kept[self.optimiser]
+
+    def _check_memory(self, state: PGPEState) -> None:
+        for name in ("velocity", "first_moment", "second_moment"):
+            wanted = state.mu.size if name in self._memory() else 0
+            if (found := getattr(state, name).size) != wanted:
+                raise ValueError(
+                    f"state: {name} has {found} entries, expected {wanted} with {self.optimiser}"
+                )

@@ -1,0 +1,117 @@
+"""What PGPE remembers between two generations: frozen, checked, told to a checkpoint as a dict.
+
+Shapes: P is the number of parameters. Every array is float64 and read-only, so a state that was
+handed to the algorithm, the recorder or a checkpoint is the same afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import TypeAlias
+
+import numpy as np
+
+from farm.arrays import FloatArray
+
+StateValue: TypeAlias = FloatArray | float | int | None
+
+ARRAYS = ("mu", "sigma", "velocity", "first_moment", "second_moment")
+
+
+class Diverged(ArithmeticError):  # noqa: N818  it says what happened
+    """An update would have made the state non-finite; the state before it is untouched."""
+
+
+def _empty() -> FloatArray:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PGPEState:
+    """The search distribution N(mu, diag(sigma^2)) and the running figures around it."""
+
+    mu: FloatArray
+    """Mean of the search distribution, (P,)."""
+    sigma: FloatArray
+    """Standard deviation of each parameter, (P,), positive."""
+    baseline: float | None = None
+    """Return that counts as neither good nor bad; None until a generation set it."""
+    best: float | None = None
+    """Best return so far over the whole run (m); None before the first generation."""
+    generation: int = 0
+    """Number of updates done."""
+    velocity: FloatArray = field(default_factory=_empty)
+    """ClipUp's velocity, (P,), or empty where it is not used."""
+    first_moment: FloatArray = field(default_factory=_empty)
+    """Adam's running mean of the gradient, (P,), or empty."""
+    second_moment: FloatArray = field(default_factory=_empty)
+    """Adam's running mean of the squared gradient, (P,), or empty."""
+
+    def __post_init__(self) -> None:
+        """Copy the arrays, make them read-only, and check every value."""
+        for name in ARRAYS:
+            object.__setattr__(self, name, _read_only(name, getattr(self, name)))
+        self._check_sizes()
+        if not (self.sigma > 0.0).all():
+            raise ValueError(
+                f"state: sigma must be positive everywhere, its least is {self.sigma.min()}"
+            )
+        for name in ("baseline", "best"):
+            object.__setattr__(self, name, _scalar(name, getattr(self, name)))
+        count = self.generation
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
+            raise ValueError(f"state: generation must be an integer of 0 or more, not {count!r}")
+        object.__setattr__(self, "generation", int(count))
+
+    def _check_sizes(self) -> None:
+        size = self.mu.size
+        if size == 0:
+            raise ValueError("state: mu must have one parameter or more, it is empty")
+        if self.sigma.size != size:
+            raise ValueError(f"state: sigma must have mu's size {size}, not {self.sigma.size}")
+        for name in ARRAYS[2:]:
+            if (found := getattr(self, name).size) not in (0, size):
+                raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {found}")
+
+    def to_dict(self) -> dict[str, StateValue]:
+        """Give every field by its name, for a checkpoint; `from_dict` takes it back bit by bit."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, StateValue]) -> PGPEState:
+        """Build the state that `to_dict` told.
+
+        Raises:
+            ValueError: a key is missing or unknown, or its value has a wrong type, shape or range;
+                the message names the key.
+        """
+        known = {each.name for each in fields(cls)}
+        if missing := sorted(known - set(values)):
+            raise ValueError(f"state: missing {', '.join(missing)}")
+        if unknown := sorted(set(values) - known):
+            raise ValueError(
+                f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(known))}"
+            )
+        return cls(**dict(values))  # type: ignore[arg-type]  # __post_init__ checks every type
+
+
+def _read_only(name: str, value: object) -> FloatArray:
+    """Return an own, read-only copy of a finite float64 vector."""
+    if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.ndim != 1:
+        found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else repr(value)
+        raise ValueError(f"state: {name} must be a float64 vector, not {found}")
+    if not np.isfinite(value).all():
+        raise ValueError(f"state: {name} must be finite everywhere")
+    copy = np.array(value, dtype=np.float64, order="C")
+    copy.setflags(write=False)
+    return copy
+
+
+def _scalar(name: str, value: object) -> float | None:
+    """Return a finite Python float, or None as it is."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, float | int) or not np.isfinite(value):
+        raise ValueError(f"state: {name} must be a finite number or None, not {value!r}")
+    return float(value)

@@ -1,0 +1,153 @@
+"""The books of one round: where each job is and what each worker holds, without any policy.
+
+A job that is not done is in exactly one place: pending, out, full or failed. `Ledger` decides
+what moves; here it moves. Times are seconds of the ledger's clock.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Container
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Worker:
+    """What we believe about a worker."""
+
+    credits: int
+    """Jobs it is willing to hold at once."""
+    held: dict[int, float] = field(default_factory=dict[int, float])
+    """Job and when it was sent [s]; done or given-up jobs stay until the worker speaks of them."""
+    answered: float = -math.inf
+    """When it last spoke of its work [s]."""
+
+
+@dataclass
+class Job:
+    """A job that is not done."""
+
+    holders: list[str] = field(default_factory=list[str])
+    """Workers that are expected to answer, in the order of issue."""
+    errors: dict[str, int] = field(default_factory=dict[str, int])
+    """Error answers by worker."""
+
+
+class Books:
+    """Jobs, workers, and the queues the jobs are in."""
+
+    def __init__(self, copies: int) -> None:
+        self.copies = copies
+        self.workers: dict[str, Worker] = {}
+        self.begin(0)
+
+    def begin(self, jobs: int) -> None:
+        """Forget every job; 0..jobs-1 are pending, and no worker holds anything."""
+        self.size = jobs
+        self.open = {index: Job() for index in range(jobs)}  # not done
+        self._pending = list(range(jobs))  # a heap; jobs done meanwhile leave it at the top
+        # Job and since when [s]; oldest first, as the clock is monotonic.
+        self.out: dict[int, float] = {}  # may have one more copy
+        self.full: dict[int, float] = {}  # all copies are out
+        self.failed: dict[int, float] = {}  # nobody holds it after an error
+        for worker in self.workers.values():
+            worker.held.clear()
+
+    def any_pending(self) -> bool:
+        """Say whether there is a job to take."""
+        while self._pending and self._pending[0] not in self.open:
+            heapq.heappop(self._pending)
+        return bool(self._pending)
+
+    def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
+        """Give a worker up to `count` pending jobs, lowest index first."""
+        taken: list[int] = []
+        while len(taken) < count and self.any_pending():
+            taken.append(heapq.heappop(self._pending))
+            self.give(taken[-1], worker, now)
+        return tuple(taken)
+
+    def give(self, index: int, worker: str, now: float) -> None:
+        """Give a worker a job that is in no queue, or out elsewhere as well."""
+        self._unqueue(index)
+        holders = self.open[index].holders
+        if len(holders) >= self.copies:  # given up at the oldest, which keeps it as held
+            del holders[0]
+        holders.append(worker)
+        self.workers[worker].held[index] = now
+        queue = self.full if len(holders) >= self.copies else self.out
+        queue[index] = now
+
+    def finish(self, worker: str, index: int) -> bool:
+        """Note a result; return whether the job was not done before."""
+        if worker in self.workers:
+            self.workers[worker].held.pop(index, None)
+        self._unqueue(index)
+        return self.open.pop(index, None) is not None
+
+    def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
+        """Note an error; return whether it counts, and whether nobody holds the job any more."""
+        known, job = self.workers.get(worker), self.open.get(index)
+        held = known is not None and known.held.pop(index, None) is not None
+        if job is None or (not held and worker in job.errors):
+            return False, False  # done meanwhile, or a doubled message
+        job.errors[worker] = job.errors.get(worker, 0) + 1
+        if not self._leave(worker, index, now):
+            return True, False
+        self.failed[index] = now
+        return True, True
+
+    def release(self, worker: str, now: float) -> int:
+        """Take everything off a worker that will not answer; return how many are pending again."""
+        count = 0
+        for index in self.workers[worker].held:
+            if index in self.open and self._leave(worker, index, now):
+                heapq.heappush(self._pending, index)
+                count += 1
+        self.workers[worker].held.clear()
+        return count
+
+    def free(self, most: int) -> list[tuple[int, str]]:
+        """Return a heap of (jobs held, worker) over the workers that may hold one more."""
+        free = [
+            (len(known.held), name)
+            for name, known in self.workers.items()
+            if len(known.held) < min(known.credits, most)
+        ]
+        heapq.heapify(free)
+        return free
+
+    def pick(
+        self, index: int, free: list[tuple[int, str]], avoided: Container[str], most: int
+    ) -> str | None:
+        """Take from the heap the worker with the fewest jobs that may have this one, if any."""
+        passed: list[tuple[int, str]] = []
+        picked = None
+        while free and picked is None:
+            held, name = heapq.heappop(free)
+            if name in avoided or index in self.workers[name].held:
+                passed.append((held, name))
+                continue
+            picked = name
+            if held + 1 < min(self.workers[name].credits, most):
+                passed.append((held + 1, name))
+        for entry in passed:
+            heapq.heappush(free, entry)
+        return picked
+
+    def _leave(self, worker: str, index: int, now: float) -> bool:
+        """Strike a holder off; return whether it was the last one, the job then in no queue."""
+        holders = self.open[index].holders
+        if worker not in holders:
+            return False
+        holders.remove(worker)
+        if not holders:
+            self._unqueue(index)
+        elif self.full.pop(index, None) is not None:
+            self.out[index] = now  # one more copy is possible; those out have their full time
+        return not holders
+
+    def _unqueue(self, index: int) -> None:
+        for queue in (self.out, self.full, self.failed):
+            queue.pop(index, None)

@@ -1,0 +1,79 @@
+"""Everything a resume needs, in one file that is replaced atomically."""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from farm import codec
+from farm.arrays import FloatArray
+from farm.codec import array
+from farm.errors import CheckpointError, MessageError
+from farm.messages import Job
+
+_MAGIC: Final = b"rolloutfarm checkpoint 1\n"
+_DIGEST: Final = hashlib.sha256().digest_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """A run between two generations."""
+
+    run: str
+    config: dict[str, Any]
+    """As in config.json."""
+    state: dict[str, Any]
+    """The algorithm's state: what its `to_dict` told."""
+    rollouts: int
+    """Exploring rollouts so far."""
+    reissued: int
+    """Jobs given out again so far."""
+    seconds: float
+    """Wall time so far [s]."""
+    solved: int
+    """Generations in a row in which the mean policy succeeded."""
+    best: Job | None
+    """The best rollout so far, as a job that runs it again."""
+    best_generation: int
+    """The generation it came from."""
+    replayed: bool
+    """Whether it has been recorded at physics rate."""
+    frequencies: FloatArray = array("<f8", 2)
+    """Random features W, (D, d)"""
+    phases: FloatArray = array("<f8", 1)
+    """Random features c, (D,)"""
+
+
+def save(path: Path, checkpoint: Checkpoint) -> None:
+    """Replace the file by a new one, or leave the old one as it is."""
+    body = codec.encode(checkpoint)
+    aside = path.with_name(path.name + ".new")
+    with aside.open("wb") as file:
+        file.write(_MAGIC + hashlib.sha256(body).digest() + body)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def load(path: Path) -> Checkpoint:
+    """The checkpoint in a file.
+
+    Raises:
+      CheckpointError: there is none, or it is truncated or of another version.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"no checkpoint at {path} ({error.strerror}): is this a run's folder?") from None
+    body = content[len(_MAGIC) + _DIGEST :]
+    if not content.startswith(_MAGIC[:-3]):
+        raise CheckpointError(f"{path} is not a checkpoint, or its beginning is damaged")
+    if not content.startswith(_MAGIC):
+        raise CheckpointError(f"{path} is a checkpoint of another version; use the release that wrote it")
+    if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
+        raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
+    try:
+        return codec.decode(body, Checkpoint)
+    except MessageError as error:
+        raise CheckpointError(f"{path}: {error}") from None

@@ -1,0 +1,225 @@
+"""The learner's side of the network: gives a round's jobs to workers and collects what they gave.
+
+One thread, the caller's, owns the ledger and does all publishing; subscriptions fill a queue.
+"""
+
+import hashlib
+import logging
+import queue
+import secrets
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from farm import codec, keys
+from farm.arrays import FloatArray
+from farm.codec import M
+from farm.errors import MessageError, RunError
+from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
+from farm.session import Event, Session
+from learner.ledger import Ledger, LedgerConfig
+
+log = logging.getLogger(__name__)
+
+_WAIT: Final = 0.2  # [s] between two looks at whether to stop
+_PATIENCE: Final = 3.0  # [s] without workers before the user is told
+
+
+
+class Stopped(Exception):  # noqa: N818  not an error
+    """The user asked to end."""
+
+
+class Dispatcher:
+    """Rounds of jobs, one after the other, on whichever workers there are."""
+
+    def __init__(
+        self, session: Session, farm: str, spec: Spec, how_to_join: str, stopped: Callable[[], bool]
+    ) -> None:
+        """Show the run on the network: subscriptions first, the liveliness token last."""
+        self.run = spec.run
+        self.ignored: Counter[str] = Counter()
+        """Messages that were not counted, by kind: stale, doubled, foreign, bad, large, version."""
+        self._session, self._farm, self._stopped = session, farm, stopped
+        self._ledger = Ledger(LedgerConfig())
+        self._how_to_join = how_to_join
+        self._incarnation = secrets.token_hex(8)
+        self._spec = codec.encode(spec)
+        self._header = Generation(
+            run=self.run, incarnation=self._incarnation, round=0, generation=0,
+            spec=hashlib.sha256(self._spec).hexdigest(), mu=_NOTHING, sigma=_NOTHING,
+        )  # fmt: skip
+        self._jobs: Sequence[Job] = ()
+        self._results: dict[int, Result] = {}
+        self._told: set[str] = set()
+        self._gone: set[str] = set()  # whose last words may still be on the way
+        self._alone = time.monotonic()
+        session.subscribe("want", keys.want(farm, "**"))
+        session.subscribe("result", keys.result(farm, self.run, "**"))
+        session.watch("worker", keys.worker_token(farm, "**"))
+        session.answer(keys.spec(farm, self.run), lambda: self._spec)
+        session.answer(keys.generation(farm, self.run), lambda: codec.encode(self._header))
+        session.token(keys.learner_token(farm, self.run))
+
+    @property
+    def jobs(self) -> Sequence[Job]:
+        """The round's jobs."""
+        return self._jobs
+
+    @property
+    def workers(self) -> tuple[str, ...]:
+        """Workers that take part."""
+        return self._ledger.workers
+
+    @property
+    def reissued(self) -> int:
+        """Jobs given out again since the start."""
+        return self._ledger.reissued
+
+    def begin(self, generation: int, mu: FloatArray, sigma: FloatArray, jobs: Sequence[Job]) -> None:
+        """Announce a round and hand out its first jobs."""
+        self._jobs, self._results = jobs, {}
+        self._header = Generation(
+            run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
+            generation=generation, spec=self._header.spec, mu=mu, sigma=sigma,
+        )  # fmt: skip
+        self._ledger.begin(len(jobs))
+        self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
+        self._hand_out()
+
+    def collect(self) -> list[Result]:
+        """Wait for the round's results, in the jobs' order.
+
+        Raises:
+          RunError: a job failed on several workers.
+          Stopped: the user asked to end.
+        """
+        while not self._ledger.complete:
+            for event in self._events():
+                self._take(event)
+            self._hand_out()
+            self._tell_when_alone()
+            if self._stopped():
+                raise Stopped
+        return [self._results[index] for index in range(len(self._jobs))]
+
+    def _events(self) -> list[Event]:
+        """What came, after waiting for it until the next deadline."""
+        due = self._ledger.next_deadline(time.monotonic())
+        events = []
+        try:
+            events.append(self._session.events.get(timeout=_WAIT if due is None else max(0.001, min(due, _WAIT))))
+            while True:
+                events.append(self._session.events.get_nowait())
+        except queue.Empty:
+            return events
+
+    def _take(self, event: Event) -> None:
+        try:
+            if event.topic == "want":
+                self._want(_decode(event, Want))
+            elif event.topic == "worker":
+                self._liveliness(event)
+            else:
+                self._result(event)
+        except MessageError as error:
+            self._ignore(error.kind, f"on {event.key}: {error}")
+
+    def _want(self, want: Want) -> None:
+        if want.worker in self._gone:
+            return
+        if want.worker not in self._ledger.workers:
+            log.info("worker %s joined (release %s)", want.worker, want.version)
+        self._ledger.want(want.worker, want.credits, time.monotonic(), idle=want.idle)
+
+    def _liveliness(self, event: Event) -> None:
+        worker = keys.tail(event.key, keys.worker_token(self._farm, ""))
+        if event.alive:
+            self._gone.discard(worker)
+            return
+        self._gone.add(worker)
+        if worker in self._ledger.workers:
+            again = self._ledger.lost(worker)
+            log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
+
+    def _result(self, event: Event) -> None:
+        sender = keys.tail(event.key, keys.result(self._farm, self.run, ""))
+        try:
+            message: Results | Failure = _decode(event, Results)
+        except MessageError as first:
+            if first.kind != "bad":
+                raise
+            try:
+                message = _decode(event, Failure)
+            except MessageError:
+                raise first from None
+        if message.worker != sender or message.run != self.run:
+            self._ignore("foreign", f"of {message.worker} on {event.key}")
+        elif (message.incarnation, message.round) != (self._incarnation, self._header.round):
+            self.ignored["stale"] += 1
+        elif isinstance(message, Failure):
+            self._failed(message)
+        else:
+            self._count(message)
+
+    def _count(self, message: Results) -> None:
+        good = [result for result in message.results if self._fits(result)]
+        if len(good) < len(message.results):
+            self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
+        verdicts = self._ledger.results(message.worker, [result.index for result in good], time.monotonic())
+        for result, verdict in zip(good, verdicts, strict=True):
+            if verdict == "new":
+                self._results[result.index] = result
+            else:
+                self.ignored[verdict] += 1
+
+    def _fits(self, result: Result) -> bool:
+        if not 0 <= result.index < len(self._jobs):
+            return False
+        job = self._jobs[result.index]
+        return len(result.returns) == len(job.signs) and (result.trajectory is None) == (job.rate == "none")
+
+    def _failed(self, failure: Failure) -> None:
+        if not 0 <= failure.index < len(self._jobs):
+            self.ignored["bad"] += 1
+            return
+        log.warning("job %d failed on worker %s: %s", failure.index, failure.worker, failure.error)
+        if self._ledger.error(failure.worker, failure.index, time.monotonic()):
+            seed = self._jobs[failure.index].perturbation
+            raise RunError(
+                f"pair {failure.index} of generation {self._header.generation} (perturbation seed {seed}) failed "
+                f"wherever it was tried, last with {failure.error}"
+            )
+
+    def _hand_out(self) -> None:
+        for worker, indices in self._ledger.assign(time.monotonic()):
+            chunk = Chunk(
+                run=self.run, incarnation=self._incarnation, round=self._header.round,
+                jobs=tuple(self._jobs[index] for index in indices),
+            )  # fmt: skip
+            # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
+            self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)
+
+    def _tell_when_alone(self) -> None:
+        now = time.monotonic()
+        if self._ledger.workers:
+            self._alone = now
+        elif now - self._alone > _PATIENCE:
+            log.warning("no workers; start some with: %s", self._how_to_join)
+            self._alone = float("inf")
+
+    def _ignore(self, kind: str, text: str) -> None:
+        self.ignored[kind] += 1
+        if text not in self._told and len(self._told) < 1000:
+            self._told.add(text)
+            log.warning("ignored a message %s", text)
+
+
+_NOTHING: Final = np.empty(0)
+
+
+def _decode(event: Event, kind: type[M]) -> M:
+    return codec.decode(event.payload, kind)

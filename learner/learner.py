@@ -1,0 +1,324 @@
+"""The learning loop: ask, simulate, tell, save, and say how it went."""
+
+import hashlib
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from farm.arrays import AnyArray, FloatArray
+from farm.errors import CheckpointError, ConfigError, RunError
+from farm.messages import Job, Result, Spec
+from farm.policy import Features, Policy
+from farm.session import Session
+from farm.states import STATES
+from farm.trajectory import Trajectory
+from learner import config as configs
+from learner.algorithms import PGPEState
+from learner.checkpoint import Checkpoint
+from learner.config import RunConfig
+from learner.dispatcher import Dispatcher
+from learner.folder import RunFolder
+from learner.progress import Progress
+
+log = logging.getLogger(__name__)
+
+EVALUATION_ROLLOUTS: Final = 100
+"""Rollouts of the evaluation at the end of a run, and of a plain `farm evaluate`."""
+
+EVALUATION_SEED: Final = 0
+"""Its seed."""
+
+_ZERO: Final = np.empty(0)  # an eps of zeros, on the wire
+
+
+@dataclass(frozen=True)
+class Report:
+    """A generation that is over."""
+
+    progress: Progress
+    rate: float
+    """Rollouts a second over this generation."""
+    sample: Trajectory | None
+    """The mean policy's rollout."""
+    traces: Mapping[str, AnyArray]
+    """Tactile traces: `best` and `worst` (T, 54), and `all` (2N, T, 54) if the run keeps them."""
+    replay: Trajectory | None
+    """The best rollout so far at physics rate, once there is a new one."""
+    replay_generation: int
+    """The generation the replayed rollout came from."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The end of a run: the mean policy, unperturbed and perturbed."""
+
+    mean: Result
+    """One rollout under nominal conditions, at physics rate."""
+    robust_success_rate: float
+    """Part of the perturbed rollouts that succeeded."""
+    replay: Trajectory | None
+    """The best rollout of the run at physics rate, if it has not been shown yet."""
+
+
+def evaluation_jobs(rollouts: int, seed: int) -> list[Job]:
+    """The mean policy on perturbed starts, and last on the nominal one at physics rate."""
+    trials = [_mean_job(i, rate="none", perturbation=(seed, i)) for i in range(rollouts)]
+    return [*trials, _mean_job(rollouts, rate="physics", perturbation=None)]
+
+
+def _mean_job(index: int, rate: str, perturbation: tuple[int, ...] | None) -> Job:
+    return Job(index=index, origin="mu", signs=(1,), perturbation=perturbation, rate=rate, eps=_ZERO)
+
+
+class Learner:
+    """One run, from its start or its checkpoint to its end."""
+
+    def __init__(self, config: RunConfig, folder: RunFolder, *, resume: bool = False) -> None:
+        """Prepare a new run, or take up the one in the folder.
+
+        Raises:
+          ConfigError: the run to start from, or to resume, does not fit.
+        """
+        self.config, self.folder = config, folder
+        if resume:
+            self._at = folder.rewind()
+        else:
+            self._at = _begin(config, folder.name)
+        self.policy = _policy(config, Features(self._at.frequencies, self._at.phases))
+        try:
+            self.state: PGPEState = config.algorithm.restore(self._at.state)
+        except ValueError as error:
+            raise CheckpointError(f"{folder.checkpoint}: {error}") from None
+        if not resume:
+            folder.save(self._at)
+        self._before = self._at.reissued
+
+    @property
+    def spec(self) -> Spec:
+        """What workers simulate."""
+        return Spec(
+            run=self.folder.name,
+            task="finger-gait",
+            task_config=configs.to_dict(self.config)["task"],
+            policy_config=configs.to_dict(self.config)["policy"],
+            frequencies=self._at.frequencies,
+            phases=self._at.phases,
+        )
+
+    @property
+    def over(self) -> bool:
+        """Whether no generation is left to do."""
+        solved = self.config.stop_when_solved
+        return self.state.generation >= self.config.generations or (solved is not None and self._at.solved >= solved)
+
+    def learn(self, farm: Dispatcher) -> Iterator[Report]:
+        """Generations until the run is over; the next one is under way while a report is looked at.
+
+        Raises:
+          Diverged: mu or sigma would not be finite; the state before is saved.
+          RunError: a job failed on several workers, or a file cannot be written.
+          Stopped: the user asked to end; the last whole generation is saved.
+        """
+        begun = time.monotonic() - self._at.seconds
+        if not self.over:
+            eps = self._explore(farm)
+        while not self.over:
+            results, jobs, last = farm.collect(), farm.jobs, self._at
+            rows = results[: len(eps)]
+            returns = np.stack([result.returns for result in rows])
+            before = self.state
+            self.state = self.config.algorithm.tell(before, eps, returns)
+            self._note(before, eps, results, returns, time.monotonic() - begun, farm)
+            if not self.over:
+                eps = self._explore(farm)
+            progress = self._progress(results, returns, farm)
+            self._save(progress)
+            yield Report(
+                progress=progress,
+                rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
+                sample=_trajectory(results[len(eps)]),
+                traces=_traces(rows, returns, self.config.traces),
+                replay=_trajectory(results[-1]) if len(jobs) > len(rows) + 1 else None,
+                replay_generation=last.best_generation,
+            )
+
+    def evaluate(self, farm: Dispatcher) -> Evaluation:
+        """The mean policy at the end of the run."""
+        jobs = evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED)
+        best = self._replay_job(len(jobs))
+        farm.begin(self.state.generation, self.state.mu, self.state.sigma, [*jobs, *best])
+        results = farm.collect()
+        trials = results[:EVALUATION_ROLLOUTS]
+        return Evaluation(
+            mean=results[EVALUATION_ROLLOUTS],
+            robust_success_rate=float(np.mean([result.success[0] for result in trials])),
+            replay=_trajectory(results[-1]) if best else None,
+        )
+
+    def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
+        """What came out, as summary.json says it."""
+        progress = self.folder.progress()
+        mean = evaluation.mean if evaluation else None
+        numbers = self.state.mu.astype("<f8").tobytes() + self.state.sigma.astype("<f8").tobytes()
+        return {
+            "run": self.folder.name,
+            "seed": self.config.seed,
+            "generations": self.state.generation,
+            "rollouts": self._at.rollouts,
+            "best_return": self.state.best,
+            "mean_policy_return": float(mean.returns[0]) if mean else None,
+            "mean_policy_success": bool(mean.success[0]) if mean else None,
+            "success_rate": progress[-1].success_rate if progress else None,
+            "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
+            "parameters_sha256": hashlib.sha256(numbers).hexdigest(),
+            "seconds": round(self._at.seconds, 3),
+            "rollouts_per_second": round(self._at.rollouts / self._at.seconds, 1) if self._at.seconds else None,
+            "workers": workers,
+            "reissued": self._at.reissued,
+            "state": state,
+        }
+
+    @property
+    def best_generation(self) -> int:
+        """The generation of the best rollout so far."""
+        return self._at.best_generation
+
+    def _explore(self, farm: Dispatcher) -> FloatArray:
+        """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
+        config, state = self.config, self.state
+        eps = config.algorithm.ask(state, np.random.default_rng((config.seed, state.generation)))
+        signs = (1, -1) if config.algorithm.estimator == "symmetric" else (1,)
+        jobs = [
+            Job(index=i, origin="mu", signs=signs, perturbation=self._perturbation(i), rate="none", eps=row)
+            for i, row in enumerate(eps)
+        ]
+        jobs.append(_mean_job(len(jobs), rate="control", perturbation=None))
+        farm.begin(state.generation, state.mu, state.sigma, [*jobs, *self._replay_job(len(jobs))])
+        return eps
+
+    def _perturbation(self, index: int) -> tuple[int, ...] | None:
+        return (self.config.seed, self.state.generation, index) if self.config.task.perturb else None
+
+    def _replay_job(self, index: int) -> list[Job]:
+        """The best rollout so far once more at physics rate, if that has not been done."""
+        best = self._at.best
+        return [] if best is None or self._at.replayed else [replace(best, index=index, rate="physics")]
+
+    def _note(
+        self,
+        before: PGPEState,
+        eps: FloatArray,
+        results: list[Result],
+        returns: FloatArray,
+        seconds: float,
+        farm: Dispatcher,
+    ) -> None:
+        """Bring the checkpoint up to date after an update."""
+        best, generation, replayed = self._at.best, self._at.best_generation, True
+        if before.best is None or returns.max() > before.best:
+            row, column = np.unravel_index(int(returns.argmax()), returns.shape)
+            theta = before.mu + (1, -1)[column] * eps[row]
+            seed = (self.config.seed, before.generation, int(row)) if self.config.task.perturb else None
+            best = Job(index=0, origin="zero", signs=(1,), perturbation=seed, rate="none", eps=theta)
+            generation, replayed = self.state.generation, False
+        self._at = replace(
+            self._at,
+            config=configs.to_dict(self.config),
+            state=self.state.to_dict(),
+            rollouts=self._at.rollouts + returns.size,
+            reissued=self._before + farm.reissued,
+            seconds=seconds,
+            solved=self._at.solved + 1 if results[len(eps)].success[0] else 0,
+            best=best,
+            best_generation=generation,
+            replayed=replayed,
+        )
+
+    def _progress(self, results: list[Result], returns: FloatArray, farm: Dispatcher) -> Progress:
+        state, rows, mean = self.state, results[: len(returns)], results[len(returns)]
+        return Progress(
+            generation=state.generation,
+            rollouts=self._at.rollouts,
+            return_mean=float(returns.mean()),
+            return_min=float(returns.min()),
+            return_max=float(returns.max()),
+            return_std=float(returns.std()),
+            best=float(returns.max()) if state.best is None else state.best,
+            baseline=state.baseline,
+            mean_policy_return=float(mean.returns[0]),
+            mean_policy_success=bool(mean.success[0]),
+            success_rate=float(np.mean([result.success for result in rows])),
+            sigma_mean=float(state.sigma.mean()),
+            sigma_min=float(state.sigma.min()),
+            sigma_max=float(state.sigma.max()),
+            mean_norm=float(np.linalg.norm(state.mu)),
+            dropped=int(sum(result.dropped.sum() for result in rows)),
+            failed=int(sum(result.failed.sum() for result in rows)),
+            clamped=int(sum(result.clamped.sum() for result in rows)),
+            reissued=self._at.reissued,
+            workers=len(farm.workers),
+            seconds=round(self._at.seconds, 3),
+        )
+
+    def _save(self, progress: Progress) -> None:
+        try:
+            self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
+            self.folder.save(self._at)
+        except OSError as error:
+            raise RunError(
+                f"cannot write to {self.folder.path}: {error.strerror}; the run stands as of generation "
+                f"{progress.generation - 1}: make room and --resume it"
+            ) from None
+
+
+def _begin(config: RunConfig, run: str) -> Checkpoint:
+    """A run before its first generation."""
+    size = STATES[config.task.state].size
+    features = Features.draw(config.policy, size, np.random.default_rng((config.seed, 2**32)))
+    state = config.algorithm.init(_policy(config, features).size)
+    if config.init_from is not None:
+        state, features = _taken_over(config, state)
+    return Checkpoint(
+        run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
+        solved=0, best=None, best_generation=0, replayed=True,
+        frequencies=features.frequencies, phases=features.phases,
+    )  # fmt: skip
+
+
+def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Features]:
+    """Start from another run: its mean, perhaps its sigma, and the features that its parameters belong to."""
+    from pathlib import Path
+
+    other = RunFolder.open(Path(str(config.init_from)))
+    theirs = other.read_config()
+    for part, name in ((theirs.policy, "policy"), (theirs.task.state, "task")):
+        mine = config.policy if name == "policy" else config.task.state
+        if part != mine:
+            raise ConfigError(f"--init-from {config.init_from}: its controller is another ({part} there, {mine} here)")
+    at = other.rewind()
+    state = replace(fresh, mu=at.state["mu"])
+    if config.init_sigma == "run":
+        state = replace(state, sigma=at.state["sigma"])
+    return state, Features(at.frequencies, at.phases)
+
+
+def _policy(config: RunConfig, features: Features) -> Policy:
+    return Policy(config.policy, STATES[config.task.state].size, features)
+
+
+def _trajectory(result: Result) -> Trajectory | None:
+    return result.trajectory.trajectory() if result.trajectory else None
+
+
+def _traces(rows: list[Result], returns: FloatArray, keep: str) -> dict[str, AnyArray]:
+    """The traces that are kept, by name."""
+    if keep == "none":
+        return {}
+    traces = np.concatenate([result.traces for result in rows])
+    flat = returns.reshape(-1)
+    kept = {"best": traces[int(flat.argmax())], "worst": traces[int(flat.argmin())]}
+    return {**kept, "all": traces} if keep == "all" else kept

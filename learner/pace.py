@@ -1,0 +1,82 @@
+"""How fast jobs go: the running median, and the chunk sizes and deadlines that follow from it."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from statistics import median
+
+_SAMPLES = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class LedgerConfig:
+    """How jobs are handed out, and when one is given to a second worker or given up."""
+
+    chunk_seconds: float = 0.08
+    """Work sent to a worker in one message [s], by the running median."""
+    straggler_factor: float = 4.0
+    """A job out longer than this many running medians is copied to another worker."""
+    straggler_seconds: float = 1.0
+    """A job is never copied sooner than this [s]."""
+    copies: int = 3
+    """Workers that may hold one job at once; 1 means no copies."""
+    max_errors: int = 3
+    """Different workers that answer an error for one job before the run stops."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name, least in (
+            ("chunk_seconds", 0.0),
+            ("straggler_factor", 1.0),
+            ("straggler_seconds", 0.0),
+        ):
+            value = getattr(self, name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not math.isfinite(value) or value < least or value == 0.0:
+                bound = "above 0" if least == 0.0 else f"of {least} or more"
+                raise ValueError(f"{name} is {value!r}, expected a finite number {bound}")
+        for name in ("copies", "max_errors"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} is {value!r}, expected an integer of 1 or more")
+
+
+class Pace:
+    """The running median of seconds per job, over the last answers of all workers."""
+
+    def __init__(self, config: LedgerConfig) -> None:
+        self._config = config
+        self._samples: deque[float] = deque(maxlen=_SAMPLES)
+        self._median: float | None = None
+
+    def learn(self, seconds: float) -> None:
+        """Take in one answer's time per job [s]."""
+        self._samples.append(max(seconds, 0.0))
+        self._median = median(self._samples)
+
+    @property
+    def median(self) -> float | None:
+        """Running median [s], None before the first answer."""
+        return self._median
+
+    @property
+    def patience(self) -> float:
+        """Time after which a job that is out counts as a straggler [s]."""
+        factor = self._config.straggler_factor
+        return max(self._config.straggler_seconds, factor * (self._median or 0.0))
+
+    def chunk(self, remaining: int, workers: int) -> int:
+        """Return the number of jobs to send at once.
+
+        Some `chunk_seconds` of work, but at most half a worker's share of what remains, so that
+        chunks shrink towards the end and all workers end together. One job as long as nothing is
+        known about its duration.
+        """
+        if self._median is None:
+            return 1
+        share = -(-remaining // (2 * max(workers, 1)))
+        # A median of 0 (a coarse clock) only says that the share decides.
+        fitting = self._config.chunk_seconds / max(self._median, 1e-9)
+        return max(1, min(share, math.floor(fitting + 0.5)))

@@ -1,0 +1,73 @@
+"""What is known of a generation that is over; one line of progress.jsonl. Pure."""
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final
+
+VERSION: Final = 1
+"""Version of a line of progress.jsonl."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """One generation. Returns, rates and counts are over its 2N exploring rollouts."""
+
+    generation: int
+    """Updates done, this one included: 1, 2, ..."""
+    rollouts: int
+    """Exploring rollouts of the run so far."""
+    return_mean: float
+    """Mean return."""
+    return_min: float
+    """Lowest return."""
+    return_max: float
+    """Highest return."""
+    return_std: float
+    """Standard deviation of the returns."""
+    best: float
+    """Best return of the run so far."""
+    baseline: float | None
+    """Baseline after the update, None where the algorithm has none."""
+    mean_policy_return: float
+    """Return of the mean policy that the generation explored around, unperturbed."""
+    mean_policy_success: bool
+    """Whether that rollout succeeded."""
+    success_rate: float
+    """Part of the rollouts that succeeded."""
+    sigma_mean: float
+    """Mean of sigma after the update."""
+    sigma_min: float
+    """Least sigma."""
+    sigma_max: float
+    """Largest sigma."""
+    mean_norm: float
+    """Euclidean norm of mu after the update."""
+    dropped: int
+    """Rollouts that dropped the object."""
+    failed: int
+    """Rollouts whose physics blew up."""
+    clamped: int
+    """Rollouts whose return overflowed and was clamped."""
+    reissued: int
+    """Jobs given out again since the run's start (lost workers, stragglers, idle workers)."""
+    workers: int
+    """Workers at the generation's end."""
+    seconds: float
+    """Wall time of the run so far, resumed parts added up [s]."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it stands in progress.jsonl."""
+        return {"version": VERSION, **asdict(self)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "Progress":
+        """Read a line back.
+
+        Raises:
+          ValueError: another version, or a field is missing.
+        """
+        if values.get("version") != VERSION:
+            raise ValueError(f"progress version {values.get('version')!r}, expected {VERSION}")
+        missing = [f.name for f in fields(cls) if f.name not in values]
+        if missing:
+            raise ValueError(f"progress line without {', '.join(missing)}")
+        return cls(**{f.name: values[f.name] for f in fields(cls)})

@@ -1,0 +1,252 @@
+"""A run as a Rerun recording: into a file, and live to whoever looks.
+
+One recording a run, its id the run's name. Every row stands on three timelines:
+
+    generation   updates done, a sequence
+    sim_time     generation x horizon + time in its sample rollout, a duration: rollouts play without gaps
+    wall_time    when it was recorded; a rollout's frames lie before its end, as far apart as they were simulated
+
+A file is never overwritten: a run that goes on writes run.part2.rrd, and closing merges the parts
+into run.rrd and compacts it. All parts opened together are one recording as well.
+"""
+
+import socket
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from farm.arrays import AnyArray, FloatArray
+from farm.errors import ConfigError
+from farm.scene import Scene
+from farm.trajectory import Trajectory
+from learner import blueprint, curves
+from learner.drawing import Drawing, trace
+from learner.progress import Progress
+from learner.recording_files import compact, next_part, parts
+
+APPLICATION: Final = "rolloutfarm"
+FLUSH: Final = 30.0
+"""How long rows may take to reach the file before the recording counts as broken [s]."""
+HOLD: Final = 0.5
+"""How long a replay rests at a rollout's end [s]."""
+_LEVELS: Final = {"WARNING": "WARN", "CRITICAL": "ERROR"}  # the standard library's names in Rerun's
+
+
+class Recorder:
+    """Writes a run down, generation by generation."""
+
+    def __init__(
+        self,
+        path: Path | None,
+        *,
+        run: str,
+        scene: Scene,
+        config: str,
+        horizon: float,
+        serve: tuple[str, int] | None = None,
+        done: int = 0,
+    ) -> None:
+        """Open the file and the server.
+
+        Args:
+          path: of the recording; where it is there already, its next part is begun.
+          run: name of the run.
+          scene: what is drawn.
+          config: the resolved configuration, Markdown.
+          horizon: nominal length of a rollout [s].
+          serve: host and port to answer viewers at. Rerun knows no passwords: 127.0.0.1, if in doubt.
+          done: generations that were recorded before.
+
+        Raises:
+          ConfigError: neither path nor address, or the address is taken.
+          OSError: the file cannot be written.
+        """
+        self._path, self._horizon, self._generation = path, horizon, done
+        self._last = time.time() - horizon
+        self._drawing = Drawing(scene)
+        sinks: list[Any] = []
+        self._server: tuple[str, int] | None = None
+        if path is not None:
+            sinks.append(_file(path))
+        if serve is not None:
+            _check_free(*serve)
+            sinks.append(rr.GrpcServerSink(*serve))
+            self._server = serve
+        if not sinks:
+            raise ConfigError("a recording without a file and without an address to serve; give one")
+        self._stream = _open(run, sinks, blueprint.learning(horizon))
+        _log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
+
+    @property
+    def uri(self) -> str | None:
+        """What a viewer opens to look on: `rerun URI`."""
+        if self._server is None:
+            return None
+        host, port = self._server
+        return f"rerun+http://{f'[{host}]' if ':' in host else host}:{port}/proxy"
+
+    def generation(
+        self, progress: Progress, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
+    ) -> None:
+        """Record a generation that is over.
+
+        Args:
+          progress: its statistics.
+          sample: a rollout at control rate, usually the mean policy's.
+          traces: taxels over rollouts [N]: `best` and `worst` (T, 54) as pictures; `all` (2N, T, 54)
+            float32, kept bit by bit.
+          rate: exploring rollouts a second.
+
+        Raises:
+          ValueError: the sample or a trace has another shape.
+          RuntimeError: the file takes no more (a full disk).
+        """
+        self._generation = progress.generation
+        now = time.time()
+        start = progress.generation * self._horizon
+        at = _times(progress.generation, [start], [now])
+        for entity, values in curves.statistics(progress, rate):
+            self._send(entity, at, _single(values))
+        for name, values in traces.items():
+            self._send(*_trace(name, values, at))
+        if sample is not None:
+            length = min(now - self._last, self._horizon)
+            wall = now + (sample.times / self._horizon - 1.0) * length
+            _send_rollout(self._stream, self._drawing, sample, progress.generation, start, wall)
+        self._last = now
+        self._stream.flush(timeout_sec=FLUSH)
+
+    def log(self, text: str, level: str = "INFO") -> None:
+        """Record a line; levels are those of the standard library."""
+        at = _times(self._generation, [self._generation * self._horizon], [time.time()])
+        self._send("/log", at, _single(rr.TextLog(text, level=_LEVELS.get(level, level))))
+
+    def close(self) -> None:
+        """Write everything out, merge the parts and compact them.
+
+        Raises:
+          RuntimeError: the file takes no more (a full disk).
+        """
+        try:
+            self._stream.flush(timeout_sec=FLUSH)
+        finally:
+            self._stream.disconnect()
+        if self._path is not None:
+            compact(self._path)
+
+    def _send(self, entity: str, times: list[rr.TimeColumn], columns: Iterable[Any]) -> None:
+        self._stream.send_columns(entity, times, columns)
+
+
+def record_replay(
+    path: Path, *, run: str, scene: Scene, config: str, rollouts: Sequence[tuple[str, Trajectory]]
+) -> None:
+    """Write rollouts into a file of their own, one after the other; a file that is there is replaced.
+
+    Timelines are sim_time, with a rest after each rollout, and rollout, counted from 1.
+
+    Args:
+      path: of the recording.
+      run: name of the run; the recording's id is `<run>-replay`.
+      scene: what is drawn.
+      config: the resolved configuration, Markdown.
+      rollouts: names and rollouts, at any rate.
+    """
+    drawing = Drawing(scene)
+    longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
+    path.unlink(missing_ok=True)
+    stream = _open(f"{run}-replay", [_file(path)], blueprint.replay(longest))
+    _log_static(stream, [*drawing.static(), _config(config)])
+    start = 0.0
+    for number, (name, rollout) in enumerate(rollouts, 1):
+        text = f"## {name}\nreturn {rollout.value:.4g}\n\n{'success' if rollout.success else 'no success'}"
+        at = _times(number, [start], None, "rollout")
+        stream.send_columns("/rollout", at, _single(rr.TextDocument(text, media_type="text/markdown")))
+        _send_rollout(stream, drawing, rollout, number, start, None, "rollout")
+        start += float(rollout.times[-1]) + HOLD
+    stream.flush(timeout_sec=FLUSH)
+    stream.disconnect()
+    compact(path)
+
+
+def _check_free(host: str, port: int) -> None:
+    """Rerun only prints a line when it cannot listen."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        raise ConfigError(f"cannot serve the recording at {host}:{port}: {error}; choose another port") from error
+
+
+def _open(recording: str, sinks: list[Any], layout: rrb.Blueprint) -> rr.RecordingStream:
+    rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+    stream.set_sinks(*sinks)
+    stream.send_blueprint(layout)
+    stream.send_recording_name(recording)
+    return stream
+
+
+def _log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:
+    for entity, archetype in entities:
+        stream.log(entity, archetype, static=True)
+
+
+def _config(text: str) -> tuple[str, Any]:
+    return "/config", rr.TextDocument(text, media_type="text/markdown")
+
+
+def _file(path: Path) -> rr.FileSink:
+    part = next_part(path)
+    part.touch()  # Rerun's own error names no errno
+    return rr.FileSink(part)
+
+
+def _single(archetype: Any) -> list[Any]:  # noqa: ANN401  (Rerun's archetypes have no public base)
+    """An archetype as columns of one row."""
+    return [batch.partition([len(batch.as_arrow_array())]) for batch in archetype.as_component_batches()]
+
+
+def _trace(name: str, values: AnyArray) -> tuple[str, list[Any]]:
+    """Entity and columns of a trace."""
+    if name == "all":
+        array = np.ascontiguousarray(values, dtype=np.float32)
+        return "/tactile/traces", _single(rr.Tensor(array, dim_names=("rollout", "step", "taxel")))
+    return f"/tactile/trace/{name}", _single(trace(values))
+
+
+def _times(
+    number: int, sim: FloatArray, wall: FloatArray | None, counter: str = "generation"
+) -> list[rr.TimeColumn]:
+    """Timelines of rows: a number, times in the simulation (n,) [s], and since the epoch (n,) [s]."""
+    columns = [
+        rr.TimeColumn(counter, sequence=np.full(len(sim), number)),
+        rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
+    ]
+    if wall is not None:
+        columns.append(rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]")))
+    return columns
+
+
+def _nanoseconds(seconds: FloatArray) -> IntArray:
+    """Rounded: Rerun alone would cut off."""
+    return np.rint(np.asarray(seconds) * 1e9).astype(np.int64)
+
+
+def _send_rollout(
+    stream: rr.RecordingStream,
+    drawing: Drawing,
+    rollout: Trajectory,
+    sim: FloatArray,
+    times: Callable[[slice | IntArray], list[rr.TimeColumn]],
+) -> None:
+    whole = times(slice(None))
+    for part in drawing.columns(rollout):
+        stream.send_columns(part.entity, whole if part.rows is None else times(part.rows), part.columns)

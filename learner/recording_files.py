@@ -1,0 +1,71 @@
+"""The files of a recording: parts that a run left behind, merged, mended and compacted.
+
+Rerun overwrites a file it is given, and a file whose last bytes a crash tore off cannot be read
+until `rerun rrd optimize` has mended it. So a run that goes on mends what is there and begins a part of its own.
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+_COMPACTING: Final = 600.0  # [s]; 30 MiB take about one
+
+
+def parts(path: Path) -> list[Path]:
+    """The files of a recording that are there, oldest first: run.rrd, run.part2.rrd, ...; open them together."""
+    further = [f for f in path.parent.glob(f"{path.stem}.part*{path.suffix}") if _number(path, f)]
+    further.sort(key=lambda f: _number(path, f))
+    return [path, *further] if path.exists() else further
+
+
+def compact(path: Path) -> bool:
+    """Merge a recording's parts into one compact file, mending an end that a crash tore off.
+
+    Returns:
+      whether it worked; where not, every part is as it was.
+    """
+    found = parts(path)
+    merged = path.with_name(f"{path.stem}.merging{path.suffix}")
+    with tempfile.TemporaryDirectory() as home, contextlib.suppress(OSError, subprocess.SubprocessError):
+        command = [sys.executable, "-m", "rerun_cli", "rrd", "optimize", *map(str, found), "-o", str(merged)]
+        subprocess.run(  # noqa: S603
+            command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING
+        )
+        merged.replace(path)
+        for old in found:
+            if old != path:
+                old.unlink()
+        return True
+    merged.unlink(missing_ok=True)
+    return False
+
+
+def _number(path: Path, part: Path) -> int:
+    """Which part a file is, 0 where it is none."""
+    digits = part.name.removeprefix(f"{path.stem}.part").removesuffix(path.suffix)
+    return int(digits) if digits.isdecimal() else 0
+
+
+def _quiet(home: str) -> dict[str, str]:
+    """An environment in which Rerun's command sends no usage data and leaves no file in the user's home."""
+    settings = Path(home, "rerun")
+    settings.mkdir()
+    values = {"analytics_enabled": False, "analytics_id": "none"}
+    (settings / "analytics.json").write_text(json.dumps(values), encoding="utf-8")
+    return {**os.environ, "HOME": home, "XDG_CONFIG_HOME": home, "RUST_LOG": "warn"}
+
+
+def _file(path: Path) -> rr.FileSink:
+    """A sink for the next part; the parts before become one, mended where a crash tore them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if parts(path):
+        compact(path)
+        last = parts(path)[-1]
+        path = path.with_name(f"{path.stem}.part{max(_number(path, last), 1) + 1}{path.suffix}")
+    path.touch()  # Rerun's own error names no errno
+    return rr.FileSink(path)

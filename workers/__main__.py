@@ -1,0 +1,55 @@
+"""One worker process: `python -m workers`. People use `farm worker`, which starts as many as there are cores."""
+
+import logging
+import os
+import signal
+import sys
+import threading
+from dataclasses import dataclass
+
+import tyro
+
+from farm.errors import ConfigError, FarmError
+from workers.worker import WorkerConfig, work
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process:
+    """One worker process."""
+
+    worker: tyro.conf.OmitArgPrefixes[WorkerConfig]
+    exit_with_parent: bool = False
+    """End when standard input closes."""
+    log_level: str = "INFO"
+    """DEBUG, INFO, WARNING or ERROR."""
+
+
+def main() -> int:
+    """Serve until SIGTERM, Ctrl-C, or the end of the parent; exit status."""
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        process = tyro.cli(Process)
+        logging.basicConfig(level=process.log_level, format="%(levelname).1s worker %(process)d: %(message)s")
+        if process.exit_with_parent:
+            threading.Thread(target=_watch_parent, args=(stop,), daemon=True).start()
+        work(process.worker, stop.is_set)
+    except ConfigError as error:
+        sys.stderr.write(f"farm worker: {error}\n")
+        return 2
+    except FarmError as error:
+        if not stop.is_set():
+            sys.stderr.write(f"farm worker: {error}\n")
+            return 1
+    return 0
+
+
+def _watch_parent(stop: threading.Event) -> None:
+    while os.read(0, 1024):
+        pass
+    stop.set()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

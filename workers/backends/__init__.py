@@ -1,0 +1,34 @@
+"""What a worker simulates with, by name."""
+
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+from farm.arrays import FloatArray
+from farm.messages import Job, Result, Spec
+from workers.backends.cpu import CpuBackend
+
+
+class Backend(Protocol):
+    """Runs one run's jobs; made from its specification."""
+
+    capacity: int
+    """Jobs that are worth holding at a time."""
+
+    def __init__(self, spec: Spec) -> None:
+        """Build the run's task; ConfigError when it is not known here."""
+
+    @property
+    def parameters(self) -> int:
+        """Length P of a parameter vector."""
+        ...
+
+    def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
+        """Run jobs around a mean (P,); results in the jobs' order."""
+        ...
+
+    def close(self) -> None:
+        """Give back what it holds."""
+
+
+BACKENDS: Final[dict[str, type[Backend]]] = {"cpu": CpuBackend}
+"""Backends by name."""

@@ -1,0 +1,76 @@
+"""Worker processes on this machine: started as subprocesses, never forked, ended by pid."""
+
+import logging
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from typing import Final
+
+log = logging.getLogger(__name__)
+
+_GRACE: Final = 1.5  # [s] that a worker has to leave before it is killed
+_RESTARTS: Final = 20  # a worker that keeps dying is not started for ever
+_ENVIRONMENT: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+
+
+class Pool:
+    """K processes `python -m workers`; one that dies is replaced."""
+
+    def __init__(self, processes: int, arguments: Sequence[str], environment: dict[str, str]) -> None:
+        """Start them with these arguments; they end when this process does, however it ends."""
+        self._command = [sys.executable, "-m", "workers", *arguments, "--exit-with-parent"]
+        # One thread a process: the cores are shared out among processes.
+        self._environment = {**environment, **dict.fromkeys(_ENVIRONMENT, "1")}
+        self._restarts = 0
+        self._processes = [self._start() for _ in range(processes)]
+
+    def _start(self) -> "subprocess.Popen[bytes]":
+        # Its standard input is a pipe that nobody writes to: it closes when this process ends.
+        # A session of its own keeps the terminal's Ctrl-C away: this process ends its workers.
+        return subprocess.Popen(
+            self._command, stdin=subprocess.PIPE, env=self._environment, start_new_session=True
+        )
+
+    @property
+    def pids(self) -> list[int]:
+        """Process ids of the workers that run."""
+        return [process.pid for process in self._processes if process.poll() is None]
+
+    def tend(self) -> list[int]:
+        """Replace workers that died; exit statuses of those that will not be replaced."""
+        given_up = []
+        for i, process in enumerate(self._processes):
+            status = process.poll()
+            if status is None:
+                continue
+            if status in (0, 1, 2) or self._restarts >= _RESTARTS:
+                given_up.append(status)  # it ended by itself and has said why
+                continue
+            self._restarts += 1
+            log.warning("worker process %d ended with status %d; starting another", process.pid, status)
+            self._processes[i] = self._start()
+        return given_up
+
+    def close(self) -> None:
+        """Ask all to leave, wait, kill those that do not."""
+        for process in self._processes:
+            if process.poll() is None:
+                process.terminate()
+        until = time.monotonic() + _GRACE
+        for process in self._processes:
+            try:
+                process.wait(max(0.0, until - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin:
+                process.stdin.close()
+
+    def __enter__(self) -> "Pool":
+        """Running already."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()

@@ -1,0 +1,238 @@
+"""A worker: joins a farm, takes jobs of whichever runs are there, answers, leaves cleanly.
+
+One thread owns everything; subscriptions only fill its queue. A worker belongs to the farm,
+not to a run: it builds each run's task from its specification and serves runs in turn.
+"""
+
+import hashlib
+import logging
+import os
+import queue
+import secrets
+import socket
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from farm import __version__, codec, keys
+from farm.errors import ConfigError, FarmError, MessageError
+from farm.messages import Chunk, Failure, Generation, Results, Spec, Want
+from farm.session import Event, Session, connect
+from workers.backends import BACKENDS, Backend
+
+log = logging.getLogger(__name__)
+
+IDLE: Final = 1.0
+"""A worker without work for so long says so, and again every time [s]."""
+
+_ASK: Final = 1.0  # [s] for an answer to a query
+_KEEP: Final = 8  # runs whose tasks are kept built
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerConfig:
+    """A worker and where it works."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Where the learner or a router listens; several are tried in turn."""
+    farm: str = "farm"
+    """Name of the farm: learners and workers of one name work together."""
+    name: str = ""
+    """Name of this worker (default: the host's name)."""
+    timeout: float | None = None
+    """Give up when nobody answers for so long at the start [s] (default: keep trying)."""
+    backend: str = "cpu"
+    """What simulates: cpu."""
+
+    def __post_init__(self) -> None:
+        """Check every value, and put in the host's name."""
+        if not self.name:
+            host = socket.gethostname().split(".")[0]
+            object.__setattr__(self, "name", "".join(c if c.isascii() and c.isalnum() else "-" for c in host) or "host")
+        keys.checked("farm", self.farm)
+        keys.checked("worker", self.name)
+        if self.backend not in BACKENDS:
+            raise ConfigError(f"unknown backend {self.backend!r}; known are {', '.join(BACKENDS)}")
+        if not self.connect:
+            raise ConfigError("no endpoint to connect to; give --connect tcp/HOST:PORT")
+        if self.timeout is not None and not 0 <= self.timeout < float("inf"):
+            raise ConfigError(f"timeout is {self.timeout}; expected a number of seconds")
+
+
+@dataclass
+class _Served:
+    """What a worker knows of one run."""
+
+    header: Generation | None = None
+    chunks: deque[Chunk] = field(default_factory=deque)
+
+
+def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
+    """Serve the farm until stopped.
+
+    Raises:
+      FarmError: nobody answered within the timeout.
+    """
+    with connect(config.connect, config.timeout, stopped) as session:
+        worker = Worker(config, session)
+        worker.join()
+        log.info("joined farm %s as %s", config.farm, worker.id)
+        while not stopped():
+            worker.turn()
+
+
+class Worker:
+    """The state of a worker and what it does with each event."""
+
+    def __init__(self, config: WorkerConfig, session: Session) -> None:
+        """Choose an identity that no other process has."""
+        self.id = f"{config.name}/{os.getpid()}-{secrets.token_hex(3)}"
+        self._config = config
+        self._session = session
+        self._runs: OrderedDict[str, _Served] = OrderedDict()
+        self._backends: OrderedDict[str, Backend | FarmError] = OrderedDict()
+        self._busy = time.monotonic()
+
+    def join(self) -> None:
+        """Subscribe, then show up: in that order, or the first jobs are lost."""
+        farm = self._config.farm
+        self._session.subscribe("generation", keys.generation(farm, "*"))
+        self._session.subscribe("inbox", keys.inbox(farm, self.id))
+        self._session.watch("learner", keys.learner_token(farm, "*"))
+        self._session.token(keys.worker_token(farm, self.id))
+        self._want(idle=True)
+
+    def turn(self) -> None:
+        """Take in what came, then run one chunk or wait for more."""
+        for event in self._events():
+            try:
+                self._take(event)
+            except MessageError as error:
+                log.warning("ignored a message on %s: %s", event.key, error)
+        chunk = self._next()
+        if chunk is not None:
+            self._run(chunk)
+            self._busy = time.monotonic()
+        elif time.monotonic() - self._busy >= IDLE:
+            self._want(idle=True)
+            self._busy = time.monotonic()
+
+    def _events(self) -> list[Event]:
+        """What is waiting, headers first; waits a little when there is nothing to do."""
+        waiting = any(run.chunks for run in self._runs.values())
+        events = []
+        try:
+            events.append(self._session.events.get(timeout=0.0 if waiting else 0.2))
+            while True:
+                events.append(self._session.events.get_nowait())
+        except queue.Empty:
+            return sorted(events, key=lambda event: event.topic == "inbox")
+
+    def _take(self, event: Event) -> None:
+        if event.topic == "generation":
+            self._begin(codec.decode(event.payload, Generation))
+        elif event.topic == "inbox":
+            self._accept(codec.decode(event.payload, Chunk))
+        elif event.alive:
+            self._want(idle=self._next(peek=True) is None)
+        else:
+            self._runs.pop(keys.tail(event.key, keys.learner_token(self._config.farm, "")), None)
+
+    def _begin(self, header: Generation) -> None:
+        """A new round: work of older ones is void."""
+        run = self._runs.setdefault(header.run, _Served())
+        old = run.header
+        if old and (old.incarnation, old.round) == (header.incarnation, header.round):
+            return
+        run.header = header
+        run.chunks.clear()
+
+    def _accept(self, chunk: Chunk) -> None:
+        run = self._runs.setdefault(chunk.run, _Served())
+        if not _belongs(chunk, run.header):
+            payload = self._session.ask(keys.generation(self._config.farm, chunk.run), _ASK)
+            if payload is not None:
+                self._begin(codec.decode(payload, Generation))
+        if _belongs(chunk, run.header):
+            run.chunks.append(chunk)
+        else:
+            log.debug("dropped a chunk of round %s of run %s", chunk.round, chunk.run)
+
+    def _next(self, *, peek: bool = False) -> Chunk | None:
+        """A chunk of the run that has waited longest."""
+        for name, run in list(self._runs.items()):
+            if run.chunks:
+                if peek:
+                    return run.chunks[0]
+                self._runs.move_to_end(name)
+                return run.chunks.popleft()
+        return None
+
+    def _run(self, chunk: Chunk) -> None:
+        header = self._runs[chunk.run].header
+        assert header is not None  # noqa: S101  a chunk is only queued behind its header
+        backend = self._backend(header)
+        if backend is None:
+            return
+        if isinstance(backend, FarmError):
+            for job in chunk.jobs:
+                self._fail(chunk, job.index, backend)
+            return
+        jobs = list(chunk.jobs)
+        if len(header.mu) != backend.parameters or any(j.eps.size not in (0, backend.parameters) for j in jobs):
+            log.warning("ignored jobs of run %s: not %d parameters", chunk.run, backend.parameters)
+            return
+        try:
+            results = backend.run(header.mu, jobs)
+        except Exception:  # whatever it was, others may be able to, and the learner decides
+            log.exception("a chunk of run %s failed; trying its jobs one by one", chunk.run)
+            results = []
+            for job in jobs:
+                try:
+                    results += backend.run(header.mu, [job])
+                except Exception as error:  # noqa: BLE001
+                    self._fail(chunk, job.index, error)
+        self._answer(chunk, Results(**_round(chunk), worker=self.id, results=tuple(results)))
+
+    def _backend(self, header: Generation) -> Backend | FarmError | None:
+        """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
+        if header.spec not in self._backends:
+            payload = self._session.ask(keys.spec(self._config.farm, header.run), _ASK)
+            if payload is None or hashlib.sha256(payload).hexdigest() != header.spec:
+                log.warning("run %s does not tell what it simulates; its jobs wait", header.run)
+                return None
+            try:
+                spec = codec.decode(payload, Spec)
+                self._backends[header.spec] = BACKENDS[self._config.backend](spec)
+                log.info("serving run %s", header.run)
+            except FarmError as error:
+                log.error("cannot serve run %s: %s", header.run, error)  # noqa: TRY400  one line, no traceback
+                self._backends[header.spec] = error
+        self._backends.move_to_end(header.spec)
+        while len(self._backends) > _KEEP:
+            _, oldest = self._backends.popitem(last=False)
+            if not isinstance(oldest, FarmError):
+                oldest.close()
+        return self._backends[header.spec]
+
+    def _fail(self, chunk: Chunk, index: int, error: Exception) -> None:
+        text = f"{type(error).__name__}: {error}"[:500]
+        self._answer(chunk, Failure(**_round(chunk), worker=self.id, index=index, error=text))
+
+    def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
+        self._session.publish(keys.result(self._config.farm, chunk.run, self.id), codec.encode(message))
+
+    def _want(self, *, idle: bool) -> None:
+        capacity = BACKENDS[self._config.backend].capacity
+        message = Want(worker=self.id, credits=2 * capacity, idle=idle, version=__version__)
+        self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=True)
+
+
+def _belongs(chunk: Chunk, header: Generation | None) -> bool:
+    return header is not None and (chunk.incarnation, chunk.round) == (header.incarnation, header.round)
+
+
+def _round(chunk: Chunk) -> dict[str, object]:
+    return {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round}
