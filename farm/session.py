@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 _CHANNEL: Final = 10_000  # samples a subscription holds before its thread moves them
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _OPEN_S: Final = 1.0
+_JOIN_S: Final = 1.0
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -80,6 +81,8 @@ class Session:
         self._session = session
         self.events = events
         self._threads: list[threading.Thread] = []
+        self._declared: list[zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
+        self._tokens: list[zenoh.LivelinessToken] = []
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
         """Send bytes to whoever subscribed to the key; without block a stuck receiver loses them."""
@@ -104,11 +107,12 @@ class Session:
 
     def token(self, key: str) -> None:
         """Show that we are here, until the session closes. Declare it after everything else."""
-        self._tokens = (*getattr(self, "_tokens", ()), self._session.liveliness().declare_token(key))
+        self._tokens.append(self._session.liveliness().declare_token(key))
 
     def answer(self, key: str, reply: Callable[[], bytes]) -> None:
         """Answer every query on the key with what `reply` gives (called on another thread)."""
         queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(_CHANNEL))
+        self._declared.append(queryable)
 
         def serve() -> None:
             for query in queryable:
@@ -125,7 +129,18 @@ class Session:
                     return reply.ok.payload.to_bytes()
         return None
 
+    def close(self) -> None:
+        """Take everything back and wait for the threads: one that is left in Rust aborts the interpreter's exit."""
+        for token in self._tokens:
+            token.undeclare()
+        for declared in self._declared:
+            declared.undeclare()
+        for thread in self._threads:
+            thread.join(_JOIN_S)
+
     def _drain(self, topic: str, subscriber: "zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]") -> None:
+        self._declared.append(subscriber)
+
         def move() -> None:
             for sample in subscriber:
                 alive = sample.kind == zenoh.SampleKind.PUT
@@ -209,7 +224,11 @@ def _open(mode: dict[str, object], direction: Literal["listen", "connect"], endp
 @contextmanager
 def _closing(session: zenoh.Session) -> Iterator[Session]:
     with session:
-        yield Session(session, queue.SimpleQueue())
+        opened = Session(session, queue.SimpleQueue())
+        try:
+            yield opened
+        finally:
+            opened.close()
 
 
 def _first_line(error: Exception) -> str:

@@ -9,8 +9,12 @@ from farm.hand import FINGERS
 
 _BACKGROUND: Final = [74, 80, 88, 255]
 _EYE: Final = rrb.EyeControls3D(
-    kind=rrb.Eye3DKind.Orbital, position=(0.30, -0.16, 0.14), look_target=(0.035, 0.02, 0.01), eye_up=(0, 0, 1)
+    kind=rrb.Eye3DKind.Orbital,
+    position=(0.275, -0.145, 0.085),
+    look_target=(0.03, 0.014, 0.007),
+    eye_up=(0, 0, 1),
 )
+_JOINTS: Final = "Joints [rad]: lighter to darker along the finger, targets thin"
 _PICTURES: Final = 0.42
 """Height of the pictures below a scene of 1."""
 
@@ -31,7 +35,9 @@ def learning(horizon: float) -> rrb.Blueprint:
         row_shares=[1.0, _PICTURES],
     )
     tabs = rrb.Tabs(_learning(), rrb.Vertical(*_curves(horizon), name="Rollout"), _config())
-    return _blueprint(rrb.Horizontal(left, tabs, column_shares=[0.45, 0.55]), "generation", "following")
+    return _blueprint(
+        rrb.Horizontal(left, tabs, column_shares=[0.45, 0.55]), "generation", "following"
+    )
 
 
 def replay(horizon: float) -> rrb.Blueprint:
@@ -77,45 +83,38 @@ def _config() -> rrb.View:
 
 
 def _learning() -> rrb.Container:
-    returns = rrb.TimeSeriesView(
-        name="Return",
-        contents=["/learning/return", "/learning/return_std"],
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
-    shares = rrb.TimeSeriesView(
-        origin="/learning/success",
-        name="Success",
-        axis_y=rrb.ScalarAxis(range=(-0.05, 1.05)),
-        plot_legend=rrb.Corner2D.LeftTop,
-    )
     return rrb.Vertical(
-        returns,
-        rrb.Horizontal(shares, _plot("/learning/lost", "Lost rollouts")),
-        rrb.Horizontal(_plot("/learning/sigma", "Sigma"), _plot("/learning/mean_norm", "Norm of mu")),
+        _plot(
+            "Return", "/learning/return", "/learning/return_std", legend=rrb.Corner2D.RightBottom
+        ),
         rrb.Horizontal(
-            rrb.TimeSeriesView(
-                name="Farm",
-                contents=["/farm/workers", "/farm/reissued"],
-                plot_legend=rrb.Corner2D.LeftTop,
-            ),
-            _plot("/farm/rollouts_per_s", "Rollouts a second"),
+            _plot("Success", "/learning/success"),
+            _plot("Sigma", "/learning/sigma"),
+            _plot("Norm of mu", "/learning/mean_norm", legend=None),
+        ),
+        rrb.Horizontal(
+            _plot("Farm", "/farm/workers", "/farm/reissued"),
+            _plot("Rollouts a second", "/farm/rollouts_per_s", legend=None),
+            _plot("Lost rollouts", "/learning/lost"),
         ),
         _log(),
-        row_shares=[2.2, 1, 1, 1, 1],
+        row_shares=[2.4, 1.1, 1.1, 1],
         name="Learning",
     )
 
 
-def _plot(origin: str, name: str) -> rrb.View:
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=rrb.Corner2D.LeftTop)
+def _plot(
+    name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop
+) -> rrb.View:
+    shown = rrb.PlotLegend(legend, visible=legend is not None)
+    return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=shown)
 
 
 def _log() -> rrb.View:
-    return rrb.TextLogView(
-        origin="/log",
-        name="Log",
-        columns=rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"]),
+    columns = rrb.TextLogColumns(
+        timeline_columns=["generation"], text_log_columns=["loglevel", "body"]
     )
+    return rrb.TextLogView(origin="/log", name="Log", columns=columns)
 
 
 def _curves(horizon: float) -> list[rrb.View]:
@@ -125,12 +124,12 @@ def _curves(horizon: float) -> list[rrb.View]:
         end=rr.TimeRangeBoundary.cursor_relative(seconds=horizon),
     )
     plots = [
-        rrb.TimeSeriesView(origin=origin, name=name, time_ranges=window, plot_legend=corner)
-        for origin, name, corner in (
-            ("/reward/terms", "Reward terms", rrb.Corner2D.LeftBottom),
-            ("/contacts/force", "Force on the fingertips [N]", rrb.Corner2D.LeftTop),
-            ("/joints", "Joints [rad]: position (thick), target (thin)", rrb.Corner2D.LeftTop),
+        rrb.TimeSeriesView(origin=origin, name=name, time_ranges=window, plot_legend=legend)
+        for origin, name, legend in (
+            ("/reward/terms", "Reward terms", rrb.PlotLegend(rrb.Corner2D.LeftBottom)),
+            ("/contacts/force", "Fingertip forces [N]", rrb.PlotLegend(rrb.Corner2D.LeftTop)),
+            ("/joints", _JOINTS, rrb.PlotLegend(visible=False)),
         )
     ]
-    lanes = rrb.StateTimelineView(origin="/contacts/state", name="Contact", time_ranges=window)
-    return [*plots, lanes]
+    # A window would not move these lanes' axis, only empty the rest of it.
+    return [*plots, rrb.StateTimelineView(origin="/contacts/state", name="Contact")]

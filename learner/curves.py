@@ -1,6 +1,6 @@
 """Curves of a run as Rerun entities: their names and colours, and a generation's values."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -19,44 +19,48 @@ BLUE: Final = (0, 114, 178)
 VERMILLION: Final = (213, 94, 0)
 GREY: Final = (150, 150, 150)
 
-def lines(names: Iterable[str], colours: Iterable[Colour], width: float = 2.0, hidden: int = 0) -> rr.SeriesLines:
-    """Names and colours of an entity's curves; the last `hidden` are switched off until asked for."""
-    names = list(names)
-    shown = [i < len(names) - hidden for i in range(len(names))]
+
+def lines(
+    names: Sequence[str], colours: Iterable[Colour], width: float = 2.0, hidden: Sequence[str] = ()
+) -> rr.SeriesLines:
+    """Names and colours of an entity's curves; hidden ones are a click on the legend away."""
     return rr.SeriesLines(
-        names=names, colors=list(colours), widths=[width] * len(names), visible_series=shown
+        names=list(names),
+        colors=list(colours),
+        widths=[width] * len(names),
+        visible_series=[name not in hidden for name in names],
     )
 
 
 def static() -> list[tuple[str, Any]]:
-    """Names and colours of the learning curves."""
-    returns = ("best", "baseline", "mean policy", "mean", "min", "max")
+    """Names and colours of the learning curves, in the order of `statistics`."""
+    returns = ("mean", "min", "max", "best", "baseline", "mean policy")
+    colours = (SKY, VERMILLION, GREEN, ORANGE, GREY, YELLOW)
+    band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
     return [
-        (
-            "/learning/return",
-            lines(returns, [ORANGE, GREY, YELLOW, SKY, VERMILLION, GREEN], hidden=3),
-        ),
-        (
-            "/learning/return_std",
-            rr.Measurements.from_fields(names="mean ± standard deviation", colors=[SKY], widths=[2.0]),
-        ),
-        ("/learning/sigma", lines(("mean", "min", "max"), [SKY, BLUE, GREY])),
-        ("/learning/mean_norm", lines(["norm"], [SKY])),
-        ("/learning/success", lines(("exploring rollouts", "mean policy"), [SKY, YELLOW])),
-        ("/learning/lost", lines(("dropped", "failed", "clamped"), [ORANGE, VERMILLION, GREY])),
-        ("/farm/workers", lines(["workers"], [GREEN])),
-        ("/farm/rollouts_per_s", lines(["rollouts a second"], [SKY])),
-        ("/farm/reissued", lines(["jobs given out again"], [ORANGE])),
+        ("/learning/return", lines(returns, colours, hidden=("mean", "min", "max"))),
+        ("/learning/return_std", band),
+        ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",))),
+        ("/learning/mean_norm", lines(("norm of mu",), (SKY,))),
+        ("/learning/success", lines(("exploring", "mean policy"), (SKY, YELLOW))),
+        ("/learning/lost", lines(("dropped", "failed", "clamped"), (ORANGE, VERMILLION, GREY))),
+        ("/farm/workers", lines(("workers",), (GREEN,))),
+        ("/farm/rollouts_per_s", lines(("rollouts per s",), (SKY,))),
+        ("/farm/reissued", lines(("reissued",), (ORANGE,))),
     ]
 
 
-def statistics(p: Progress, rate: float) -> list[tuple[str, Any]]:
+def statistics(progress: Progress, rate: float) -> list[tuple[str, Any]]:
+    """A generation's values; rate is of exploring rollouts [1/s]."""
+    p = progress
     baseline = np.nan if p.baseline is None else p.baseline
-    returns = [p.best, baseline, p.mean_policy_return, p.return_mean, p.return_min, p.return_max]
-    band = rr.Measurements.from_fields(values=[p.return_mean], variances=[p.return_std**2])
+    mean, spread = p.return_mean, (p.return_min, p.return_max)
     return [
-        ("/learning/return", rr.Scalars(returns)),
-        ("/learning/return_std", band),
+        ("/learning/return", rr.Scalars([mean, *spread, p.best, baseline, p.mean_policy_return])),
+        (
+            "/learning/return_std",
+            rr.Measurements.from_fields(values=[mean], variances=[p.return_std**2]),
+        ),
         ("/learning/sigma", rr.Scalars([p.sigma_mean, p.sigma_min, p.sigma_max])),
         ("/learning/mean_norm", rr.Scalars([p.mean_norm])),
         ("/learning/success", rr.Scalars([p.success_rate, float(p.mean_policy_success)])),

@@ -4,7 +4,7 @@ Entities hang flat below /world: /world/<body>, with its geometries and, at a fi
 its taxels as children. A finger keeps its colour everywhere (palette of Okabe and Ito).
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -31,11 +31,14 @@ ARROW: Final = 0.012
 LONGEST: Final = 0.1
 """Arrows are cut here: one hard blow must not fill the scene [m]."""
 
-_RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
-    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
+_RAMP: Final = (
+    np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
+        [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
+    )
 )
 _SHADES: Final = (1.25, 0.95, 0.65)
-_TAXEL_RADIUS: Final = 0.0011
+_TAXEL_RADIUS: Final = 0.0014
+_GLASS: Final = 120  # fingertips are see-through: taxels and arrows start where they touch
 _FELT: Final = ("free", "contact")
 
 
@@ -56,7 +59,9 @@ class Drawing:
         self._bodies = scene.bodies
         self._geometries = scene.geometries()
         self._rest = scene.poses(scene.model.qpos0[None])[0]
-        self._fixed = {n for n in self._bodies if scene.model.body_weldid[scene.model.body(n).id] == 0}
+        self._fixed = {
+            n for n in self._bodies if scene.model.body_weldid[scene.model.body(n).id] == 0
+        }
         tips = {g.name: g for g in self._geometries}
         self._tips = [tips[f"{finger}_tip"] for finger in FINGERS]
 
@@ -64,22 +69,32 @@ class Drawing:
         """Entities and archetypes that are logged once."""
         yield "/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
         for geometry in self._geometries:
-            yield f"/world/{geometry.body}/{geometry.name}", solid(geometry)
+            yield f"/world/{geometry.body}/{geometry.name}", solid(geometry, self._colour(geometry))
         for name, pose in zip(self._bodies, self._rest, strict=True):
             if name in self._fixed:
-                yield f"/world/{name}", rr.Transform3D(translation=pose[:3], quaternion=_xyzw(pose[3:]))
+                yield (
+                    f"/world/{name}",
+                    rr.Transform3D(translation=pose[:3], quaternion=_xyzw(pose[3:])),
+                )
         for finger, tip in zip(FINGERS, self._tips, strict=True):
-            yield _taxels(tip), rr.Points3D.from_fields(
-                positions=np.array(tip.position) + tactile.positions(), radii=_TAXEL_RADIUS
+            yield (
+                _taxels(tip),
+                rr.Points3D.from_fields(
+                    positions=np.array(tip.position) + tactile.positions(), radii=_TAXEL_RADIUS
+                ),
             )
             yield f"/tactile/{finger}", _image_style(tactile.SHAPE)
-            yield f"/contacts/state/{finger}", rr.StateConfiguration(
-                values=_FELT, colors=[(52, 54, 58), FINGER_COLOURS[finger]]
+            yield (
+                f"/contacts/state/{finger}",
+                rr.StateConfiguration(values=_FELT, colors=[(52, 54, 58), FINGER_COLOURS[finger]]),
             )
         yield "/contacts/force", lines(FINGERS, FINGER_COLOURS.values())
         yield "/reward/terms", lines(TERMS, TERM_COLOURS)
         yield "/joints/position", lines(_joint_names(), _joint_colours(), width=2.5)
-        yield "/joints/target", lines([f"{n} target" for n in _joint_names()], _joint_colours(), width=0.8)
+        yield (
+            "/joints/target",
+            lines([f"{n} target" for n in _joint_names()], _joint_colours(), width=0.8),
+        )
 
     def columns(self, rollout: Trajectory) -> Iterator[Columns]:
         """A rollout, all its frames.
@@ -90,17 +105,27 @@ class Drawing:
         count = len(rollout.times)
         if rollout.bodies.shape != (count, len(self._bodies), 7):
             expected = (count, len(self._bodies), 7)
-            raise ValueError(f"poses of shape {rollout.bodies.shape}, expected {expected}: another scene?")
+            raise ValueError(
+                f"poses of shape {rollout.bodies.shape}, expected {expected}: another scene?"
+            )
         for name, poses in zip(self._bodies, np.moveaxis(rollout.bodies, 1, 0), strict=True):
             if name not in self._fixed:
                 yield Columns(
                     f"/world/{name}",
-                    rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:])),
+                    rr.Transform3D.columns(
+                        translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:])
+                    ),
                 )
         yield from self._touch(rollout)
         yield Columns("/reward/terms", _scalars(rollout.terms))
         yield Columns("/joints/position", _scalars(rollout.joints))
         yield Columns("/joints/target", _scalars(rollout.targets))
+
+    def _colour(self, geometry: Geometry) -> list[int]:
+        """RGBA of 0 to 255: a fingertip's is its finger's, all else has its own."""
+        if geometry in self._tips:
+            return [*FINGER_COLOURS[FINGERS[self._tips.index(geometry)]], _GLASS]
+        return [round(255 * value) for value in geometry.colour]
 
     def _touch(self, rollout: Trajectory) -> Iterator[Columns]:
         force = rollout.images.sum(axis=-1)
@@ -152,7 +177,7 @@ class Drawing:
 
 
 def trace(values: AnyArray) -> rr.DepthImage:
-    """Taxels over a rollout, (T, 54) [N], as an image of 54 rows (finger by finger) and T columns."""
+    """Taxels over a rollout, (T, 54) [N]: an image of 54 rows, finger by finger, and T columns."""
     image = np.ascontiguousarray(values.T, dtype=np.float32)
     return rr.DepthImage(
         image,
@@ -188,11 +213,11 @@ def rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     return np.asarray(vector + 2.0 * (scalar * cross + np.cross(axis, cross)))
 
 
-def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (one of four archetypes without a common base)
+def solid(geometry: Geometry, colour: list[int]) -> Any:  # noqa: ANN401  (one of four archetypes without a common base)
     """A MuJoCo primitive as a Rerun one, in its body's frame."""
     style = {
         "quaternions": [_xyzw(np.array(geometry.quaternion))],
-        "colors": [[round(255 * c) for c in geometry.colour]],
+        "colors": [colour],
         "fill_mode": rr.components.FillMode.Solid,
     }
     centre, size = np.array(geometry.position), geometry.size

@@ -5,6 +5,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from farm.policy import Features, Policy
 from farm.session import Session
 from farm.states import STATES
 from farm.trajectory import Trajectory
+from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.algorithms import PGPEState
 from learner.checkpoint import Checkpoint
@@ -77,37 +79,24 @@ def _mean_job(index: int, rate: str, perturbation: tuple[int, ...] | None) -> Jo
 class Learner:
     """One run, from its start or its checkpoint to its end."""
 
-    def __init__(self, config: RunConfig, folder: RunFolder, *, resume: bool = False) -> None:
-        """Prepare a new run, or take up the one in the folder.
+    def __init__(self, config: RunConfig, folder: RunFolder, at: Checkpoint) -> None:
+        """Take up a run where its checkpoint stands: `start`'s for a new one.
 
         Raises:
-          ConfigError: the run to start from, or to resume, does not fit.
+          CheckpointError: the checkpoint does not fit the configuration.
         """
-        self.config, self.folder = config, folder
-        if resume:
-            self._at = folder.rewind()
-        else:
-            self._at = _begin(config, folder.name)
-        self.policy = _policy(config, Features(self._at.frequencies, self._at.phases))
+        self.config, self.folder, self._at = config, folder, at
         try:
-            self.state: PGPEState = config.algorithm.restore(self._at.state)
+            self.state: PGPEState = config.algorithm.restore(at.state)
         except ValueError as error:
             raise CheckpointError(f"{folder.checkpoint}: {error}") from None
-        if not resume:
-            folder.save(self._at)
-        self._before = self._at.reissued
+        self._before = at.reissued
+        folder.save(at)
 
     @property
     def spec(self) -> Spec:
         """What workers simulate."""
-        return Spec(
-            run=self.folder.name,
-            task="finger-gait",
-            task_config=configs.to_dict(self.config)["task"],
-            policy_config=configs.to_dict(self.config)["policy"],
-            frequencies=self._at.frequencies,
-            phases=self._at.phases,
-        )
+        return specification(self.config, self._at)
 
     @property
     def over(self) -> bool:
@@ -205,8 +194,9 @@ class Learner:
 
     def _replay_job(self, index: int) -> list[Job]:
         """The best rollout so far once more at physics rate, if that has not been done."""
-        best = self._at.best
-        return [] if best is None or self._at.replayed else [replace(best, index=index, rate="physics")]
+        at = self._at
+        due = at.best is not None and not at.replayed
+        return [replace(at.best, index=index, rate="physics")] if due and at.best else []
 
     def _note(
         self,
@@ -275,8 +265,12 @@ class Learner:
             ) from None
 
 
-def _begin(config: RunConfig, run: str) -> Checkpoint:
-    """A run before its first generation."""
+def start(config: RunConfig, run: str) -> Checkpoint:
+    """A run before its first generation.
+
+    Raises:
+      ConfigError: the run to start from cannot be used.
+    """
     size = STATES[config.task.state].size
     features = Features.draw(config.policy, size, np.random.default_rng((config.seed, 2**32)))
     state = config.algorithm.init(_policy(config, features).size)
@@ -289,17 +283,23 @@ def _begin(config: RunConfig, run: str) -> Checkpoint:
     )  # fmt: skip
 
 
+def specification(config: RunConfig, at: Checkpoint) -> Spec:
+    """What a run simulates, for workers."""
+    settings = configs.to_dict(config)
+    return Spec(
+        run=at.run, task="finger-gait", task_config=settings["task"], policy_config=settings["policy"],
+        frequencies=at.frequencies, phases=at.phases,
+    )  # fmt: skip
+
+
 def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Features]:
     """Start from another run: its mean, perhaps its sigma, and the features that its parameters belong to."""
-    from pathlib import Path
-
     other = RunFolder.open(Path(str(config.init_from)))
     theirs = other.read_config()
-    for part, name in ((theirs.policy, "policy"), (theirs.task.state, "task")):
-        mine = config.policy if name == "policy" else config.task.state
-        if part != mine:
-            raise ConfigError(f"--init-from {config.init_from}: its controller is another ({part} there, {mine} here)")
-    at = other.rewind()
+    for there, here in ((theirs.policy, config.policy), (theirs.task.state, config.task.state)):
+        if there != here:
+            raise ConfigError(f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})")
+    at = checkpoints.load(other.checkpoint)
     state = replace(fresh, mu=at.state["mu"])
     if config.init_sigma == "run":
         state = replace(state, sigma=at.state["sigma"])

@@ -3,8 +3,8 @@
 One recording a run, its id the run's name. Every row stands on three timelines:
 
     generation   updates done, a sequence
-    sim_time     generation x horizon + time in its sample rollout, a duration: rollouts play without gaps
-    wall_time    when it was recorded; a rollout's frames lie before its end, as far apart as they were simulated
+    sim_time     generation x horizon + time in its sample rollout, a duration without gaps
+    wall_time    when it was recorded; a rollout's frames fill the time since the last one
 
 A file is never overwritten: a run that goes on writes run.part2.rrd, and closing merges the parts
 into run.rrd and compacts it. All parts opened together are one recording as well.
@@ -12,7 +12,7 @@ into run.rrd and compacts it. All parts opened together are one recording as wel
 
 import socket
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,27 +20,33 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from farm.arrays import AnyArray, FloatArray
+from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.scene import Scene
 from farm.trajectory import Trajectory
 from learner import blueprint, curves
-from learner.drawing import Drawing, trace
+from learner.drawing import Columns, Drawing, trace
 from learner.progress import Progress
 from learner.recording_files import compact, next_part, parts
+
+__all__ = ["Recorder", "parts", "record_replay"]
 
 APPLICATION: Final = "rolloutfarm"
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
-HOLD: Final = 0.5
-"""How long a replay rests at a rollout's end [s]."""
-_LEVELS: Final = {"WARNING": "WARN", "CRITICAL": "ERROR"}  # the standard library's names in Rerun's
+SEAM: Final = 1e-6
+"""A rollout's last frame comes so much before the next one's first, which would hide it [s]."""
+PAUSE: Final = 0.1
+"""Between two rollouts of a replay [s]."""
+_LEVELS: Final = {"WARNING": "WARN"}  # the standard library's name in Rerun's
+
+Times = list[rr.TimeColumn]
 
 
 class Recorder:
     """Writes a run down, generation by generation."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         path: Path | None,
         *,
@@ -59,7 +65,7 @@ class Recorder:
           scene: what is drawn.
           config: the resolved configuration, Markdown.
           horizon: nominal length of a rollout [s].
-          serve: host and port to answer viewers at. Rerun knows no passwords: 127.0.0.1, if in doubt.
+          serve: host and port to answer viewers at; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
 
         Raises:
@@ -78,7 +84,9 @@ class Recorder:
             sinks.append(rr.GrpcServerSink(*serve))
             self._server = serve
         if not sinks:
-            raise ConfigError("a recording without a file and without an address to serve; give one")
+            raise ConfigError(
+                "a recording without a file and without an address to serve; give one"
+            )
         self._stream = _open(run, sinks, blueprint.learning(horizon))
         _log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
 
@@ -91,15 +99,19 @@ class Recorder:
         return f"rerun+http://{f'[{host}]' if ':' in host else host}:{port}/proxy"
 
     def generation(
-        self, progress: Progress, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
+        self,
+        progress: Progress,
+        sample: Trajectory | None,
+        traces: Mapping[str, AnyArray],
+        rate: float,
     ) -> None:
         """Record a generation that is over.
 
         Args:
           progress: its statistics.
           sample: a rollout at control rate, usually the mean policy's.
-          traces: taxels over rollouts [N]: `best` and `worst` (T, 54) as pictures; `all` (2N, T, 54)
-            float32, kept bit by bit.
+          traces: taxels over rollouts [N]: `best` and `worst` (T, 54) as pictures; `all`
+            (2N, T, 54) float32, kept bit by bit.
           rate: exploring rollouts a second.
 
         Raises:
@@ -107,24 +119,29 @@ class Recorder:
           RuntimeError: the file takes no more (a full disk).
         """
         self._generation = progress.generation
-        now = time.time()
-        start = progress.generation * self._horizon
-        at = _times(progress.generation, [start], [now])
+        start, now = self._start, time.time()
+        at = _times("generation", progress.generation, np.array([start]), np.array([now]))
         for entity, values in curves.statistics(progress, rate):
-            self._send(entity, at, _single(values))
+            self._stream.send_columns(entity, at, _row(values))
         for name, values in traces.items():
-            self._send(*_trace(name, values, at))
+            entity, picture = _trace(name, values)
+            self._stream.send_columns(entity, at, _row(picture))
         if sample is not None:
-            length = min(now - self._last, self._horizon)
-            wall = now + (sample.times / self._horizon - 1.0) * length
-            _send_rollout(self._stream, self._drawing, sample, progress.generation, start, wall)
+            wall = now + (sample.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
+            end = start + self._horizon - SEAM
+            frames = progress.generation, np.minimum(start + sample.times, end), wall
+            _send(self._stream, self._drawing.columns(sample), _rows("generation", *frames))
         self._last = now
         self._stream.flush(timeout_sec=FLUSH)
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a line; levels are those of the standard library."""
-        at = _times(self._generation, [self._generation * self._horizon], [time.time()])
-        self._send("/log", at, _single(rr.TextLog(text, level=_LEVELS.get(level, level))))
+        at = _times(
+            "generation", self._generation, np.array([self._start]), np.array([time.time()])
+        )
+        self._stream.send_columns(
+            "/log", at, _row(rr.TextLog(text, level=_LEVELS.get(level, level)))
+        )
 
     def close(self) -> None:
         """Write everything out, merge the parts and compact them.
@@ -139,16 +156,18 @@ class Recorder:
         if self._path is not None:
             compact(self._path)
 
-    def _send(self, entity: str, times: list[rr.TimeColumn], columns: Iterable[Any]) -> None:
-        self._stream.send_columns(entity, times, columns)
+    @property
+    def _start(self) -> float:
+        """Where the generation begins on sim_time [s]."""
+        return self._generation * self._horizon
 
 
 def record_replay(
     path: Path, *, run: str, scene: Scene, config: str, rollouts: Sequence[tuple[str, Trajectory]]
 ) -> None:
-    """Write rollouts into a file of their own, one after the other; a file that is there is replaced.
+    """Write rollouts into a file of their own, one after the other; it may replace one.
 
-    Timelines are sim_time, with a rest after each rollout, and rollout, counted from 1.
+    Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1.
 
     Args:
       path: of the recording.
@@ -164,11 +183,10 @@ def record_replay(
     _log_static(stream, [*drawing.static(), _config(config)])
     start = 0.0
     for number, (name, rollout) in enumerate(rollouts, 1):
-        text = f"## {name}\nreturn {rollout.value:.4g}\n\n{'success' if rollout.success else 'no success'}"
-        at = _times(number, [start], None, "rollout")
-        stream.send_columns("/rollout", at, _single(rr.TextDocument(text, media_type="text/markdown")))
-        _send_rollout(stream, drawing, rollout, number, start, None, "rollout")
-        start += float(rollout.times[-1]) + HOLD
+        at = _times("rollout", number, np.array([start]))
+        stream.send_columns("/rollout", at, _row(_caption(name, rollout)))
+        _send(stream, drawing.columns(rollout), _rows("rollout", number, start + rollout.times))
+        start += float(rollout.times[-1]) + PAUSE
     stream.flush(timeout_sec=FLUSH)
     stream.disconnect()
     compact(path)
@@ -182,7 +200,9 @@ def _check_free(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
-        raise ConfigError(f"cannot serve the recording at {host}:{port}: {error}; choose another port") from error
+        raise ConfigError(
+            f"cannot serve the recording at {host}:{port}: {error}; choose another port"
+        ) from error
 
 
 def _open(recording: str, sinks: list[Any], layout: rrb.Blueprint) -> rr.RecordingStream:
@@ -200,53 +220,73 @@ def _log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]])
 
 
 def _config(text: str) -> tuple[str, Any]:
-    return "/config", rr.TextDocument(text, media_type="text/markdown")
+    return "/config", _markdown(text)
 
 
 def _file(path: Path) -> rr.FileSink:
     part = next_part(path)
-    part.touch()  # Rerun's own error names no errno
+    part.touch()  # fails with an errno; Rerun's own error has none
     return rr.FileSink(part)
 
 
-def _single(archetype: Any) -> list[Any]:  # noqa: ANN401  (Rerun's archetypes have no public base)
+def _caption(name: str, rollout: Trajectory) -> rr.TextDocument:
+    success = "success" if rollout.success else "no success"
+    return _markdown(f"### {name}\n\nreturn {rollout.value:.4g}\n\n{success}")
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type="text/markdown")
+
+
+def _trace(name: str, values: AnyArray) -> tuple[str, Any]:
+    if name != "all":
+        return f"/tactile/trace/{name}", trace(values)
+    array = np.ascontiguousarray(values, dtype=np.float32)
+    return "/tactile/traces", rr.Tensor(array, dim_names=("rollout", "step", "taxel"))
+
+
+def _row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no public base)
     """An archetype as columns of one row."""
-    return [batch.partition([len(batch.as_arrow_array())]) for batch in archetype.as_component_batches()]
+    batches = archetype.as_component_batches()
+    return [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
 
 
-def _trace(name: str, values: AnyArray) -> tuple[str, list[Any]]:
-    """Entity and columns of a trace."""
-    if name == "all":
-        array = np.ascontiguousarray(values, dtype=np.float32)
-        return "/tactile/traces", _single(rr.Tensor(array, dim_names=("rollout", "step", "taxel")))
-    return f"/tactile/trace/{name}", _single(trace(values))
-
-
-def _times(
-    number: int, sim: FloatArray, wall: FloatArray | None, counter: str = "generation"
-) -> list[rr.TimeColumn]:
-    """Timelines of rows: a number, times in the simulation (n,) [s], and since the epoch (n,) [s]."""
+def _times(counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None) -> Times:
+    """Timelines of n rows: a number, times in the simulation and since the epoch (n,) [s]."""
     columns = [
         rr.TimeColumn(counter, sequence=np.full(len(sim), number)),
         rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
     ]
     if wall is not None:
-        columns.append(rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]")))
+        columns.append(
+            rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]"))
+        )
     return columns
 
 
 def _nanoseconds(seconds: FloatArray) -> IntArray:
-    """Rounded: Rerun alone would cut off."""
-    return np.rint(np.asarray(seconds) * 1e9).astype(np.int64)
+    """Rounded: Rerun would cut off."""
+    return np.rint(seconds * 1e9).astype(np.int64)
 
 
-def _send_rollout(
+def _rows(
+    counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None
+) -> Callable[[IntArray | None], Times]:
+    """Timelines of some of n rows, of all where None."""
+    whole = _times(counter, number, sim, wall)
+
+    def some(rows: IntArray | None) -> Times:
+        if rows is None:
+            return whole
+        return _times(counter, number, sim[rows], None if wall is None else wall[rows])
+
+    return some
+
+
+def _send(
     stream: rr.RecordingStream,
-    drawing: Drawing,
-    rollout: Trajectory,
-    sim: FloatArray,
-    times: Callable[[slice | IntArray], list[rr.TimeColumn]],
+    columns: Iterable[Columns],
+    times: Callable[[IntArray | None], Times],
 ) -> None:
-    whole = times(slice(None))
-    for part in drawing.columns(rollout):
-        stream.send_columns(part.entity, whole if part.rows is None else times(part.rows), part.columns)
+    for part in columns:
+        stream.send_columns(part.entity, times(part.rows), part.columns)

@@ -1,7 +1,8 @@
 """The files of a recording: parts that a run left behind, merged, mended and compacted.
 
 Rerun overwrites a file it is given, and a file whose last bytes a crash tore off cannot be read
-until `rerun rrd optimize` has mended it. So a run that goes on mends what is there and begins a part of its own.
+until `rerun rrd optimize` has mended it. So a run that goes on mends what is there and begins a
+part of its own.
 """
 
 import contextlib
@@ -17,7 +18,7 @@ _COMPACTING: Final = 600.0  # [s]; 30 MiB take about one
 
 
 def parts(path: Path) -> list[Path]:
-    """The files of a recording that are there, oldest first: run.rrd, run.part2.rrd, ...; open them together."""
+    """The files of a recording that are there: run.rrd, run.part2.rrd, ...; open them together."""
     further = [f for f in path.parent.glob(f"{path.stem}.part*{path.suffix}") if _number(path, f)]
     further.sort(key=lambda f: _number(path, f))
     return [path, *further] if path.exists() else further
@@ -31,8 +32,20 @@ def compact(path: Path) -> bool:
     """
     found = parts(path)
     merged = path.with_name(f"{path.stem}.merging{path.suffix}")
-    with tempfile.TemporaryDirectory() as home, contextlib.suppress(OSError, subprocess.SubprocessError):
-        command = [sys.executable, "-m", "rerun_cli", "rrd", "optimize", *map(str, found), "-o", str(merged)]
+    with (
+        tempfile.TemporaryDirectory() as home,
+        contextlib.suppress(OSError, subprocess.SubprocessError),
+    ):
+        command = [
+            sys.executable,
+            "-m",
+            "rerun_cli",
+            "rrd",
+            "optimize",
+            *map(str, found),
+            "-o",
+            str(merged),
+        ]
         subprocess.run(  # noqa: S603
             command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING
         )
@@ -45,6 +58,16 @@ def compact(path: Path) -> bool:
     return False
 
 
+def next_part(path: Path) -> Path:
+    """Where a run goes on recording; what is there becomes one file first, if it can."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not parts(path):
+        return path
+    compact(path)
+    last = max(_number(path, parts(path)[-1]), 1)
+    return path.with_name(f"{path.stem}.part{last + 1}{path.suffix}")
+
+
 def _number(path: Path, part: Path) -> int:
     """Which part a file is, 0 where it is none."""
     digits = part.name.removeprefix(f"{path.stem}.part").removesuffix(path.suffix)
@@ -52,20 +75,9 @@ def _number(path: Path, part: Path) -> int:
 
 
 def _quiet(home: str) -> dict[str, str]:
-    """An environment in which Rerun's command sends no usage data and leaves no file in the user's home."""
+    """An environment in which Rerun's command sends no usage data and writes no settings."""
     settings = Path(home, "rerun")
     settings.mkdir()
     values = {"analytics_enabled": False, "analytics_id": "none"}
     (settings / "analytics.json").write_text(json.dumps(values), encoding="utf-8")
     return {**os.environ, "HOME": home, "XDG_CONFIG_HOME": home, "RUST_LOG": "warn"}
-
-
-def _file(path: Path) -> rr.FileSink:
-    """A sink for the next part; the parts before become one, mended where a crash tore them."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if parts(path):
-        compact(path)
-        last = parts(path)[-1]
-        path = path.with_name(f"{path.stem}.part{max(_number(path, last), 1) + 1}{path.suffix}")
-    path.touch()  # Rerun's own error names no errno
-    return rr.FileSink(path)

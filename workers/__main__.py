@@ -7,8 +7,7 @@ import sys
 import threading
 from dataclasses import dataclass
 
-import tyro
-
+from farm import arguments
 from farm.errors import ConfigError, FarmError
 from workers.worker import WorkerConfig, work
 
@@ -17,7 +16,7 @@ from workers.worker import WorkerConfig, work
 class Process:
     """One worker process."""
 
-    worker: tyro.conf.OmitArgPrefixes[WorkerConfig]
+    worker: WorkerConfig
     exit_with_parent: bool = False
     """End when standard input closes."""
     log_level: str = "INFO"
@@ -30,7 +29,7 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     try:
-        process = tyro.cli(Process)
+        process = arguments.parse(Process, sys.argv[1:], "python -m workers")
         logging.basicConfig(level=process.log_level, format="%(levelname).1s worker %(process)d: %(message)s")
         if process.exit_with_parent:
             threading.Thread(target=_watch_parent, args=(stop,), daemon=True).start()

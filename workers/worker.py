@@ -19,7 +19,7 @@ from typing import Final
 from farm import __version__, codec, keys
 from farm.errors import ConfigError, FarmError, MessageError
 from farm.messages import Chunk, Failure, Generation, Results, Spec, Want
-from farm.session import Event, Session, connect
+from farm.session import Event, Session, check_endpoint, connect
 from workers.backends import BACKENDS, Backend
 
 log = logging.getLogger(__name__)
@@ -35,8 +35,8 @@ _KEEP: Final = 8  # runs whose tasks are kept built
 class WorkerConfig:
     """A worker and where it works."""
 
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Where the learner or a router listens; several are tried in turn."""
+    connect: tuple[str, ...] = ()
+    """Where a learner or a router listens, repeatable (default: tcp/127.0.0.1:7447)."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     name: str = ""
@@ -51,12 +51,14 @@ class WorkerConfig:
         if not self.name:
             host = socket.gethostname().split(".")[0]
             object.__setattr__(self, "name", "".join(c if c.isascii() and c.isalnum() else "-" for c in host) or "host")
+        if not self.connect:
+            object.__setattr__(self, "connect", ("tcp/127.0.0.1:7447",))
+        for endpoint in self.connect:
+            check_endpoint(endpoint)
         keys.checked("farm", self.farm)
         keys.checked("worker", self.name)
         if self.backend not in BACKENDS:
             raise ConfigError(f"unknown backend {self.backend!r}; known are {', '.join(BACKENDS)}")
-        if not self.connect:
-            raise ConfigError("no endpoint to connect to; give --connect tcp/HOST:PORT")
         if self.timeout is not None and not 0 <= self.timeout < float("inf"):
             raise ConfigError(f"timeout is {self.timeout}; expected a number of seconds")
 

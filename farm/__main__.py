@@ -1,0 +1,56 @@
+"""The front door: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+from farm import __version__
+from farm.errors import ConfigError, FarmError
+
+COMMANDS: Final = {
+    "run": "learner and local workers together: learns the gait and records it",
+    "learner": "the learner alone; workers join it from anywhere",
+    "worker": "workers alone; they serve whichever learners are there",
+    "evaluate": "the learnt mean policy on perturbed starts",
+    "replay": "the learnt gait again, at physics rate, into a recording",
+    "view": "opens a run's recording in the Rerun viewer",
+    "runs": "a table of the runs in a folder",
+}
+"""Commands and what they are for; each is a module of farm.commands with a function `main`."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; exit status 0, 1 for a failure, 2 for a mistake in its use."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    name = words[0] if words else "--help"
+    if name in ("-h", "--help", "help"):
+        sys.stdout.write(_overview())
+        return 0
+    if name == "--version":
+        sys.stdout.write(f"rolloutfarm {__version__}\n")
+        return 0
+    try:
+        if name not in COMMANDS:
+            raise ConfigError(f"unknown command {name!r}; known are {', '.join(COMMANDS)} (see farm --help)")
+        return int(importlib.import_module(f"farm.commands.{name}").main(words[1:]))
+    except FarmError as error:
+        sys.stderr.write(f"farm: {error}\n")
+        return 2 if isinstance(error, ConfigError) else 1
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+
+
+def _overview() -> str:
+    rows = "".join(f"  farm {name:<10}{text}\n" for name, text in COMMANDS.items())
+    return (
+        "rolloutfarm: a hand learns to change its grip by touch, on as many machines as you like.\n\n"
+        f"{rows}\n  farm COMMAND --help says what a command takes; farm --version.\n"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

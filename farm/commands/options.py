@@ -1,0 +1,123 @@
+"""What a learner is told besides the run's configuration: nothing here changes a number."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from farm import arguments, keys
+from farm.errors import ConfigError
+from farm.session import check_endpoint
+from learner import config as configs
+from learner.config import RunConfig, changes
+from learner.folder import RunFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerOptions:
+    """Where a run comes from, where it goes, and who may watch."""
+
+    preset: str = "default"
+    """Settings to begin with: default | thesis."""
+    config: Path | None = None
+    """Settings to begin with: a config.json (other flags override it)."""
+    resume: Path | None = None
+    """Go on with the run in this folder; --generations may extend it."""
+    out: Path = Path("runs")
+    """Folder that run folders are made in."""
+    name: str = ""
+    """Name of the run and its folder (default: task-preset-sSEED-UTC time)."""
+    record: bool = True
+    """Record the run with Rerun."""
+    serve: str | None = None
+    """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
+    listen: str | None = None
+    """Where workers can reach the learner (default: tcp/127.0.0.1:7447; farm run: any free port)."""
+    connect: tuple[str, ...] = ()
+    """Dial a router instead of listening, repeatable."""
+    farm: str = "farm"
+    """Name of the farm: learners and workers of one name work together."""
+    log_level: str = "INFO"
+    """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        keys.checked("farm", self.farm)
+        if self.name:
+            keys.checked("run", self.name)
+        if self.listen is not None and self.connect:
+            raise ConfigError("--listen and --connect exclude each other: a learner listens, or dials a router")
+        for endpoint in (*self.connect, *([self.listen] if self.listen else [])):
+            check_endpoint(endpoint)
+        if self.serve is not None:
+            address(self.serve)
+
+
+def address(serve: str) -> tuple[str, int]:
+    """Host and port of [HOST:]PORT.
+
+    Raises:
+      ConfigError: it has another form.
+    """
+    host, _, port = serve.rpartition(":")
+    if not port.isdigit() or not 0 < int(port) < 65536:
+        raise ConfigError(f"--serve {serve!r} is not of the form [HOST:]PORT, for example 9876")
+    return host or "127.0.0.1", int(port)
+
+
+def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
+    """The configuration that other flags change, and the run to resume.
+
+    Raises:
+      ConfigError: two of --preset, --config and --resume, or one that cannot be used.
+    """
+    chosen = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
+    given = [f"--{name}" for name, value in chosen.items() if value is not None]
+    if len(given) > 1:
+        raise ConfigError(f"{' and '.join(given)} exclude each other: each says what to begin with")
+    if chosen["resume"] is not None:
+        folder = RunFolder.open(Path(chosen["resume"]))
+        return folder.read_config(), folder
+    if chosen["config"] is not None:
+        return configs.read(Path(chosen["config"])), None
+    return configs.preset(chosen["preset"] or "default"), None
+
+
+def _value(words: Sequence[str], flag: str) -> str | None:
+    """The last value given for a flag, in either form; a missing one is left to the parser."""
+    found = None
+    for i, word in enumerate(words):
+        if word == flag and i + 1 < len(words):
+            found = words[i + 1]
+        elif word.startswith(flag + "="):
+            found = word.partition("=")[2]
+    return found
+
+
+def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
+    """Whether a run may go on with this configuration.
+
+    Raises:
+      ConfigError: a setting other than the number of generations has changed, or that one is too small.
+    """
+    changed = [change for change in changes(saved, wanted) if change[0] != "generations"]
+    if changed:
+        what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
+        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may grow")
+    done = len(folder.progress())
+    if wanted.generations < done:
+        raise ConfigError(f"--generations {wanted.generations}: the run has {done} behind it")
+
+
+def run_name(options: LearnerOptions, config: RunConfig) -> str:
+    """The new run's name."""
+    what = options.config.stem if options.config else options.preset
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    return keys.checked("run", options.name or f"finger-gait-{what}-s{config.seed}-{stamp}")
+
+
+def parse(kind: type[arguments.C], words: Sequence[str], program: str) -> tuple[arguments.C, RunFolder | None, RunConfig]:
+    """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
+    begin, resumed = origin(words)
+    default = replace(kind(), run=begin)  # type: ignore[type-var]
+    return arguments.parse(kind, words, program, default), resumed, begin

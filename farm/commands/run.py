@@ -1,0 +1,34 @@
+"""`farm run`: learner and local workers together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from farm.commands.learning import learn
+from farm.commands.options import LearnerOptions, parse
+from farm.errors import ConfigError
+from farm.local import Place, free_endpoint
+from learner.config import RunConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCommand:
+    """Learner and local workers together: learns the gait and records it."""
+
+    options: LearnerOptions = field(default_factory=LearnerOptions)
+    """Where the run comes from and where it goes."""
+    workers: int = 2
+    """Worker processes on this machine."""
+    run: RunConfig = field(default_factory=RunConfig)
+    """The run."""
+
+    def __post_init__(self) -> None:
+        """Check the number."""
+        if not 0 <= self.workers <= 1024:
+            raise ConfigError(f"workers is {self.workers}; expected 0 to 1024")
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command, resumed, begin = parse(RunCommand, words, "farm run")
+    place = Place(workers=command.workers, listen=free_endpoint())
+    return learn(command.options, command.run, place, resumed, begin)

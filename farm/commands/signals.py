@@ -1,0 +1,27 @@
+"""Ctrl-C and SIGTERM as a flag that long work looks at."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def stop_flag() -> Iterator[threading.Event]:
+    """Set by the first Ctrl-C or SIGTERM; a second Ctrl-C ends the program at once."""
+    flag = threading.Event()
+    said = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+
+    def handle(number: int, _: object) -> None:
+        if flag.is_set() and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        sys.stderr.write(f"\n{said[signal.Signals(number)]}: saving and ending\n")
+        flag.set()
+
+    before = {number: signal.signal(number, handle) for number in said}
+    try:
+        yield flag
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

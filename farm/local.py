@@ -1,0 +1,237 @@
+"""A run from Python: learner, workers and recording in one call; what `farm run` does.
+
+    from farm.local import learn
+    from learner.config import RunConfig
+
+    for report in learn(RunConfig(seed=3), "runs/first", workers=2):
+        print(report.progress.mean_policy_return)
+"""
+
+import importlib.util
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from farm import scene as scenes
+from farm import session
+from farm.errors import ConfigError, RunError
+from farm.messages import Job, Result
+from farm.scene import Scene
+from farm.session import Session
+from learner import checkpoint as checkpoints
+from learner.algorithms import Diverged
+from learner.config import RunConfig
+from learner.dispatcher import Dispatcher, Stopped
+from learner.folder import RunFolder
+from learner.learner import Evaluation, Learner, Report, specification, start
+from workers.backends.cpu import CpuBackend
+from workers.pool import Pool
+
+if TYPE_CHECKING:
+    from learner.recording import Recording
+
+log = logging.getLogger(__name__)
+
+LISTEN: Final = "tcp/127.0.0.1:7447"
+"""Where a learner listens unless told otherwise."""
+
+_TEND: Final = 0.5  # [s] between two looks at the worker processes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where a run stands on the network and on this machine; no number depends on it."""
+
+    workers: int = 0
+    """Local worker processes."""
+    listen: str = LISTEN
+    """Where workers dial."""
+    connect: tuple[str, ...] = ()
+    """Routers to dial instead of listening."""
+    farm: str = "farm"
+    """Name of the farm."""
+    record: bool = True
+    """Write run.rrd and replay.rrd."""
+    serve: tuple[str, int] | None = None
+    """Stream live at this host and port."""
+
+
+class Run:
+    """A run that is open: iterate over `learn`, then `finish`."""
+
+    def __init__(self, learner: Learner, farm: Dispatcher, recording: "Recording | None", workers: int) -> None:
+        """Made by `open_run`."""
+        self.learner, self._farm, self._recording, self._workers = learner, farm, recording, workers
+        self.summary: dict[str, Any] = {}
+        """What summary.json says, once it is over."""
+
+    @property
+    def live(self) -> str | None:
+        """Where viewers find the live stream, if it is served."""
+        return self._recording.uri if self._recording else None
+
+    def learn(self) -> Iterator[Report]:
+        """Generations until the run is over, each recorded; then the evaluation. `summary` tells how it ended.
+
+        Raises:
+          RunError: the run failed or diverged; everything is saved.
+        """
+        state, evaluation = "failed", None
+        try:
+            for report in self.learner.learn(self._farm):
+                if self._recording:
+                    self._recording.generation(report)
+                yield report
+            evaluation = self.learner.evaluate(self._farm)
+            if self._recording:
+                self._recording.end(evaluation)
+            state = "finished"
+        except (Stopped, GeneratorExit):
+            state = "interrupted"
+        except Diverged as error:
+            state = "diverged"
+            raise RunError(f"the run diverged: {error}; everything before is saved") from None
+        finally:
+            self._finish(state, evaluation)
+
+    def _finish(self, state: str, evaluation: Evaluation | None) -> None:
+        workers = max(len(self._farm.workers), self._workers)
+        self.summary = self.learner.summary(state, workers, evaluation)
+        self.learner.folder.write_summary(self.summary)
+        log.info("run %s %s after generation %d", self.learner.folder.name, state, self.learner.state.generation)
+
+
+def learn(
+    config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False
+) -> Iterator[Report]:
+    """Learn with local workers; the folder must not exist yet.
+
+    Raises:
+      ConfigError: the folder exists, or a setting makes no sense.
+      RunError: the run failed.
+    """
+    place = Place(workers=workers, listen=free_endpoint(), record=record)
+    with open_run(config, Path(folder), place) as run:
+        yield from run.learn()
+
+
+@contextmanager
+def open_run(
+    config: RunConfig,
+    path: Path,
+    place: Place,
+    *,
+    resume: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[Run]:
+    """Everything a run needs, opened in an order that leaves nothing behind when a part fails."""
+    scene = scenes.load(config.task.object)
+    folder = RunFolder(path)
+    at = folder.rewind() if resume else start(config, folder.name)
+    if place.record or place.serve:
+        check_rerun()
+    with ExitStack() as stack:
+        link = stack.enter_context(_session(place, stopped))
+        if resume:
+            folder.write_config(config)
+        else:
+            folder = RunFolder.create(path, config)
+        learner = Learner(config, folder, at)
+        stack.enter_context(_log_file(folder))
+        recording = stack.enter_context(_recording(place, learner, scene)) if place.record or place.serve else None
+        tend = _Tending(stopped)
+        farm = Dispatcher(link, place.farm, learner.spec, _how_to_join(place), tend)
+        if place.workers:
+            tend.pool = stack.enter_context(Pool(place.workers, _worker_flags(place), dict(os.environ)))
+        yield Run(learner, farm, recording, place.workers)
+
+
+def free_endpoint() -> str:
+    """An endpoint on this machine with a port that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class _Tending:
+    """Asked now and then whether to stop; looks after the local workers while at it."""
+
+    def __init__(self, stopped: Callable[[], bool]) -> None:
+        self._stopped, self._next = stopped, 0.0
+        self.pool: Pool | None = None
+
+    def __call__(self) -> bool:
+        if self.pool and time.monotonic() > self._next:
+            self._next = time.monotonic() + _TEND
+            if len(self.pool.tend()) == len(self.pool.pids) == 0 and not self.pool.pids:
+                raise RunError("no local worker keeps running; their own messages above say why")
+        return self._stopped()
+
+
+def _session(place: Place, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
+    if place.connect:
+        return session.connect(place.connect, None, stopped)
+    return session.listen(place.listen)
+
+
+def _worker_flags(place: Place) -> list[str]:
+    endpoints = place.connect or (place.listen,)
+    return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), "--farm", place.farm]
+
+
+def _how_to_join(place: Place) -> str:
+    flags = _worker_flags(place)
+    return " ".join(["farm worker", *(flags if place.farm != "farm" else flags[:-2])])
+
+
+@contextmanager
+def _log_file(folder: RunFolder) -> Iterator[None]:
+    handler = logging.FileHandler(folder.log, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.getLogger().addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(handler)
+        handler.close()
+
+
+@contextmanager
+def _recording(place: Place, learner: Learner, scene: Scene) -> "Iterator[Recording]":
+    from learner.recording import Recording  # noqa: PLC0415  with the extra that was checked before
+
+    recording = Recording(learner, scene, place.serve, to_file=place.record)
+    try:
+        yield recording
+    finally:
+        recording.finish()
+
+
+def check_rerun() -> None:
+    """Whether rerun-sdk is there; it is an extra, workers do without.
+
+    Raises:
+      ConfigError: it is not; says what to install.
+    """
+    if importlib.util.find_spec("rerun") is None:
+        raise ConfigError("recording needs rerun-sdk: pip install 'rolloutfarm[learner]', or go without by --no-record")
+
+
+def simulate(folder: RunFolder, jobs: Sequence[Job]) -> tuple[int, list[Result]]:
+    """Run jobs around a run's mean in this process.
+
+    Returns:
+      the generation the mean is of, and the results in the jobs' order.
+
+    Raises:
+      ConfigError: the run cannot be read.
+    """
+    at = checkpoints.load(folder.checkpoint)
+    backend = CpuBackend(specification(folder.read_config(), at))
+    return int(at.state["generation"]), backend.run(at.state["mu"], jobs)

@@ -1,0 +1,126 @@
+"""The recorder behind a thread: learning never waits for it, nor falls with it."""
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
+
+from farm.arrays import AnyArray
+from farm.trajectory import Trajectory
+from learner.progress import Progress
+
+log = logging.getLogger(__name__)
+
+WAITING: Final = 256
+"""Messages that may wait before rollouts and traces are dropped."""
+
+
+class Recording(Protocol):
+    """What `Recorder` offers."""
+
+    @property
+    def uri(self) -> str | None:
+        """What a viewer opens to look on."""
+        ...
+
+    def generation(
+        self,
+        progress: Progress,
+        sample: Trajectory | None,
+        traces: Mapping[str, AnyArray],
+        rate: float,
+    ) -> None:
+        """Record a generation."""
+        ...
+
+    def log(self, text: str, level: str = "INFO") -> None:
+        """Record a line."""
+        ...
+
+    def close(self) -> None:
+        """End the recording."""
+        ...
+
+
+class RecorderThread:
+    """Hands everything on to a recorder, in a thread of its own.
+
+    When more than `waiting` messages wait, rollouts and traces are dropped, and counted; statistics
+    and lines never. A recorder that fails (a full disk) ends the recording with one line in the log.
+    """
+
+    def __init__(self, recorder: Recording, waiting: int = WAITING) -> None:
+        self._recorder, self._waiting = recorder, waiting
+        self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._failed = threading.Event()
+        self._dropped = 0
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    @property
+    def uri(self) -> str | None:
+        """What a viewer opens to look on."""
+        return self._recorder.uri
+
+    @property
+    def dropped(self) -> int:
+        """Generations recorded without their rollout and traces, because too many waited."""
+        return self._dropped
+
+    @property
+    def failed(self) -> bool:
+        """Whether the recording ended before its time."""
+        return self._failed.is_set()
+
+    def generation(
+        self,
+        progress: Progress,
+        sample: Trajectory | None,
+        traces: Mapping[str, AnyArray],
+        rate: float,
+    ) -> None:
+        """Have a generation recorded; see `Recorder.generation`."""
+        if self._queue.qsize() >= self._waiting and (sample is not None or traces):
+            sample, traces = None, {}
+            self._dropped += 1
+        self._put(lambda: self._recorder.generation(progress, sample, traces, rate))
+
+    def log(self, text: str, level: str = "INFO") -> None:
+        """Have a line recorded."""
+        self._put(lambda: self._recorder.log(text, level))
+
+    def close(self, timeout: float | None = None) -> bool:
+        """Record what waits and end the recording.
+
+        Args:
+          timeout: how long that may take [s]; None for as long as it takes.
+
+        Returns:
+          whether everything is recorded.
+        """
+        self._queue.put(None)
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            log.warning("the recording is not complete after %g s: left as it is", timeout)
+            return False
+        return not self.failed
+
+    def _put(self, call: Callable[[], None]) -> None:
+        if not self.failed:
+            self._queue.put(call)
+
+    def _work(self) -> None:
+        try:
+            while (call := self._queue.get()) is not None:
+                call()
+            self._recorder.close()
+        except Exception as error:  # noqa: BLE001  (whatever it is, learning goes on)
+            self._failed.set()
+            log.error("the recording ends here, learning goes on: %s", error)  # noqa: TRY400
+            self._abandon()
+
+    def _abandon(self) -> None:
+        """Let go of what waits, and of the file as far as that goes."""
+        while not self._queue.empty():
+            self._queue.get()
