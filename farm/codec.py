@@ -38,7 +38,7 @@ def array(dtype: str, ndim: int) -> Any:  # noqa: ANN401  a dataclass field, as 
 def encode(message: object) -> bytes:
     """The message with its type's name and the schema version."""
     body = {"schema": SCHEMA, "type": type(message).__name__, **_plain(message)}
-    return msgpack.packb(body, default=_pack, use_bin_type=True)
+    return bytes(msgpack.packb(body, default=_pack, use_bin_type=True) or b"")
 
 
 def decode(payload: bytes, kind: type[M]) -> M:
@@ -51,9 +51,7 @@ def decode(payload: bytes, kind: type[M]) -> M:
     if len(payload) > MAX_BYTES:
         raise MessageError(f"a message of {len(payload)} bytes; at most {MAX_BYTES} are taken", "large")
     try:
-        body = msgpack.unpackb(
-            payload, ext_hook=_unpack, strict_map_key=True, max_array_len=_LISTS, max_map_len=_LISTS
-        )
+        body = msgpack.unpackb(payload, ext_hook=_unpack, strict_map_key=True, max_array_len=_LISTS, max_map_len=_LISTS)
     except MessageError:
         raise
     except Exception as error:  # msgpack and its hooks raise many kinds
@@ -79,7 +77,7 @@ def _plain(value: Any) -> dict[str, Any]:  # noqa: ANN401
 
 def _pack(value: object) -> object:
     if isinstance(value, np.ndarray):
-        head = msgpack.packb([value.dtype.str, list(value.shape)])
+        head = bytes(msgpack.packb([value.dtype.str, list(value.shape)]) or b"")
         return msgpack.ExtType(_ARRAY, head + np.ascontiguousarray(value).tobytes())
     if dataclasses.is_dataclass(value):
         return _plain(value)

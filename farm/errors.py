@@ -1,10 +1,10 @@
 """What can go wrong, as a tree.
 
-    FarmError                 anything we can say in one line
-      ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
-      MessageError            bytes from the network that are not what they should be
-      CheckpointError         a run folder that cannot be continued
-      RunError                a run that cannot go on (exit status 1)
+FarmError                 anything we can say in one line
+  ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
+  MessageError            bytes from the network that are not what they should be
+  CheckpointError         a run folder that cannot be continued
+  RunError                a run that cannot go on (exit status 1)
 """
 
 

@@ -1,12 +1,12 @@
 """The key space of a farm, in one place. Pure.
 
-    <farm>/live/worker/<worker>        liveliness token of a worker, <worker> = <name>/<instance>
-    <farm>/live/learner/<run>          liveliness token of a learner
-    <farm>/want/<worker>               a worker's credits
-    <farm>/pairs/<worker>              a worker's inbox: chunks of jobs
-    <farm>/run/<run>/spec              queryable: what is simulated
-    <farm>/run/<run>/generation        published and queryable: the round that is on
-    <farm>/run/<run>/result/<worker>   results
+<farm>/live/worker/<worker>        liveliness token of a worker, <worker> = <name>/<instance>
+<farm>/live/learner/<run>          liveliness token of a learner
+<farm>/want/<worker>               a worker's credits
+<farm>/pairs/<worker>              a worker's inbox: chunks of jobs
+<farm>/run/<run>/spec              queryable: what is simulated
+<farm>/run/<run>/generation        published and queryable: the round that is on
+<farm>/run/<run>/result/<worker>   results
 """
 
 import re

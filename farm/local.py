@@ -1,10 +1,10 @@
 """A run from Python: learner, workers and recording in one call; what `farm run` does.
 
-    from farm.local import learn
-    from learner.config import RunConfig
+from farm.local import learn
+from learner.config import RunConfig
 
-    for report in learn(RunConfig(seed=3), "runs/first", workers=2):
-        print(report.progress.mean_policy_return)
+for report in learn(RunConfig(seed=3), "runs/first", workers=2):
+    print(report.progress.mean_policy_return)
 """
 
 import importlib.util
@@ -14,21 +14,24 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm import scene as scenes
 from farm import session
-from farm.errors import ConfigError, RunError
+from farm.errors import CheckpointError, ConfigError, RunError
 from farm.messages import Job, Result
 from farm.scene import Scene
 from farm.session import Session
 from learner import checkpoint as checkpoints
+from learner import config as configs
 from learner.algorithms import Diverged
+from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.dispatcher import Dispatcher, Stopped
 from learner.folder import RunFolder
+from learner.ledger import LedgerConfig
 from learner.learner import Evaluation, Learner, Report, specification, start
 from workers.backends.cpu import CpuBackend
 from workers.pool import Pool
@@ -60,6 +63,8 @@ class Place:
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
     """Stream live at this host and port."""
+    ledger: LedgerConfig = field(default_factory=LedgerConfig)
+    """How jobs are cut into chunks, and when they are given out again."""
 
 
 class Run:
@@ -107,9 +112,7 @@ class Run:
         log.info("run %s %s after generation %d", self.learner.folder.name, state, self.learner.state.generation)
 
 
-def learn(
-    config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False
-) -> Iterator[Report]:
+def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False) -> Iterator[Report]:
     """Learn with local workers; the folder must not exist yet.
 
     Raises:
@@ -133,7 +136,7 @@ def open_run(
     """Everything a run needs, opened in an order that leaves nothing behind when a part fails."""
     scene = scenes.load(config.task.object)
     folder = RunFolder(path)
-    at = folder.rewind() if resume else start(config, folder.name)
+    at = _resumed(folder, config) if resume else start(config, folder.name)
     if place.record or place.serve:
         check_rerun()
     with ExitStack() as stack:
@@ -146,10 +149,28 @@ def open_run(
         stack.enter_context(_log_file(folder))
         recording = stack.enter_context(_recording(place, learner, scene)) if place.record or place.serve else None
         tend = _Tending(stopped)
-        farm = Dispatcher(link, place.farm, learner.spec, _how_to_join(place), tend)
+        farm = Dispatcher(link, place.farm, learner.spec, _how_to_join(place), tend, place.ledger)
         if place.workers:
-            tend.pool = stack.enter_context(Pool(place.workers, _worker_flags(place), dict(os.environ)))
+            flags = [*_worker_flags(place), "--log-level", "WARNING"]  # what they do, the learner says
+            tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
         yield Run(learner, farm, recording, place.workers)
+
+
+def _resumed(folder: RunFolder, config: RunConfig) -> Checkpoint:
+    """The checkpoint to go on from.
+
+    Raises:
+      CheckpointError: it cannot be used, or belongs to another configuration.
+    """
+    at = checkpoints.load(folder.checkpoint)
+    saved = configs.from_dict(at.config, str(folder.checkpoint))
+    for name, old, new in configs.changes(saved, config):
+        if name != "generations":
+            raise CheckpointError(
+                f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
+            )
+    folder.rewind(at)
+    return replace(at, run=folder.name)
 
 
 def free_endpoint() -> str:
@@ -204,7 +225,7 @@ def _log_file(folder: RunFolder) -> Iterator[None]:
 
 @contextmanager
 def _recording(place: Place, learner: Learner, scene: Scene) -> "Iterator[Recording]":
-    from learner.recording import Recording  # noqa: PLC0415  with the extra that was checked before
+    from learner.recording import Recording
 
     recording = Recording(learner, scene, place.serve, to_file=place.record)
     try:

@@ -31,13 +31,13 @@ class PolicyConfig:
     """The controller."""
 
     controller: Literal["direct", "projected", "kernel", "cosine"] = "projected"
-    """How parameters and state make an action (thesis 3.7 and 3.8; kernel: exact limit of projected; cosine: bounded direct)."""
+    """How parameters and state make an action (thesis 3.7, 3.8; kernel: projected at infinite D; cosine: 5.2)."""
     features: int = 8000
     """Number of random Fourier features, D (the kernel controller needs none)."""
     bandwidth: float = 1.0
     """Width h of the Gaussian kernel, in units of the state."""
     action: Literal["offset", "absolute", "increment"] = "offset"
-    """What an action is: an offset from the start grip's commands, a joint position, or a change of the last target [rad]."""
+    """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
     clip: bool = True
     """Clip joint targets to the joints' ranges."""
 
@@ -94,12 +94,13 @@ class Policy:
 
     def weights(self, theta: FloatArray) -> FloatArray:
         """What of the parameters does not change during a rollout, (B, P) -> (B, 8, D or d)."""
-        theta = theta.reshape(len(theta), len(JOINTS), -1)
-        if self.config.controller == "projected":
-            return np.stack([[self.features(joint) for joint in rollout] for rollout in theta])
-        if self.config.controller == "cosine":
-            return np.cos(theta)
-        return theta
+        theta = np.ascontiguousarray(theta).reshape(len(theta), len(JOINTS), -1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.config.controller == "projected":
+                return np.stack([[self.features(joint) for joint in rollout] for rollout in theta])
+            if self.config.controller == "cosine":
+                return np.cos(theta)
+            return theta
 
     def actions(self, weights: FloatArray, x: FloatArray) -> FloatArray:
         """Raw actions.
@@ -111,6 +112,7 @@ class Policy:
         Returns:
           (B, 8) [rad]; may be huge or not finite with the direct controller.
         """
+        weights, x = np.ascontiguousarray(weights), np.ascontiguousarray(x)  # numpy sums in the order of the memory
         with np.errstate(over="ignore", invalid="ignore"):
             if self.config.controller == "kernel":
                 return self._kernel(weights, x)

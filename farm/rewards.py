@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray
+from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.hand import LOWER, UPPER
 
 TERMS: Final = ("tactile", "joints", "action", "contact points", "drop")
@@ -99,10 +99,10 @@ def full(
 
 
 REWARDS: Final[dict[str, Reward]] = {"basic": basic, "full": full}
-"""Rewards by name: (joints (..., 8), images (..., 3, 18), points (..., 3, 3), action (..., 8), goal, weights) -> (..., 5)."""
+"""Rewards by name: joints (..., 8), images (..., 3, 18), points (..., 3, 3), action (..., 8) -> terms (..., 5)."""
 
 
-def end(terms: FloatArray, steps: FloatArray, dropped: BoolArray, failed: BoolArray, weights: Weights) -> FloatArray:
+def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArray, weights: Weights) -> FloatArray:
     """Cut the terms where each rollout ended and add the penalty there.
 
     Args:
@@ -116,8 +116,8 @@ def end(terms: FloatArray, steps: FloatArray, dropped: BoolArray, failed: BoolAr
       (B, T, 5), zero after the end.
     """
     count, horizon, _ = terms.shape
-    rows, last = np.arange(count), np.asarray(steps, dtype=np.int64) - 1
-    out = np.where((np.arange(horizon) < np.asarray(steps)[:, None])[..., None], terms, 0.0)
+    rows, last = np.arange(count), steps - 1
+    out = np.where((np.arange(horizon) < steps[:, None])[..., None], terms, 0.0)
     out[rows[failed], last[failed]] = 0.0
     ended = dropped | failed
     out[rows[ended], last[ended], 4] = -weights.drop

@@ -10,7 +10,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -81,7 +81,9 @@ class Session:
         self._session = session
         self.events = events
         self._threads: list[threading.Thread] = []
-        self._declared: list[zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
+        self._declared: list[
+            zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.Queryable[zenoh.Handler[zenoh.Query]]
+        ] = []
         self._tokens: list[zenoh.LivelinessToken] = []
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
@@ -173,9 +175,7 @@ def listen(endpoint: str) -> Iterator[Session]:
 
 
 @contextmanager
-def connect(
-    endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool]
-) -> Iterator[Session]:
+def connect(endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool]) -> Iterator[Session]:
     """A session that dials a learner or a router, and keeps trying.
 
     Args:
@@ -212,7 +212,7 @@ def _dial(endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[
             time.sleep(0.1)  # zenoh itself waits up to _OPEN_S for an address that does not refuse
 
 
-def _open(mode: dict[str, object], direction: Literal["listen", "connect"], endpoints: list[str]) -> zenoh.Session:
+def _open(mode: Mapping[str, object], direction: Literal["listen", "connect"], endpoints: list[str]) -> zenoh.Session:
     config = zenoh.Config()
     for key, value in {**_COMMON, **mode, f"{direction}/endpoints": endpoints}.items():
         config.insert_json5(key, json.dumps(value))

@@ -62,6 +62,7 @@ def image(force: FloatArray, position: FloatArray) -> FloatArray:
     Returns:
       (..., 18) force on each taxel [N]; they add up to the sum of the forces.
     """
+    force, position = np.ascontiguousarray(force), np.ascontiguousarray(position)
     x, y, z = position[..., 0], position[..., 1], position[..., 2]
     length = np.sqrt(x * x + y * y + z * z)
     length = np.where(length > 0, length, 1.0)
@@ -85,6 +86,7 @@ def contact_points(images: FloatArray) -> FloatArray:
     Returns:
       (..., 3) in the fingertip's frame, in units of its radius; zero without contact.
     """
+    images = np.ascontiguousarray(images)  # numpy sums in the order of the memory
     total = images.sum(axis=-1)
     share = images / np.where(total > 0, total, 1.0)[..., None]
     return np.stack([(share * DIRECTIONS[:, axis]).sum(axis=-1) for axis in range(3)], axis=-1)

@@ -28,7 +28,6 @@ _WAIT: Final = 0.2  # [s] between two looks at whether to stop
 _PATIENCE: Final = 3.0  # [s] without workers before the user is told
 
 
-
 class Stopped(Exception):  # noqa: N818  not an error
     """The user asked to end."""
 
@@ -37,14 +36,20 @@ class Dispatcher:
     """Rounds of jobs, one after the other, on whichever workers there are."""
 
     def __init__(
-        self, session: Session, farm: str, spec: Spec, how_to_join: str, stopped: Callable[[], bool]
+        self,
+        session: Session,
+        farm: str,
+        spec: Spec,
+        how_to_join: str,
+        stopped: Callable[[], bool],
+        ledger: LedgerConfig | None = None,
     ) -> None:
         """Show the run on the network: subscriptions first, the liveliness token last."""
         self.run = spec.run
         self.ignored: Counter[str] = Counter()
         """Messages that were not counted, by kind: stale, doubled, foreign, bad, large, version."""
         self._session, self._farm, self._stopped = session, farm, stopped
-        self._ledger = Ledger(LedgerConfig())
+        self._ledger = Ledger(ledger or LedgerConfig())
         self._how_to_join = how_to_join
         self._incarnation = secrets.token_hex(8)
         self._spec = codec.encode(spec)

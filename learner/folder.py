@@ -159,13 +159,12 @@ class RunFolder:
         """Replace the checkpoint."""
         checkpoints.save(self.checkpoint, checkpoint)
 
-    def rewind(self) -> Checkpoint:
-        """The checkpoint, with the other files cut back to it.
+    def rewind(self, checkpoint: Checkpoint) -> None:
+        """Cut the other files back to a checkpoint.
 
         Raises:
           CheckpointError: it cannot be used.
         """
-        checkpoint = checkpoints.load(self.checkpoint)
         generation = checkpoint.state.get("generation")
         if type(generation) is not int:
             raise CheckpointError(f"{self.checkpoint} holds no generation")
@@ -179,7 +178,6 @@ class RunFolder:
             whole = int((rows["generation"] <= generation).sum()) * _row_type(head["parameters"]).itemsize
             with path.open("r+b") as file:
                 file.truncate(offset + whole)
-        return checkpoint
 
 
 def every(parameters: int, generations: int) -> int:

@@ -14,7 +14,6 @@ from farm.arrays import AnyArray, FloatArray
 from farm.errors import CheckpointError, ConfigError, RunError
 from farm.messages import Job, Result, Spec
 from farm.policy import Features, Policy
-from farm.session import Session
 from farm.states import STATES
 from farm.trajectory import Trajectory
 from learner import checkpoint as checkpoints
@@ -113,8 +112,9 @@ class Learner:
           Stopped: the user asked to end; the last whole generation is saved.
         """
         begun = time.monotonic() - self._at.seconds
-        if not self.over:
-            eps = self._explore(farm)
+        if self.over:
+            return
+        eps = self._explore(farm)
         while not self.over:
             results, jobs, last = farm.collect(), farm.jobs, self._at
             rows = results[: len(eps)]
@@ -298,7 +298,9 @@ def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Feature
     theirs = other.read_config()
     for there, here in ((theirs.policy, config.policy), (theirs.task.state, config.task.state)):
         if there != here:
-            raise ConfigError(f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})")
+            raise ConfigError(
+                f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"
+            )
     at = checkpoints.load(other.checkpoint)
     state = replace(fresh, mu=at.state["mu"])
     if config.init_sigma == "run":

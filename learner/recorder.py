@@ -46,7 +46,7 @@ Times = list[rr.TimeColumn]
 class Recorder:
     """Writes a run down, generation by generation."""
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
         path: Path | None,
         *,
@@ -65,28 +65,24 @@ class Recorder:
           scene: what is drawn.
           config: the resolved configuration, Markdown.
           horizon: nominal length of a rollout [s].
-          serve: host and port to answer viewers at; Rerun knows no passwords, so 127.0.0.1.
+          serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
 
         Raises:
           ConfigError: neither path nor address, or the address is taken.
           OSError: the file cannot be written.
         """
-        self._path, self._horizon, self._generation = path, horizon, done
-        self._last = time.time() - horizon
-        self._drawing = Drawing(scene)
-        sinks: list[Any] = []
-        self._server: tuple[str, int] | None = None
-        if path is not None:
-            sinks.append(_file(path))
-        if serve is not None:
-            _check_free(*serve)
-            sinks.append(rr.GrpcServerSink(*serve))
-            self._server = serve
-        if not sinks:
+        if path is None and serve is None:
             raise ConfigError(
                 "a recording without a file and without an address to serve; give one"
             )
+        self._path, self._horizon, self._generation = path, horizon, done
+        self._last = time.time() - horizon
+        self._drawing = Drawing(scene)
+        self._server = None if serve is None else (serve[0], _free_port(*serve))
+        sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
+        if path is not None:
+            sinks.append(_file(path))
         self._stream = _open(run, sinks, blueprint.learning(horizon))
         _log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
 
@@ -192,16 +188,18 @@ def record_replay(
     compact(path)
 
 
-def _check_free(host: str, port: int) -> None:
-    """Rerun only prints a line when it cannot listen."""
+def _free_port(host: str, port: int) -> int:
+    """The port, or a free one for 0; Rerun only prints a line when it cannot listen."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(family) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-    except OSError as error:
+            return int(probe.getsockname()[1])
+    except (OSError, OverflowError) as error:
+        place = f"{host}:{port}"
         raise ConfigError(
-            f"cannot serve the recording at {host}:{port}: {error}; choose another port"
+            f"cannot serve the recording at {place}: {error}; choose another"
         ) from error
 
 

@@ -78,7 +78,7 @@ class Recording(logging.Handler):
         try:
             shown = [rollout for rollout in rollouts if rollout is not None]
             record_replay(folder.replay, run=folder.name, scene=self._scene, config=self._config, rollouts=shown)
-        except Exception as error:  # noqa: BLE001  whatever Rerun raises, the learning goes on
+        except Exception as error:
             log.warning("no replay recorded: %s", error)
 
 

@@ -46,7 +46,7 @@ def compact(path: Path) -> bool:
             "-o",
             str(merged),
         ]
-        subprocess.run(  # noqa: S603
+        subprocess.run(
             command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING
         )
         merged.replace(path)

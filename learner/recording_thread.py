@@ -1,5 +1,6 @@
 """The recorder behind a thread: learning never waits for it, nor falls with it."""
 
+import contextlib
 import logging
 import queue
 import threading
@@ -115,12 +116,14 @@ class RecorderThread:
             while (call := self._queue.get()) is not None:
                 call()
             self._recorder.close()
-        except Exception as error:  # noqa: BLE001  (whatever it is, learning goes on)
+        except Exception as error:
             self._failed.set()
-            log.error("the recording ends here, learning goes on: %s", error)  # noqa: TRY400
+            log.error("the recording ends here, learning goes on: %s", error)
             self._abandon()
 
     def _abandon(self) -> None:
-        """Let go of what waits, and of the file as far as that goes."""
+        """Let go of what waits, and keep what is recorded as far as that goes."""
         while not self._queue.empty():
             self._queue.get()
+        with contextlib.suppress(Exception):
+            self._recorder.close()

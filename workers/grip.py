@@ -115,8 +115,9 @@ class Grasping:
         return jacobian[2, joints] * _APPROACH[finger] * PRESS[finger] / stiffness
 
     def _place(self, finger: str, joints: FloatArray) -> None:
-        """Put one finger's joints as given, with everything that follows from it."""
+        """Put one finger's joints as given and the others as they began: nothing depends on what was asked before."""
         index = list(FINGER_JOINTS[finger])
+        self.data.qpos[:8] = _BENT
         self.data.qpos[index] = joints[index]
         mujoco.mj_kinematics(self.scene.model, self.data)
         mujoco.mj_comPos(self.scene.model, self.data)

@@ -28,9 +28,7 @@ class Pool:
     def _start(self) -> "subprocess.Popen[bytes]":
         # Its standard input is a pipe that nobody writes to: it closes when this process ends.
         # A session of its own keeps the terminal's Ctrl-C away: this process ends its workers.
-        return subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, env=self._environment, start_new_session=True
-        )
+        return subprocess.Popen(self._command, stdin=subprocess.PIPE, env=self._environment, start_new_session=True)
 
     @property
     def pids(self) -> list[int]:

@@ -16,6 +16,7 @@ import numpy as np
 from farm import scene as scenes
 from farm import tactile
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.errors import ConfigError
 from farm.hand import FINGERS, GRIPS, JOINTS
 from farm.policy import Policy
 from farm.rewards import Demonstration
@@ -102,7 +103,7 @@ class Stepper:
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Whose state is no longer a reasonable number, (n,)."""
-        return ~(np.abs(self.state[ids]) < _LIMIT).all(axis=1)
+        return np.asarray(~(np.abs(self.state[ids]) < _LIMIT).all(axis=1))
 
     def set_conditions(self, perturbations: Sequence[Perturbation]) -> None:
         """Give the first simulations the friction and mass of these perturbations."""
@@ -121,7 +122,7 @@ class Simulation:
         """Close start and goal grip, record the demonstration.
 
         Raises:
-          ConfigError: unknown object, or one that the fingers cannot reach.
+          ConfigError: unknown object, one that the fingers cannot reach, or a goal grip that does not hold it.
         """
         self.scene = scenes.load(config.object)
         self.policy = policy
@@ -131,7 +132,7 @@ class Simulation:
         self._nominal = Stepper(self.scene, perturbed=False, threads=threads)
         self._perturbed: Stepper | None = None
         self._threads = threads
-        goal = self._demonstrate(grasping.command(GRIPS[config.goal_grip]))
+        goal = self._demonstrate(config.goal_grip, grasping.command(GRIPS[config.goal_grip]))
         self.task = FingerGait(config, goal, self._commands)
         self._start = self._close(self._nominal, self._commands, np.zeros((1, 3)))
 
@@ -221,12 +222,14 @@ class Simulation:
         stepper.batch.bind("eq_active")[ids] = 0
         return Start(stepper.state[ids].copy(), stepper.frames(ids))
 
-    def _demonstrate(self, commands: FloatArray) -> Demonstration:
+    def _demonstrate(self, grip: str, commands: FloatArray) -> Demonstration:
         """Close the goal grip, release, let it settle, and record it."""
         self._close(self._nominal, commands, np.zeros((1, 3)))
         ids = np.zeros(1, dtype=np.int64)
         self._nominal.step(ids, SETTLE)
         frames = self._nominal.frames(ids)
+        if not touching(frames.force)[0]:
+            raise ConfigError(f"grip {grip!r} does not hold object {self.scene.object_name!r}; take another goal grip")
         images = tactile.image(frames.force, frames.place)
         return Demonstration(joints=frames.joints[0], images=images[0], points=tactile.contact_points(images)[0])
 

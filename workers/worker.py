@@ -104,7 +104,6 @@ class Worker:
         self._session.subscribe("inbox", keys.inbox(farm, self.id))
         self._session.watch("learner", keys.learner_token(farm, "*"))
         self._session.token(keys.worker_token(farm, self.id))
-        self._want(idle=True)
 
     def turn(self) -> None:
         """Take in what came, then run one chunk or wait for more."""
@@ -138,7 +137,7 @@ class Worker:
         elif event.topic == "inbox":
             self._accept(codec.decode(event.payload, Chunk))
         elif event.alive:
-            self._want(idle=self._next(peek=True) is None)
+            self._want(idle=False)
         else:
             self._runs.pop(keys.tail(event.key, keys.learner_token(self._config.farm, "")), None)
 
@@ -162,19 +161,17 @@ class Worker:
         else:
             log.debug("dropped a chunk of round %s of run %s", chunk.round, chunk.run)
 
-    def _next(self, *, peek: bool = False) -> Chunk | None:
+    def _next(self) -> Chunk | None:
         """A chunk of the run that has waited longest."""
         for name, run in list(self._runs.items()):
             if run.chunks:
-                if peek:
-                    return run.chunks[0]
                 self._runs.move_to_end(name)
                 return run.chunks.popleft()
         return None
 
     def _run(self, chunk: Chunk) -> None:
         header = self._runs[chunk.run].header
-        assert header is not None  # noqa: S101  a chunk is only queued behind its header
+        assert header is not None
         backend = self._backend(header)
         if backend is None:
             return
@@ -194,9 +191,14 @@ class Worker:
             for job in jobs:
                 try:
                     results += backend.run(header.mu, [job])
-                except Exception as error:  # noqa: BLE001
+                except Exception as error:
                     self._fail(chunk, job.index, error)
-        self._answer(chunk, Results(**_round(chunk), worker=self.id, results=tuple(results)))
+        self._answer(
+            chunk,
+            Results(
+                run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.id, results=tuple(results)
+            ),
+        )
 
     def _backend(self, header: Generation) -> Backend | FarmError | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
@@ -210,7 +212,7 @@ class Worker:
                 self._backends[header.spec] = BACKENDS[self._config.backend](spec)
                 log.info("serving run %s", header.run)
             except FarmError as error:
-                log.error("cannot serve run %s: %s", header.run, error)  # noqa: TRY400  one line, no traceback
+                log.error("cannot serve run %s: %s", header.run, error)
                 self._backends[header.spec] = error
         self._backends.move_to_end(header.spec)
         while len(self._backends) > _KEEP:
@@ -221,7 +223,12 @@ class Worker:
 
     def _fail(self, chunk: Chunk, index: int, error: Exception) -> None:
         text = f"{type(error).__name__}: {error}"[:500]
-        self._answer(chunk, Failure(**_round(chunk), worker=self.id, index=index, error=text))
+        self._answer(
+            chunk,
+            Failure(
+                run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.id, index=index, error=text
+            ),
+        )
 
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
         self._session.publish(keys.result(self._config.farm, chunk.run, self.id), codec.encode(message))
@@ -234,7 +241,3 @@ class Worker:
 
 def _belongs(chunk: Chunk, header: Generation | None) -> bool:
     return header is not None and (chunk.incarnation, chunk.round) == (header.incarnation, header.round)
-
-
-def _round(chunk: Chunk) -> dict[str, object]:
-    return {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round}

@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from types import TracebackType
 from typing import Protocol
 
 from rich.console import Console, Group
@@ -24,7 +23,7 @@ class Display(Protocol):
         """Begin."""
         ...
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """End."""
         ...
 
@@ -104,11 +103,15 @@ class LiveDisplay:
         self._returns.append(p.mean_policy_return)
         self._bar.update(self._task, completed=p.generation)
         table = Table.grid(padding=(0, 2))
-        table.add_row("return", f"{p.return_mean:.3f}", f"[{p.return_min:.3f} .. {p.return_max:.3f}]", f"best {p.best:.3f}")
+        table.add_row(
+            "return", f"{p.return_mean:.3f}", f"[{p.return_min:.3f} .. {p.return_max:.3f}]", f"best {p.best:.3f}"
+        )
         succeeded = "[green]success[/green]" if p.mean_policy_success else "no success"
         table.add_row("mean policy", f"{p.mean_policy_return:.3f}", succeeded, _spark(self._returns[-_SPARK:]))
         table.add_row("success", f"{p.success_rate:.0%}", f"dropped {p.dropped}", f"failed {p.failed}")
-        table.add_row("sigma", f"{p.sigma_mean:.3f}", f"[{p.sigma_min:.3f} .. {p.sigma_max:.3f}]", f"|mu| {p.mean_norm:.2f}")
+        table.add_row(
+            "sigma", f"{p.sigma_mean:.3f}", f"[{p.sigma_min:.3f} .. {p.sigma_max:.3f}]", f"|mu| {p.mean_norm:.2f}"
+        )
         table.add_row("farm", f"{report.rate:.0f} rollouts/s", f"{p.workers} workers", f"re-issued {p.reissued}")
         self._live.update(Group(table, self._bar))
 

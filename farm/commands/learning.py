@@ -14,9 +14,7 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM, as of a shell."""
 
 
-def learn(
-    chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunFolder | None, begin: RunConfig
-) -> int:
+def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunFolder | None, begin: RunConfig) -> int:
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up(chosen.log_level)
     place = replace(place, connect=chosen.connect, farm=chosen.farm, record=chosen.record)

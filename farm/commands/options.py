@@ -116,7 +116,9 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
     return keys.checked("run", options.name or f"finger-gait-{what}-s{config.seed}-{stamp}")
 
 
-def parse(kind: type[arguments.C], words: Sequence[str], program: str) -> tuple[arguments.C, RunFolder | None, RunConfig]:
+def parse(
+    kind: type[arguments.C], words: Sequence[str], program: str
+) -> tuple[arguments.C, RunFolder | None, RunConfig]:
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
     begin, resumed = origin(words)
     default = replace(kind(), run=begin)  # type: ignore[type-var]

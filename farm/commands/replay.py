@@ -29,8 +29,8 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ReplayCommand, words, "farm replay")
     check_rerun()
-    from learner.recorder import record_replay  # noqa: PLC0415  with the extra that was just checked
-    from learner.recording import markdown  # noqa: PLC0415
+    from learner.recorder import record_replay
+    from learner.recording import markdown
 
     folder = RunFolder.open(command.run)
     config = folder.read_config()
@@ -41,7 +41,9 @@ def main(words: Sequence[str]) -> int:
     path = command.to or folder.path / "gait.rrd"
     rollout = (f"mean policy after generation {generation}", shown.trajectory())
     try:
-        record_replay(path, run=folder.name, scene=scenes.load(config.task.object), config=markdown(config), rollouts=[rollout])
+        record_replay(
+            path, run=folder.name, scene=scenes.load(config.task.object), config=markdown(config), rollouts=[rollout]
+        )
     except OSError as error:
         raise RunError(f"cannot write {path}: {error.strerror}") from None
     success = "the gait succeeds" if shown.success else "the gait does not succeed"

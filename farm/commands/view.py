@@ -27,10 +27,12 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ViewCommand, words, "farm view")
     check_rerun()
-    from learner.recording_files import parts  # noqa: PLC0415  with the extra that was just checked
+    from learner.recording_files import parts
 
     files = [command.run] if command.run.is_file() else parts(command.run / "run.rrd")
     if not files:
         raise ConfigError(f"no recording in {command.run}: give a run's folder or a .rrd file")
     flags = ["--web-viewer"] if command.web else []
-    return subprocess.run([sys.executable, "-m", "rerun", *map(str, files), "--bind", "127.0.0.1", *flags], check=False).returncode
+    return subprocess.run(
+        [sys.executable, "-m", "rerun", *map(str, files), "--bind", "127.0.0.1", *flags], check=False
+    ).returncode

@@ -6,7 +6,7 @@ controller sets joint targets; a demonstration of the goal grip defines the rewa
 """
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 

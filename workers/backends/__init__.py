@@ -1,7 +1,7 @@
 """What a worker simulates with, by name."""
 
 from collections.abc import Sequence
-from typing import Final, Protocol
+from typing import ClassVar, Final, Protocol
 
 from farm.arrays import FloatArray
 from farm.messages import Job, Result, Spec
@@ -11,7 +11,7 @@ from workers.backends.cpu import CpuBackend
 class Backend(Protocol):
     """Runs one run's jobs; made from its specification."""
 
-    capacity: int
+    capacity: ClassVar[int]
     """Jobs that are worth holding at a time."""
 
     def __init__(self, spec: Spec) -> None:

@@ -1,7 +1,7 @@
 """Jobs on this machine's processor: one thread, many rollouts at a time in mujoco.batch."""
 
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from workers.simulation import CAPACITY, Rollouts, Simulation
 class CpuBackend:
     """Simulates one run's jobs."""
 
-    capacity: Final = CAPACITY
+    capacity: ClassVar[int] = CAPACITY
     """Jobs that are worth holding at a time."""
 
     def __init__(self, spec: Spec) -> None:
@@ -100,7 +100,7 @@ class CpuBackend:
         images = tactile.image(force, place)
         terms = outcome.terms[row]
         return Trajectory(
-            times=np.arange(frames + 1) * TIMESTEP * substeps,
+            times=np.arange(frames + 1, dtype=float) * (TIMESTEP * substeps),
             bodies=self._simulation.scene.poses(qpos),
             joints=qpos[:, :8],
             targets=np.concatenate([self._simulation.task.commands[None], rollouts.targets[row][control]]),
