@@ -126,6 +126,16 @@ class Scene:
         return out
 
 
+def quiet() -> None:
+    """Keep MuJoCo's warnings from the terminal and from a MUJOCO_LOG.TXT in the user's folder.
+
+    A rollout whose physics blows up is reported as failed; process-wide, as MuJoCo's setting is.
+    """
+    config = mujoco.MjLogConfig.get()
+    config.logto_console = config.logto_file = False
+    mujoco.MjLogConfig.set(config)
+
+
 def load(object_name: str) -> Scene:
     """Compile the hand with the object of that name.
 

@@ -35,9 +35,7 @@ def learning(horizon: float) -> rrb.Blueprint:
         row_shares=[1.0, _PICTURES],
     )
     tabs = rrb.Tabs(_learning(), rrb.Vertical(*_curves(horizon), name="Rollout"), _config())
-    return _blueprint(
-        rrb.Horizontal(left, tabs, column_shares=[0.45, 0.55]), "generation", "following"
-    )
+    return _blueprint(rrb.Horizontal(left, tabs, column_shares=[0.45, 0.55]), "generation", "following")
 
 
 def replay(horizon: float) -> rrb.Blueprint:
@@ -84,9 +82,7 @@ def _config() -> rrb.View:
 
 def _learning() -> rrb.Container:
     return rrb.Vertical(
-        _plot(
-            "Return", "/learning/return", "/learning/return_std", legend=rrb.Corner2D.RightBottom
-        ),
+        _plot("Return", "/learning/return", "/learning/return_std", legend=rrb.Corner2D.RightBottom),
         rrb.Horizontal(
             _plot("Success", "/learning/success"),
             _plot("Sigma", "/learning/sigma"),
@@ -103,17 +99,13 @@ def _learning() -> rrb.Container:
     )
 
 
-def _plot(
-    name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop
-) -> rrb.View:
+def _plot(name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop) -> rrb.View:
     shown = rrb.PlotLegend(legend, visible=legend is not None)
     return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=shown)
 
 
 def _log() -> rrb.View:
-    columns = rrb.TextLogColumns(
-        timeline_columns=["generation"], text_log_columns=["loglevel", "body"]
-    )
+    columns = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
     return rrb.TextLogView(origin="/log", name="Log", columns=columns)
 
 

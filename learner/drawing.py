@@ -31,10 +31,8 @@ ARROW: Final = 0.012
 LONGEST: Final = 0.1
 """Arrows are cut here: one hard blow must not fill the scene [m]."""
 
-_RAMP: Final = (
-    np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
-        [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
-    )
+_RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
+    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
 )
 _SHADES: Final = (1.25, 0.95, 0.65)
 _TAXEL_RADIUS: Final = 0.0014
@@ -59,9 +57,7 @@ class Drawing:
         self._bodies = scene.bodies
         self._geometries = scene.geometries()
         self._rest = scene.poses(scene.model.qpos0[None])[0]
-        self._fixed = {
-            n for n in self._bodies if scene.model.body_weldid[scene.model.body(n).id] == 0
-        }
+        self._fixed = {n for n in self._bodies if scene.model.body_weldid[scene.model.body(n).id] == 0}
         tips = {g.name: g for g in self._geometries}
         self._tips = [tips[f"{finger}_tip"] for finger in FINGERS]
 
@@ -79,9 +75,7 @@ class Drawing:
         for finger, tip in zip(FINGERS, self._tips, strict=True):
             yield (
                 _taxels(tip),
-                rr.Points3D.from_fields(
-                    positions=np.array(tip.position) + tactile.positions(), radii=_TAXEL_RADIUS
-                ),
+                rr.Points3D.from_fields(positions=np.array(tip.position) + tactile.positions(), radii=_TAXEL_RADIUS),
             )
             yield f"/tactile/{finger}", _image_style(tactile.SHAPE)
             yield (
@@ -105,16 +99,12 @@ class Drawing:
         count = len(rollout.times)
         if rollout.bodies.shape != (count, len(self._bodies), 7):
             expected = (count, len(self._bodies), 7)
-            raise ValueError(
-                f"poses of shape {rollout.bodies.shape}, expected {expected}: another scene?"
-            )
+            raise ValueError(f"poses of shape {rollout.bodies.shape}, expected {expected}: another scene?")
         for name, poses in zip(self._bodies, np.moveaxis(rollout.bodies, 1, 0), strict=True):
             if name not in self._fixed:
                 yield Columns(
                     f"/world/{name}",
-                    rr.Transform3D.columns(
-                        translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:])
-                    ),
+                    rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:])),
                 )
         yield from self._touch(rollout)
         yield Columns("/reward/terms", _scalars(rollout.terms))
@@ -154,9 +144,7 @@ class Drawing:
         )
         return columns.partition(touching.sum(axis=1))
 
-    def contacts(
-        self, bodies: FloatArray, points: FloatArray, force: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def contacts(self, bodies: FloatArray, points: FloatArray, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Contact arrows in the world.
 
         Args:

@@ -10,6 +10,8 @@ A file is never overwritten: a run that goes on writes run.part2.rrd, and closin
 into run.rrd and compacts it. All parts opened together are one recording as well.
 """
 
+import errno
+import shutil
 import socket
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,6 +36,8 @@ __all__ = ["Recorder", "parts", "record_replay"]
 APPLICATION: Final = "rolloutfarm"
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
+RESERVE: Final = 32 << 20
+"""Free space on the disk below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
 """A rollout's last frame comes so much before the next one's first, which would hide it [s]."""
 PAUSE: Final = 0.1
@@ -73,11 +77,10 @@ class Recorder:
           OSError: the file cannot be written.
         """
         if path is None and serve is None:
-            raise ConfigError(
-                "a recording without a file and without an address to serve; give one"
-            )
+            raise ConfigError("a recording without a file and without an address to serve; give one")
         self._path, self._horizon, self._generation = path, horizon, done
         self._last = time.time() - horizon
+        self._broken = False
         self._drawing = Drawing(scene)
         self._server = None if serve is None else (serve[0], _free_port(*serve))
         sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
@@ -112,8 +115,9 @@ class Recorder:
 
         Raises:
           ValueError: the sample or a trace has another shape.
-          RuntimeError: the file takes no more (a full disk).
+          OSError: the file takes no more (a full disk); what is there stays.
         """
+        self._check_space()
         self._generation = progress.generation
         start, now = self._start, time.time()
         at = _times("generation", progress.generation, np.array([start]), np.array([now]))
@@ -128,29 +132,45 @@ class Recorder:
             frames = progress.generation, np.minimum(start + sample.times, end), wall
             _send(self._stream, self._drawing.columns(sample), _rows("generation", *frames))
         self._last = now
-        self._stream.flush(timeout_sec=FLUSH)
+        self._flush()
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a line; levels are those of the standard library."""
-        at = _times(
-            "generation", self._generation, np.array([self._start]), np.array([time.time()])
-        )
-        self._stream.send_columns(
-            "/log", at, _row(rr.TextLog(text, level=_LEVELS.get(level, level)))
-        )
+        at = _times("generation", self._generation, np.array([self._start]), np.array([time.time()]))
+        self._stream.send_columns("/log", at, _row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
     def close(self) -> None:
-        """Write everything out, merge the parts and compact them.
+        """Write everything out, merge the parts and compact them; a broken recording is left as it is.
 
         Raises:
-          RuntimeError: the file takes no more (a full disk).
+          OSError: the file takes no more.
         """
-        try:
-            self._stream.flush(timeout_sec=FLUSH)
-        finally:
-            self._stream.disconnect()
+        if self._broken:
+            return
+        self._flush()
+        self._stream.disconnect()
         if self._path is not None:
             compact(self._path)
+
+    def _flush(self) -> None:
+        """See every row into the file: a kill loses nothing, and what goes wrong is noticed."""
+        try:
+            self._stream.flush(timeout_sec=FLUSH)
+        except RuntimeError as error:
+            # Rerun would now wait for this file for ever, at the latest when the process ends.
+            self._broken = True
+            rr.unregister_shutdown()
+            self._stream.inner = _Abandoned()
+            raise OSError(f"Rerun writes no more: {error}") from error
+
+    def _check_space(self) -> None:
+        """Stop before Rerun meets a full disk."""
+        if self._path is None:
+            return
+        free = shutil.disk_usage(self._path.parent).free
+        if free < RESERVE:
+            text = f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are needed"
+            raise OSError(errno.ENOSPC, text)
 
     @property
     def _start(self) -> float:
@@ -188,6 +208,14 @@ def record_replay(
     compact(path)
 
 
+class _Abandoned:
+    """Stands in for a native recording that must not be waited for."""
+
+    def is_forked_child(self) -> bool:
+        """Yes: Rerun lets go of those without a word."""
+        return True
+
+
 def _free_port(host: str, port: int) -> int:
     """The port, or a free one for 0; Rerun only prints a line when it cannot listen."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -198,9 +226,7 @@ def _free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except (OSError, OverflowError) as error:
         place = f"{host}:{port}"
-        raise ConfigError(
-            f"cannot serve the recording at {place}: {error}; choose another"
-        ) from error
+        raise ConfigError(f"cannot serve the recording at {place}: {error}; choose another") from error
 
 
 def _open(recording: str, sinks: list[Any], layout: rrb.Blueprint) -> rr.RecordingStream:
@@ -256,9 +282,7 @@ def _times(counter: str, number: int, sim: FloatArray, wall: FloatArray | None =
         rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
     ]
     if wall is not None:
-        columns.append(
-            rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]"))
-        )
+        columns.append(rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]")))
     return columns
 
 

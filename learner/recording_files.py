@@ -46,9 +46,7 @@ def compact(path: Path) -> bool:
             "-o",
             str(merged),
         ]
-        subprocess.run(
-            command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING
-        )
+        subprocess.run(command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING)
         merged.replace(path)
         for old in found:
             if old != path:

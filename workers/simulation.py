@@ -86,6 +86,10 @@ class Stepper:
         """Advance the simulations of these ids by physics steps."""
         self.batch.step(ids, nstep=count)
 
+    def play(self, ids: IntArray, controls: FloatArray) -> None:
+        """Advance the simulations of these ids by one physics step for each of their controls, (n, steps, 8)."""
+        self.batch.rollout(controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids)
+
     def frames(self, ids: IntArray) -> Frames:
         """Measure: joint positions now, forces as of the last physics step's beginning (as mj_step leaves them)."""
         sensors = self._sensors[ids].reshape(len(ids), len(FINGERS), CONTACTS, CONTACT_WIDTH)
@@ -124,6 +128,7 @@ class Simulation:
         Raises:
           ConfigError: unknown object, one that the fingers cannot reach, or a goal grip that does not hold it.
         """
+        scenes.quiet()
         self.scene = scenes.load(config.object)
         self.policy = policy
         grasping = Grasping(self.scene)
@@ -216,9 +221,9 @@ class Simulation:
         qpos[ids, place] += displaced
         anchor[ids, 0] = qpos[ids, place]
         stepper.batch.bind("mocap_quat")[ids, 0] = qpos[ids, place.stop :]
-        for t in range(CLOSING):
-            stepper.ctrl[ids] = self._waiting + (commands - self._waiting) * min(1.0, (t + 1) / RAMP)
-            stepper.step(ids, 1)
+        part = np.minimum(1.0, np.arange(1, CLOSING + 1) / RAMP)[:, None]
+        ramp = self._waiting + (commands - self._waiting) * part
+        stepper.play(ids, np.broadcast_to(ramp, (len(ids), *ramp.shape)))
         stepper.batch.bind("eq_active")[ids] = 0
         return Start(stepper.state[ids].copy(), stepper.frames(ids))
 
