@@ -51,6 +51,9 @@ def decode(payload: bytes, kind: type[M]) -> M:
     if len(payload) > MAX_BYTES:
         raise MessageError(f"a message of {len(payload)} bytes; at most {MAX_BYTES} are taken", "large")
     try:
+        structure = msgpack.Unpacker(max_buffer_size=max(len(payload), 1))
+        structure.feed(payload)
+        structure.skip()  # every length it announces is there: nothing is allocated for a promise
         body = msgpack.unpackb(payload, ext_hook=_unpack, strict_map_key=True, max_array_len=_LISTS, max_map_len=_LISTS)
     except MessageError:
         raise
@@ -58,13 +61,13 @@ def decode(payload: bytes, kind: type[M]) -> M:
         raise MessageError(f"not a message: {error}") from None
     if not isinstance(body, dict):
         raise MessageError(f"not a message: a {type(body).__name__}")
-    if body.get("schema") != SCHEMA:
+    schema, name = body.get("schema"), body.get("type")
+    if type(schema) is not int or schema != SCHEMA:
         raise MessageError(
-            f"schema version {str(body.get('schema'))[:20]}, this side speaks {SCHEMA}: run the same release on both",
-            "version",
+            f"schema version {_brief(schema)}, this side speaks {SCHEMA}: run the same release on both", "version"
         )
-    if body.get("type") != kind.__name__:
-        raise MessageError(f"a {str(body.get('type'))[:40]} where a {kind.__name__} was expected")
+    if type(name) is not str or name != kind.__name__:
+        raise MessageError(f"a {_brief(name)} where a {kind.__name__} was expected")
     try:
         return typing.cast("M", _build(kind, body, {"schema", "type"}))
     except RecursionError:
@@ -87,7 +90,7 @@ def _pack(value: object) -> object:
 def _unpack(code: int, payload: bytes) -> AnyArray:
     if code != _ARRAY:
         raise MessageError(f"unknown extension {code}")
-    unpacker = msgpack.Unpacker(max_array_len=16, max_buffer_size=0)
+    unpacker = msgpack.Unpacker(max_array_len=16, max_buffer_size=200)
     unpacker.feed(payload[:200])
     dtype, shape = unpacker.unpack()
     if dtype not in _DTYPES or not all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape) or len(shape) > 4:
@@ -134,7 +137,12 @@ def _value(name: str, hint: Any, metadata: Any, value: Any) -> Any:  # noqa: ANN
         return value
     if hint in (int, bool, str) and type(value) is hint:
         return value
-    raise MessageError(f"{name}: {str(value)[:40]!r} is not a {hint}")
+    raise MessageError(f"{name}: {_brief(value)!r} is not a {hint}")
+
+
+def _brief(value: object) -> str:
+    """What to say of a value in an error; never the text of something big or deep."""
+    return str(value)[:40] if value is None or isinstance(value, (str, int, float)) else type(value).__name__
 
 
 def _array(name: str, metadata: Any, value: object) -> AnyArray:  # noqa: ANN401
@@ -142,4 +150,6 @@ def _array(name: str, metadata: Any, value: object) -> AnyArray:  # noqa: ANN401
         raise MessageError(f"{name}: expected an array {metadata['dtype']} of {metadata['ndim']} dimensions")
     if value.dtype.kind == "f" and not np.isfinite(value).all():
         raise MessageError(f"{name}: not finite")
+    if value.dtype.kind == "b" and (value.view(np.uint8) > 1).any():
+        raise MessageError(f"{name}: not true or false")
     return value

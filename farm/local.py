@@ -70,11 +70,18 @@ class Place:
 class Run:
     """A run that is open: iterate over `learn`, then `finish`."""
 
-    def __init__(self, learner: Learner, farm: Dispatcher, recording: "Recording | None", workers: int) -> None:
+    def __init__(
+        self, learner: Learner, farm: Dispatcher, recording: "Recording | None", pool: Pool | None
+    ) -> None:
         """Made by `open_run`."""
-        self.learner, self._farm, self._recording, self._workers = learner, farm, recording, workers
+        self.learner, self._farm, self._recording, self._pool = learner, farm, recording, pool
         self.summary: dict[str, Any] = {}
         """What summary.json says, once it is over."""
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of the local workers."""
+        return self._pool.pids if self._pool else []
 
     @property
     def live(self) -> str | None:
@@ -106,7 +113,7 @@ class Run:
             self._finish(state, evaluation)
 
     def _finish(self, state: str, evaluation: Evaluation | None) -> None:
-        workers = max(len(self._farm.workers), self._workers)
+        workers = max(len(self._farm.workers), len(self.worker_pids))
         self.summary = self.learner.summary(state, workers, evaluation)
         self.learner.folder.write_summary(self.summary)
         log.info("run %s %s after generation %d", self.learner.folder.name, state, self.learner.state.generation)
@@ -153,7 +160,7 @@ def open_run(
         if place.workers:
             flags = [*_worker_flags(place), "--log-level", "WARNING"]  # what they do, the learner says
             tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
-        yield Run(learner, farm, recording, place.workers)
+        yield Run(learner, farm, recording, tend.pool)
 
 
 def _resumed(folder: RunFolder, config: RunConfig) -> Checkpoint:

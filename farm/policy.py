@@ -142,6 +142,8 @@ class Policy:
           (B, 8) [rad], finite.
         """
         base = {"offset": start, "absolute": 0.0, "increment": last}[self.config.action]
-        targets = np.nan_to_num(base + actions, nan=0.0, posinf=_TARGET_LIMIT, neginf=-_TARGET_LIMIT)
-        lower, upper = (LOWER, UPPER) if self.config.clip else (-_TARGET_LIMIT, _TARGET_LIMIT)
-        return np.clip(targets, lower, upper)
+        targets = base + actions
+        targets[np.isnan(targets)] = 0.0
+        if self.config.clip:
+            return np.minimum(np.maximum(targets, LOWER), UPPER)
+        return np.minimum(np.maximum(targets, -_TARGET_LIMIT), _TARGET_LIMIT)

@@ -63,18 +63,28 @@ def image(force: FloatArray, position: FloatArray) -> FloatArray:
       (..., 18) force on each taxel [N]; they add up to the sum of the forces.
     """
     force, position = np.ascontiguousarray(force), np.ascontiguousarray(position)
-    x, y, z = position[..., 0], position[..., 1], position[..., 2]
+    images = np.zeros((*force.shape[:-1], TAXELS))
+    for contact in range(force.shape[-1]):
+        hit = force[..., contact] > 0
+        if hit.any():
+            images[hit] += _spread(force[..., contact][hit], position[..., contact, :][hit])
+    return images
+
+
+def _spread(force: FloatArray, position: FloatArray) -> FloatArray:
+    """One contact a row: force (K,) and place (K, 3) to taxels (K, 18)."""
+    x, y, z = position[:, 0], position[:, 1], position[:, 2]
     length = np.sqrt(x * x + y * y + z * z)
     length = np.where(length > 0, length, 1.0)
     # Spelt out, not a matrix product: its sums must not depend on the size of the batch.
     cosine = (
-        (x / length)[..., None] * DIRECTIONS[:, 0]
-        + (y / length)[..., None] * DIRECTIONS[:, 1]
-        + (z / length)[..., None] * DIRECTIONS[:, 2]
+        (x / length)[:, None] * DIRECTIONS[:, 0]
+        + (y / length)[:, None] * DIRECTIONS[:, 1]
+        + (z / length)[:, None] * DIRECTIONS[:, 2]
     )
     weight = np.exp(KAPPA * (cosine - 1.0))
-    weight *= (force / weight.sum(axis=-1))[..., None]
-    return _fold(weight, axis=-2)
+    weight *= (force / weight.sum(axis=-1))[:, None]
+    return weight
 
 
 def contact_points(images: FloatArray) -> FloatArray:
@@ -91,11 +101,3 @@ def contact_points(images: FloatArray) -> FloatArray:
     share = images / np.where(total > 0, total, 1.0)[..., None]
     return np.stack([(share * DIRECTIONS[:, axis]).sum(axis=-1) for axis in range(3)], axis=-1)
 
-
-def _fold(values: FloatArray, axis: int) -> FloatArray:
-    """Sum over a short axis one slice after the other: an order that no shape changes."""
-    slices = np.moveaxis(values, axis, 0)
-    total = slices[0].copy()
-    for part in slices[1:]:
-        total += part
-    return total

@@ -1,6 +1,6 @@
 """Layouts of the viewer: a learning run, and a replay of rollouts. They travel in the file."""
 
-from typing import Final
+from typing import Final, Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -49,7 +49,7 @@ def replay(horizon: float) -> rrb.Blueprint:
     return _blueprint(rrb.Horizontal(left, tabs, column_shares=[0.6, 0.4]), "sim_time", "playing")
 
 
-def _blueprint(root: rrb.Container, timeline: str, play: str) -> rrb.Blueprint:
+def _blueprint(root: rrb.Container, timeline: str, play: Literal["following", "playing"]) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),

@@ -1,4 +1,4 @@
-"""Curves of a run as Rerun entities: their names and colours, and a generation's values."""
+"""Colours, and the curves of a run: their names, and a generation's values as Rerun entities."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 
+from farm.arrays import FloatArray, IntArray
 from learner.progress import Progress
 
 Colour = tuple[int, int, int]
@@ -20,6 +21,11 @@ VERMILLION: Final = (213, 94, 0)
 GREY: Final = (150, 150, 150)
 
 
+_RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
+    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
+)
+
+
 def lines(
     names: Sequence[str], colours: Iterable[Colour], width: float = 2.0, hidden: Sequence[str] = ()
 ) -> rr.SeriesLines:
@@ -30,6 +36,20 @@ def lines(
         widths=[width] * len(names),
         visible_series=[name not in hidden for name in names],
     )
+
+
+def ramp(values: FloatArray, top: float) -> IntArray:
+    """Colours of values in [0, top], (...) -> (...) packed as 0xRRGGBBAA."""
+    share = np.clip(values / top, 0.0, 1.0)
+    knots = np.linspace(0.0, 1.0, len(_RAMP))
+    rgb = [np.rint(np.interp(share, knots, channel)).astype(np.uint32) for channel in _RAMP.T]
+    return rgb[0] << 24 | rgb[1] << 16 | rgb[2] << 8 | np.uint32(255)
+
+
+def pack(colour: Colour) -> int:
+    """A colour as 0xRRGGBBAA."""
+    red, green, blue = colour
+    return red << 24 | green << 16 | blue << 8 | 255
 
 
 def static() -> list[tuple[str, Any]]:

@@ -2,6 +2,10 @@
 
 Entities hang flat below /world: /world/<body>, with its geometries and, at a finger's last link,
 its taxels as children. A finger keeps its colour everywhere (palette of Okabe and Ito).
+
+A fingertip's picture has the taxels' 6 rows and 3 columns (see `farm.tactile`): top is towards the back
+of the finger, bottom towards its pad, left the side of negative y. A trace has the fingers' taxels
+below each other, row by row, and time to the right.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,7 +21,7 @@ from farm.hand import FINGERS, JOINTS, TIP_RADIUS
 from farm.rewards import TERMS
 from farm.scene import Geometry, Scene
 from farm.trajectory import Trajectory
-from learner.curves import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, Colour, lines
+from learner.curves import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, Colour, lines, pack, ramp
 
 FINGER_COLOURS: Final[Mapping[str, Colour]] = dict(zip(FINGERS, (SKY, GREEN, PURPLE), strict=True))
 TERM_COLOURS: Final = (YELLOW, BLUE, GREY, ORANGE, VERMILLION)
@@ -31,9 +35,6 @@ ARROW: Final = 0.012
 LONGEST: Final = 0.1
 """Arrows are cut here: one hard blow must not fill the scene [m]."""
 
-_RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
-    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
-)
 _SHADES: Final = (1.25, 0.95, 0.65)
 _TAXEL_RADIUS: Final = 0.0014
 _GLASS: Final = 120  # fingertips are see-through: taxels and arrows start where they touch
@@ -70,7 +71,7 @@ class Drawing:
             if name in self._fixed:
                 yield (
                     f"/world/{name}",
-                    rr.Transform3D(translation=pose[:3], quaternion=_xyzw(pose[3:])),
+                    rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=_xyzw(pose[3:]))),
                 )
         for finger, tip in zip(FINGERS, self._tips, strict=True):
             yield (
@@ -173,20 +174,6 @@ def trace(values: AnyArray) -> rr.DepthImage:
         depth_range=(0.0, TOP_FORCE),
         magnification_filter=rr.components.MagnificationFilter.Nearest,
     )
-
-
-def ramp(values: FloatArray, top: float) -> IntArray:
-    """Colours of values in [0, top], (...) -> (...) packed as 0xRRGGBBAA."""
-    share = np.clip(values / top, 0.0, 1.0)
-    knots = np.linspace(0.0, 1.0, len(_RAMP))
-    rgb = [np.rint(np.interp(share, knots, channel)).astype(np.uint32) for channel in _RAMP.T]
-    return rgb[0] << 24 | rgb[1] << 16 | rgb[2] << 8 | np.uint32(255)
-
-
-def pack(colour: Colour) -> int:
-    """A colour as 0xRRGGBBAA."""
-    red, green, blue = colour
-    return red << 24 | green << 16 | blue << 8 | 255
 
 
 def changes(states: AnyArray) -> IntArray:

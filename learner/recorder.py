@@ -14,26 +14,25 @@ import errno
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
-from farm.arrays import AnyArray, FloatArray, IntArray
+from farm.arrays import AnyArray
 from farm.errors import ConfigError
 from farm.scene import Scene
 from farm.trajectory import Trajectory
 from learner import blueprint, curves
-from learner.drawing import Columns, Drawing, trace
+from learner.drawing import Drawing, trace
 from learner.progress import Progress
 from learner.recording_files import compact, next_part, parts
+from learner.rows import begin, log_static, row, rows, send, times
 
 __all__ = ["Recorder", "parts", "record_replay"]
 
-APPLICATION: Final = "rolloutfarm"
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
 RESERVE: Final = 32 << 20
@@ -43,8 +42,6 @@ SEAM: Final = 1e-6
 PAUSE: Final = 0.1
 """Between two rollouts of a replay [s]."""
 _LEVELS: Final = {"WARNING": "WARN"}  # the standard library's name in Rerun's
-
-Times = list[rr.TimeColumn]
 
 
 class Recorder:
@@ -86,8 +83,8 @@ class Recorder:
         sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
         if path is not None:
             sinks.append(_file(path))
-        self._stream = _open(run, sinks, blueprint.learning(horizon))
-        _log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
+        self._stream = begin(run, sinks, blueprint.learning(horizon))
+        log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
 
     @property
     def uri(self) -> str | None:
@@ -120,24 +117,24 @@ class Recorder:
         self._check_space()
         self._generation = progress.generation
         start, now = self._start, time.time()
-        at = _times("generation", progress.generation, np.array([start]), np.array([now]))
+        at = times("generation", progress.generation, np.array([start]), np.array([now]))
         for entity, values in curves.statistics(progress, rate):
-            self._stream.send_columns(entity, at, _row(values))
+            self._stream.send_columns(entity, at, row(values))
         for name, values in traces.items():
             entity, picture = _trace(name, values)
-            self._stream.send_columns(entity, at, _row(picture))
+            self._stream.send_columns(entity, at, row(picture))
         if sample is not None:
             wall = now + (sample.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
             end = start + self._horizon - SEAM
             frames = progress.generation, np.minimum(start + sample.times, end), wall
-            _send(self._stream, self._drawing.columns(sample), _rows("generation", *frames))
+            send(self._stream, self._drawing.columns(sample), rows("generation", *frames))
         self._last = now
         self._flush()
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a line; levels are those of the standard library."""
-        at = _times("generation", self._generation, np.array([self._start]), np.array([time.time()]))
-        self._stream.send_columns("/log", at, _row(rr.TextLog(text, level=_LEVELS.get(level, level))))
+        at = times("generation", self._generation, np.array([self._start]), np.array([time.time()]))
+        self._stream.send_columns("/log", at, row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
     def close(self) -> None:
         """Write everything out, merge the parts and compact them; a broken recording is left as it is.
@@ -160,7 +157,7 @@ class Recorder:
             # Rerun would now wait for this file for ever, at the latest when the process ends.
             self._broken = True
             rr.unregister_shutdown()
-            self._stream.inner = _Abandoned()
+            self._stream.inner = _Abandoned()  # type: ignore[assignment]
             raise OSError(f"Rerun writes no more: {error}") from error
 
     def _check_space(self) -> None:
@@ -195,13 +192,13 @@ def record_replay(
     drawing = Drawing(scene)
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
     path.unlink(missing_ok=True)
-    stream = _open(f"{run}-replay", [_file(path)], blueprint.replay(longest))
-    _log_static(stream, [*drawing.static(), _config(config)])
+    stream = begin(f"{run}-replay", [_file(path)], blueprint.replay(longest))
+    log_static(stream, [*drawing.static(), _config(config)])
     start = 0.0
     for number, (name, rollout) in enumerate(rollouts, 1):
-        at = _times("rollout", number, np.array([start]))
-        stream.send_columns("/rollout", at, _row(_caption(name, rollout)))
-        _send(stream, drawing.columns(rollout), _rows("rollout", number, start + rollout.times))
+        at = times("rollout", number, np.array([start]))
+        stream.send_columns("/rollout", at, row(_caption(name, rollout)))
+        send(stream, drawing.columns(rollout), rows("rollout", number, start + rollout.times))
         start += float(rollout.times[-1]) + PAUSE
     stream.flush(timeout_sec=FLUSH)
     stream.disconnect()
@@ -229,20 +226,6 @@ def _free_port(host: str, port: int) -> int:
         raise ConfigError(f"cannot serve the recording at {place}: {error}; choose another") from error
 
 
-def _open(recording: str, sinks: list[Any], layout: rrb.Blueprint) -> rr.RecordingStream:
-    rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
-    stream.set_sinks(*sinks)
-    stream.send_blueprint(layout)
-    stream.send_recording_name(recording)
-    return stream
-
-
-def _log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:
-    for entity, archetype in entities:
-        stream.log(entity, archetype, static=True)
-
-
 def _config(text: str) -> tuple[str, Any]:
     return "/config", _markdown(text)
 
@@ -267,48 +250,3 @@ def _trace(name: str, values: AnyArray) -> tuple[str, Any]:
         return f"/tactile/trace/{name}", trace(values)
     array = np.ascontiguousarray(values, dtype=np.float32)
     return "/tactile/traces", rr.Tensor(array, dim_names=("rollout", "step", "taxel"))
-
-
-def _row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no public base)
-    """An archetype as columns of one row."""
-    batches = archetype.as_component_batches()
-    return [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
-
-
-def _times(counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None) -> Times:
-    """Timelines of n rows: a number, times in the simulation and since the epoch (n,) [s]."""
-    columns = [
-        rr.TimeColumn(counter, sequence=np.full(len(sim), number)),
-        rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
-    ]
-    if wall is not None:
-        columns.append(rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]")))
-    return columns
-
-
-def _nanoseconds(seconds: FloatArray) -> IntArray:
-    """Rounded: Rerun would cut off."""
-    return np.rint(seconds * 1e9).astype(np.int64)
-
-
-def _rows(
-    counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None
-) -> Callable[[IntArray | None], Times]:
-    """Timelines of some of n rows, of all where None."""
-    whole = _times(counter, number, sim, wall)
-
-    def some(rows: IntArray | None) -> Times:
-        if rows is None:
-            return whole
-        return _times(counter, number, sim[rows], None if wall is None else wall[rows])
-
-    return some
-
-
-def _send(
-    stream: rr.RecordingStream,
-    columns: Iterable[Columns],
-    times: Callable[[IntArray | None], Times],
-) -> None:
-    for part in columns:
-        stream.send_columns(part.entity, times(part.rows), part.columns)

@@ -5,14 +5,16 @@ until `rerun rrd optimize` has mended it. So a run that goes on mends what is th
 part of its own.
 """
 
-import contextlib
 import json
+import logging
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Final
+
+log = logging.getLogger(__name__)
 
 _COMPACTING: Final = 600.0  # [s]; 30 MiB take about one
 
@@ -32,28 +34,23 @@ def compact(path: Path) -> bool:
     """
     found = parts(path)
     merged = path.with_name(f"{path.stem}.merging{path.suffix}")
-    with (
-        tempfile.TemporaryDirectory() as home,
-        contextlib.suppress(OSError, subprocess.SubprocessError),
-    ):
-        command = [
-            sys.executable,
-            "-m",
-            "rerun_cli",
-            "rrd",
-            "optimize",
-            *map(str, found),
-            "-o",
-            str(merged),
-        ]
-        subprocess.run(command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING)
+    try:
+        _optimise(found, merged)
         merged.replace(path)
         for old in found:
             if old != path:
                 old.unlink()
-        return True
-    merged.unlink(missing_ok=True)
-    return False
+    except (OSError, subprocess.SubprocessError) as error:
+        log.warning("the recording %s stays as it is, not merged or compacted: %s", path, error)
+        merged.unlink(missing_ok=True)
+        return False
+    return True
+
+
+def _optimise(found: list[Path], merged: Path) -> None:
+    command = [sys.executable, "-m", "rerun_cli", "rrd", "optimize", *map(str, found), "-o", str(merged)]
+    with tempfile.TemporaryDirectory() as home:
+        subprocess.run(command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING)
 
 
 def next_part(path: Path) -> Path:

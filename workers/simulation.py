@@ -24,7 +24,7 @@ from farm.scene import CONTACT_WIDTH, CONTACTS, Scene
 from farm.tasks.finger_gait import SUBSTEPS, FingerGait, Frames, Outcome, Perturbation, TaskConfig, touching
 from workers.grip import Grasping
 
-CAPACITY: Final = 32
+CAPACITY: Final = 64
 """Rollouts stepped together; more are done in turns."""
 
 CLOSING: Final = 100
@@ -139,7 +139,7 @@ class Simulation:
         self._threads = threads
         goal = self._demonstrate(config.goal_grip, grasping.command(GRIPS[config.goal_grip]))
         self.task = FingerGait(config, goal, self._commands)
-        self._start = self._close(self._nominal, self._commands, np.zeros((1, 3)))
+        self.start = self._close(self._nominal, self._commands, np.zeros((1, 3)))
 
     def run(
         self, theta: FloatArray, perturbations: Sequence[Perturbation | None], substeps: int = SUBSTEPS
@@ -194,7 +194,7 @@ class Simulation:
         count = len(perturbations)
         real = [p for p in perturbations if p is not None]
         if not real:
-            start = Start(np.repeat(self._start.rows, count, axis=0), _take(self._start.frames, [0] * count))
+            start = Start(np.repeat(self.start.rows, count, axis=0), _take(self.start.frames, [0] * count))
             self._nominal.state[:count] = start.rows
             return self._nominal, start, None
         if self._perturbed is None:

@@ -8,8 +8,10 @@ import sys
 import textwrap
 import threading
 from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,10 +19,13 @@ import pytest
 from rerun.chunk import RrdReader
 
 from farm import scene as scenes
+from farm.arrays import AnyArray
 from farm.errors import ConfigError
 from farm.hand import FINGERS, TIP_RADIUS
+from farm.scene import Scene
 from farm.trajectory import Trajectory
-from learner.drawing import ARROW, TOP_FORCE, Drawing, changes, ramp, solid
+from learner.curves import ramp
+from learner.drawing import ARROW, TOP_FORCE, Drawing, changes, rotate, solid
 from learner.progress import Progress
 from learner.recorder import Recorder, parts, record_replay
 from learner.recording_thread import RecorderThread
@@ -28,25 +33,28 @@ from learner.recording_thread import RecorderThread
 STEPS = 15
 HORIZON = 1.5
 
+Start = Callable[..., Recorder]
+Batches = dict[str, list[Any]]
+
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Scene:
     return scenes.load("bar")
 
 
 @pytest.fixture
-def start(tmp_path, scene):
+def start(tmp_path: Path, scene: Scene) -> Start:
     """Begin a recorder of a run called `try`."""
 
-    def begin(name="run.rrd", **options):
-        arguments = {"run": "try", "scene": scene, "config": "# settings", "horizon": HORIZON}
-        return Recorder(tmp_path / name, **{**arguments, **options})
+    def begin(done: int = 0) -> Recorder:
+        path = tmp_path / "run.rrd"
+        return Recorder(path, run="try", scene=scene, config="# settings", horizon=HORIZON, done=done)
 
     return begin
 
 
-def progress(generation=1, **values):
-    numbers = {
+def progress(generation: int = 1) -> Progress:
+    numbers: dict[str, Any] = {
         "generation": generation,
         "rollouts": 30 * generation,
         "return_mean": -5.0 + 0.1 * generation,
@@ -69,11 +77,11 @@ def progress(generation=1, **values):
         "workers": 3,
         "seconds": 1.0,
     }
-    return Progress(**{**numbers, **values})
+    return Progress(**numbers)
 
 
-def rollout(scene, frames=STEPS + 1, step=0.1, seed=0):
-    rng = np.random.default_rng(seed)
+def rollout(scene: Scene, frames: int = STEPS + 1, step: float = 0.1) -> Trajectory:
+    rng = np.random.default_rng(0)
     qpos = np.repeat(scene.model.qpos0[None], frames, axis=0)
     qpos[:, :8] = rng.uniform(0.0, 0.5, (frames, 8))
     images = rng.uniform(0.0, 1.0, (frames, 3, 18))
@@ -81,7 +89,7 @@ def rollout(scene, frames=STEPS + 1, step=0.1, seed=0):
     points = rng.normal(size=(frames, 3, 3))
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
     return Trajectory(
-        times=np.arange(frames) * step,
+        times=np.arange(frames, dtype=np.float64) * step,
         bodies=scene.poses(qpos),
         joints=qpos[:, :8],
         targets=qpos[:, :8] + 0.1,
@@ -93,28 +101,28 @@ def rollout(scene, frames=STEPS + 1, step=0.1, seed=0):
     )
 
 
-def traces(pairs=2, seed=0):
+def traces(pairs: int = 2, seed: int = 0) -> dict[str, AnyArray]:
     values = np.random.default_rng(seed).uniform(0.0, 2.0, (2 * pairs, STEPS, 54))
     return {"best": values[0], "worst": values[1], "all": values.astype(np.float32)}
 
 
-def read(*paths):
+def read(path: Path) -> tuple[Batches, set[str]]:
     """Record batches by entity, and which entities are static."""
-    batches, static = defaultdict(list), set()
-    for path in paths:
-        for chunk in RrdReader(path).stream():
-            batches[chunk.entity_path].append(chunk.to_record_batch())
-            if chunk.is_static:
-                static.add(chunk.entity_path)
+    batches: Batches = defaultdict(list)
+    static: set[str] = set()
+    for chunk in RrdReader(path).stream():
+        batches[chunk.entity_path].append(chunk.to_record_batch())
+        if chunk.is_static:
+            static.add(chunk.entity_path)
     return batches, static
 
 
-def count(batches, entity, component):
+def count(batches: Batches, entity: str, component: str) -> int:
     """Rows of an entity that are on a timeline and have the component."""
     return len(column(batches, entity, component))
 
 
-def column(batches, entity, name):
+def column(batches: Batches, entity: str, name: str) -> list[Any]:
     """A column's values in the order of sim_time."""
     rows = []
     for batch in batches[entity]:
@@ -125,13 +133,13 @@ def column(batches, entity, name):
     return [value for _, value in sorted(rows, key=lambda row: row[0]) if value is not None]
 
 
-def times(batches, entity):
+def times(batches: Batches, entity: str) -> list[int]:
     """An entity's sim_time [ns]."""
-    found = [b.column("sim_time").cast("int64").to_pylist() for b in batches[entity]]
-    return sorted(sum(found, []))
+    timed = [b for b in batches[entity] if "sim_time" in b.schema.names]
+    return sorted(t for b in timed for t in b.column("sim_time").cast("int64").to_pylist())
 
 
-def test_generations_are_recorded_on_every_timeline(start, tmp_path, scene):
+def test_generations_are_recorded_on_every_timeline(start: Start, tmp_path: Path, scene: Scene) -> None:
     recorder = start()
     recorder.log("it begins")
     for generation in (1, 2, 3):
@@ -172,7 +180,7 @@ def test_generations_are_recorded_on_every_timeline(start, tmp_path, scene):
             assert not {"log_time", "log_tick"} & set(batch.schema.names), entity
 
 
-def test_rollouts_follow_each_other_without_gap(start, tmp_path, scene):
+def test_rollouts_follow_each_other_without_gap(start: Start, tmp_path: Path, scene: Scene) -> None:
     recorder = start()
     for generation in (4, 5):
         recorder.generation(progress(generation), rollout(scene), {}, rate=1.0)
@@ -184,7 +192,7 @@ def test_rollouts_follow_each_other_without_gap(start, tmp_path, scene):
     assert (np.diff(at) > 0).all(), "a last frame is hidden behind the next rollout's first"
 
 
-def test_frames_hold_what_the_rollout_held(start, tmp_path, scene):
+def test_frames_hold_what_the_rollout_held(start: Start, tmp_path: Path, scene: Scene) -> None:
     shown = rollout(scene, frames=7)  # it ended early
     recorder = start()
     recorder.generation(progress(), shown, {}, rate=1.0)
@@ -202,7 +210,7 @@ def test_frames_hold_what_the_rollout_held(start, tmp_path, scene):
     assert column(batches, "/contacts/state/index", "state") == [["contact"]]
 
 
-def test_all_traces_come_back_bit_by_bit(start, tmp_path):
+def test_all_traces_come_back_bit_by_bit(start: Start, tmp_path: Path) -> None:
     recorder = start()
     kept = {g: traces(pairs=15, seed=g) for g in (1, 2)}
     for generation, values in kept.items():
@@ -215,7 +223,7 @@ def test_all_traces_come_back_bit_by_bit(start, tmp_path):
         assert array.tobytes() == values["all"].tobytes()
 
 
-def test_the_layout_travels_in_the_file(start, tmp_path):
+def test_the_layout_travels_in_the_file(start: Start, tmp_path: Path) -> None:
     start().close()
     reader = RrdReader(tmp_path / "run.rrd")
     assert len(reader.blueprints()) == 1
@@ -223,7 +231,7 @@ def test_the_layout_travels_in_the_file(start, tmp_path):
     assert reader.recordings()[0].application_id == "rolloutfarm"
 
 
-def test_a_run_that_goes_on_keeps_what_is_there(start, tmp_path, scene):
+def test_a_run_that_goes_on_keeps_what_is_there(start: Start, tmp_path: Path, scene: Scene) -> None:
     path = tmp_path / "run.rrd"
     first = start()
     first.generation(progress(1), rollout(scene), traces(), rate=1.0)
@@ -243,7 +251,7 @@ def test_a_run_that_goes_on_keeps_what_is_there(start, tmp_path, scene):
     assert column(batches, "/log", "level") == [["WARN"]]
 
 
-def test_parts_are_found_in_order(tmp_path):
+def test_parts_are_found_in_order(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     assert parts(path) == []
     names = ["run.rrd", "run.part2.rrd", "run.part10.rrd"]
@@ -252,7 +260,26 @@ def test_parts_are_found_in_order(tmp_path):
     assert [p.name for p in parts(path)] == names
 
 
-def test_a_torn_file_is_mended(start, tmp_path, scene):
+def test_what_cannot_be_merged_stays(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "run.rrd"
+    start().close()
+    monkeypatch.setattr("sys.executable", "/nowhere/python")
+    before = path.read_bytes()
+    second = start(done=1)
+    second.generation(progress(2), None, {}, rate=1.0)
+    second.close()
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir() if "part" in p.name] == ["run.part2.rrd"]
+    assert "not merged" in caplog.text
+    monkeypatch.undo()
+    start(done=2).close()
+    assert parts(path) == [path]
+    assert column(read(path)[0], "/learning/return", "generation") == [2]
+
+
+def test_a_torn_file_is_mended(start: Start, tmp_path: Path, scene: Scene) -> None:
     path = tmp_path / "run.rrd"
     code = f"""
         import os, pickle, sys
@@ -276,7 +303,7 @@ def test_a_torn_file_is_mended(start, tmp_path, scene):
     assert column(batches, "/learning/return", "generation") == [1, 2, 3, 4, 5, 6]
 
 
-def test_wrong_input_is_refused(start, scene):
+def test_wrong_input_is_refused(start: Start, scene: Scene) -> None:
     recorder = start()
     good = rollout(scene)
     with pytest.raises(ValueError, match="another scene"):
@@ -288,23 +315,23 @@ def test_wrong_input_is_refused(start, scene):
     recorder.close()
 
 
-def test_a_recording_needs_somewhere_to_go(scene):
+def test_a_recording_needs_somewhere_to_go(scene: Scene) -> None:
     with pytest.raises(ConfigError, match="without a file"):
         Recorder(None, run="try", scene=scene, config="", horizon=HORIZON)
 
 
-def test_viewers_are_served(scene):
-    options = {"run": "try", "scene": scene, "config": "", "horizon": HORIZON}
-    recorder = Recorder(None, serve=("127.0.0.1", 0), **options)
+def test_viewers_are_served(scene: Scene) -> None:
+    recorder = Recorder(None, run="try", scene=scene, config="", horizon=HORIZON, serve=("127.0.0.1", 0))
+    assert recorder.uri is not None
     port = int(recorder.uri.removeprefix("rerun+http://127.0.0.1:").removesuffix("/proxy"))
     recorder.generation(progress(), rollout(scene), traces(), rate=1.0)
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     with pytest.raises(ConfigError, match="choose another"):
-        Recorder(None, serve=("127.0.0.1", port), **options)
+        Recorder(None, run="try", scene=scene, config="", horizon=HORIZON, serve=("127.0.0.1", port))
     recorder.close()
 
 
-def test_replays_follow_each_other(tmp_path, scene):
+def test_replays_follow_each_other(tmp_path: Path, scene: Scene) -> None:
     path = tmp_path / "replay.rrd"
     shown = [
         ("best of generation 3", rollout(scene, 31, 0.01)),
@@ -323,7 +350,7 @@ def test_replays_follow_each_other(tmp_path, scene):
     assert (np.diff(times(batches, "/reward/terms")) > 0).all()
 
 
-def test_arrows_push_the_fingers_at_their_contacts(scene):
+def test_arrows_push_the_fingers_at_their_contacts(scene: Scene) -> None:
     shown = rollout(scene)
     force = shown.images.sum(axis=-1)
     force[:, 0] = 1.0
@@ -341,21 +368,23 @@ def test_arrows_push_the_fingers_at_their_contacts(scene):
                 np.testing.assert_allclose(vectors[frame, finger], -ARROW * outward, atol=1e-9)
 
 
-def test_a_capsule_starts_where_its_axis_begins(scene):
+def test_a_capsule_starts_where_its_axis_begins(scene: Scene) -> None:
     geometry = next(g for g in scene.geometries() if g.name == "thumb_distal")
     assert geometry.shape == "capsule"
     drawn = solid(geometry, [0, 0, 0, 255])
-    start = drawn.translations.as_arrow_array().to_pylist()[0]
-    assert start == pytest.approx([0.0, 0.0, 0.006], abs=1e-7)
-    assert drawn.lengths.as_arrow_array().to_pylist() == pytest.approx([0.028])
+    start = np.array(drawn.translations.as_arrow_array().to_pylist()[0])
+    length = drawn.lengths.as_arrow_array().to_pylist()[0]
+    end = start + rotate(np.array(geometry.quaternion), np.array([0.0, 0.0, length]))
+    ends = sorted([start, end], key=lambda point: point[2])
+    np.testing.assert_allclose(ends, [[0.0, 0.0, 0.006], [0.0, 0.0, 0.034]], atol=1e-6)
 
 
-def test_colours_run_from_violet_to_yellow():
+def test_colours_run_from_violet_to_yellow() -> None:
     colours = ramp(np.array([-1.0, 0.0, TOP_FORCE, 9.0]), TOP_FORCE)
     assert [hex(c) for c in colours] == ["0x440154ff"] * 2 + ["0xfde725ff"] * 2
 
 
-def test_changes_are_the_first_row_and_every_other_state():
+def test_changes_are_the_first_row_and_every_other_state() -> None:
     assert changes(np.array([False, False, True, True, False])).tolist() == [0, 2, 4]
     assert changes(np.array([True])).tolist() == [0]
 
@@ -363,27 +392,31 @@ def test_changes_are_the_first_row_and_every_other_state():
 class Slow:
     """A recorder that waits for a go."""
 
-    uri = "somewhere"
+    uri: str | None = "somewhere"
 
-    def __init__(self, fails=None):
-        self.go, self.generations, self.lines = threading.Event(), [], []
+    def __init__(self, fails: Exception | None = None) -> None:
+        self.go = threading.Event()
+        self.generations: list[tuple[Progress, Trajectory | None, Mapping[str, AnyArray], float]] = []
+        self.lines: list[tuple[str, str]] = []
         self.closed = False
         self.fails = fails
 
-    def generation(self, progress, sample, traces, rate):
+    def generation(
+        self, progress: Progress, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
+    ) -> None:
         self.go.wait()
         if self.fails:
             raise self.fails
         self.generations.append((progress, sample, traces, rate))
 
-    def log(self, text, level="INFO"):
+    def log(self, text: str, level: str = "INFO") -> None:
         self.lines.append((text, level))
 
-    def close(self):
+    def close(self) -> None:
         self.closed = True
 
 
-def test_a_slow_recorder_loses_rollouts_but_no_statistics(scene):
+def test_a_slow_recorder_loses_rollouts_but_no_statistics(scene: Scene) -> None:
     slow = Slow()
     thread = RecorderThread(slow, waiting=4)
     shown = rollout(scene, frames=2)
@@ -402,7 +435,7 @@ def test_a_slow_recorder_loses_rollouts_but_no_statistics(scene):
     assert slow.closed
 
 
-def test_a_broken_recorder_ends_with_one_line(caplog):
+def test_a_broken_recorder_ends_with_one_line(caplog: pytest.LogCaptureFixture) -> None:
     broken = Slow(fails=OSError("no space left on device"))
     broken.go.set()
     thread = RecorderThread(broken)
@@ -418,7 +451,7 @@ def test_a_broken_recorder_ends_with_one_line(caplog):
     assert broken.closed
 
 
-def test_a_recorder_that_hangs_is_left_behind(caplog):
+def test_a_recorder_that_hangs_is_left_behind(caplog: pytest.LogCaptureFixture) -> None:
     slow = Slow()
     thread = RecorderThread(slow)
     thread.generation(progress(), None, {}, 1.0)
@@ -427,7 +460,7 @@ def test_a_recorder_that_hangs_is_left_behind(caplog):
     slow.go.set()
 
 
-def test_a_full_disk_is_noticed(tmp_path):
+def test_a_full_disk_is_noticed(tmp_path: Path) -> None:
     code = f"""
         import pickle, resource, sys
         from pathlib import Path
@@ -452,7 +485,9 @@ def test_a_full_disk_is_noticed(tmp_path):
     assert b"noticed" in ended.stdout, ended.stderr.decode()
 
 
-def test_a_recording_ends_before_the_disk_is_full(start, tmp_path, monkeypatch):
+def test_a_recording_ends_before_the_disk_is_full(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recorder = start()
     recorder.generation(progress(1), None, {}, rate=1.0)
     monkeypatch.setattr("learner.recorder.RESERVE", 1 << 60)
@@ -463,7 +498,7 @@ def test_a_recording_ends_before_the_disk_is_full(start, tmp_path, monkeypatch):
     assert column(batches, "/learning/return", "generation") == [1]
 
 
-def test_the_learner_does_without_rerun():
+def test_the_learner_does_without_rerun() -> None:
     code = "import sys, learner, learner.recording_thread, learner.recording_files as f; "
     code += "sys.exit('rerun' in sys.modules)"
     root = Path(__file__).parents[2]

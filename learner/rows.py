@@ -1,0 +1,72 @@
+"""A Rerun recording, and how rows get into it: several at once, on timelines of our own."""
+
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from farm.arrays import FloatArray, IntArray
+from learner.drawing import Columns
+
+APPLICATION: Final = "rolloutfarm"
+Times = list[rr.TimeColumn]
+
+
+def begin(recording: str, sinks: list[Any], layout: rrb.Blueprint) -> rr.RecordingStream:
+    """A recording of that id into these sinks, its layout first."""
+    rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+    stream.set_sinks(*sinks)
+    stream.send_blueprint(layout)
+    stream.send_recording_name(recording)
+    return stream
+
+
+def log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:
+    """What holds at any time."""
+    for entity, archetype in entities:
+        stream.log(entity, archetype, static=True)
+
+
+def row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no public base)
+    """An archetype as columns of one row."""
+    batches = archetype.as_component_batches()
+    return [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
+
+
+def times(counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None) -> Times:
+    """Timelines of n rows: a number, times in the simulation and since the epoch (n,) [s]."""
+    columns = [
+        rr.TimeColumn(counter, sequence=np.full(len(sim), number)),
+        rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
+    ]
+    if wall is not None:
+        columns.append(rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]")))
+    return columns
+
+
+def _nanoseconds(seconds: FloatArray) -> IntArray:
+    """Rounded: Rerun would cut off."""
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
+def rows(
+    counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None
+) -> Callable[[IntArray | None], Times]:
+    """Timelines of some of n rows, of all where None."""
+    whole = times(counter, number, sim, wall)
+
+    def some(chosen: IntArray | None) -> Times:
+        if chosen is None:
+            return whole
+        return times(counter, number, sim[chosen], None if wall is None else wall[chosen])
+
+    return some
+
+
+def send(stream: rr.RecordingStream, columns: Iterable[Columns], at: Callable[[IntArray | None], Times]) -> None:
+    """Send entities' rows; `at` is what `rows` made of their frames."""
+    for part in columns:
+        stream.send_columns(part.entity, at(part.rows), part.columns)
