@@ -181,7 +181,7 @@ class WireTrajectory:
     def of(cls, trajectory: Trajectory) -> "WireTrajectory":
         """Make ready to send."""
         shrink = {
-            name: np.clip(getattr(trajectory, name), -1e30, 1e30).astype("<f4")
+            name: np.clip(np.nan_to_num(getattr(trajectory, name), nan=-1e30), -1e30, 1e30).astype("<f4")
             for name in ("bodies", "joints", "targets", "images", "points", "terms")
         }
         return cls(value=trajectory.value, success=trajectory.success, times=trajectory.times, **shrink)
