@@ -70,7 +70,9 @@ def _preset(name: str, cores: int, generations: int, repeats: int) -> None:
         ratio = float(np.median([turn[i].steps_per_second / turn[0].steps_per_second for turn in measured]))
         rate = float(np.median([turn[i].rollouts_per_second for turn in measured]))
         cpu = float(np.median([turn[i].cpu_per_rollout for turn in measured]))
-        print(f"| {name} ({config.policy.controller}) | {what} | {rate:.0f} | {1e3 * cpu:.2f} | {ratio:.2f} |", flush=True)
+        print(
+            f"| {name} ({config.policy.controller}) | {what} | {rate:.0f} | {1e3 * cpu:.2f} | {ratio:.2f} |", flush=True
+        )
 
 
 class _ClosedLoop:
@@ -109,7 +111,12 @@ class _ClosedLoop:
 def _farm(config: RunConfig, pairs: int, generations: int) -> Measured:
     """Generations of a run that learns nothing, timed from the second on."""
     still = replace(
-        config.algorithm, pairs=pairs, initial_mu=STILL, initial_sigma=1e-3, learning_rate_mu=0.0, learning_rate_sigma=0.0
+        config.algorithm,
+        pairs=pairs,
+        initial_mu=STILL,
+        initial_sigma=1e-3,
+        learning_rate_mu=0.0,
+        learning_rate_sigma=0.0,
     )
     config = replace(config, algorithm=still, generations=generations)
     with tempfile.TemporaryDirectory() as folder:

@@ -31,13 +31,13 @@ from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.dispatcher import Dispatcher, Stopped
 from learner.folder import RunFolder
-from learner.ledger import LedgerConfig
 from learner.learner import Evaluation, Learner, Report, specification, start
+from learner.ledger.ledger import LedgerConfig
 from workers.backends.cpu import CpuBackend
 from workers.pool import Pool
 
 if TYPE_CHECKING:
-    from learner.recording import Recording
+    from learner.recording.run import Recording
 
 log = logging.getLogger(__name__)
 
@@ -70,9 +70,7 @@ class Place:
 class Run:
     """A run that is open: iterate over `learn`, then `finish`."""
 
-    def __init__(
-        self, learner: Learner, farm: Dispatcher, recording: "Recording | None", pool: Pool | None
-    ) -> None:
+    def __init__(self, learner: Learner, farm: Dispatcher, recording: "Recording | None", pool: Pool | None) -> None:
         """Made by `open_run`."""
         self.learner, self._farm, self._recording, self._pool = learner, farm, recording, pool
         self.summary: dict[str, Any] = {}
@@ -153,8 +151,13 @@ def open_run(
         else:
             folder = RunFolder.create(path, config)
         learner = Learner(config, folder, at)
+        try:
+            recording = stack.enter_context(_recording(place, learner, scene)) if place.record or place.serve else None
+        except ConfigError:
+            if not resume:
+                folder.discard()
+            raise
         stack.enter_context(_log_file(folder))
-        recording = stack.enter_context(_recording(place, learner, scene)) if place.record or place.serve else None
         tend = _Tending(stopped)
         farm = Dispatcher(link, place.farm, learner.spec, _how_to_join(place), tend, place.ledger)
         if place.workers:
@@ -232,7 +235,7 @@ def _log_file(folder: RunFolder) -> Iterator[None]:
 
 @contextmanager
 def _recording(place: Place, learner: Learner, scene: Scene) -> "Iterator[Recording]":
-    from learner.recording import Recording
+    from learner.recording.run import Recording
 
     recording = Recording(learner, scene, place.serve, to_file=place.record)
     try:

@@ -100,4 +100,3 @@ def contact_points(images: FloatArray) -> FloatArray:
     total = images.sum(axis=-1)
     share = images / np.where(total > 0, total, 1.0)[..., None]
     return np.stack([(share * DIRECTIONS[:, axis]).sum(axis=-1) for axis in range(3)], axis=-1)
-

@@ -20,7 +20,7 @@ from farm.codec import M
 from farm.errors import MessageError, RunError
 from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
 from farm.session import Event, Session
-from learner.ledger import Ledger, LedgerConfig
+from learner.ledger.ledger import Ledger, LedgerConfig
 
 log = logging.getLogger(__name__)
 

@@ -14,6 +14,7 @@ is cut off when the run is resumed.
 
 import json
 import math
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -94,6 +95,10 @@ class RunFolder:
         if not (path / "config.json").is_file():
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         return cls(path)
+
+    def discard(self) -> None:
+        """Remove a new run that could not begin."""
+        shutil.rmtree(self.path)
 
     def write_config(self, config: RunConfig) -> None:
         """Write config.json."""

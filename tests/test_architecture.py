@@ -20,7 +20,7 @@ DOORS = {
     "msgpack": ("farm/codec.py",),
     "tyro": ("farm/arguments.py", "farm/commands/"),
     "mujoco": ("farm/scene.py", "workers/grip.py", "workers/simulation.py"),
-    "rerun": ("learner/blueprint.py", "learner/curves.py", "learner/drawing.py", "learner/recorder.py"),
+    "rerun": ("learner/recording/",),
     "rich": ("farm/commands/",),
 }
 """The only modules that may import a package from outside."""
@@ -28,7 +28,7 @@ DOORS = {
 PURE = (
     *("farm/arrays.py", "farm/errors.py", "farm/hand.py", "farm/keys.py", "farm/policy.py", "farm/rewards.py"),
     *("farm/states.py", "farm/tactile.py", "farm/trajectory.py", "farm/tasks/", "learner/algorithms/"),
-    *("learner/books.py", "learner/ledger.py", "learner/pace.py", "learner/progress.py"),
+    *("learner/ledger/", "learner/progress.py"),
 )
 """Modules without network, simulator, clock or file."""
 

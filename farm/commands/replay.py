@@ -29,8 +29,8 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ReplayCommand, words, "farm replay")
     check_rerun()
-    from learner.recorder import record_replay
-    from learner.recording import markdown
+    from learner.recording.recorder import record_replay
+    from learner.recording.run import markdown
 
     folder = RunFolder.open(command.run)
     config = folder.read_config()

@@ -27,7 +27,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ViewCommand, words, "farm view")
     check_rerun()
-    from learner.recording_files import parts
+    from learner.recording.files import parts
 
     files = [command.run] if command.run.is_file() else parts(command.run / "run.rrd")
     if not files:

@@ -89,7 +89,7 @@ class TaskConfig:
         _known("state base", self.state, STATES)
         _known("reward", self.reward, REWARDS)
         _known("weights", self.weights, WEIGHTS)
-        if not SUCCESS_STEPS <= self.steps <= 1000:
+        if not isinstance(self.steps, int) or not SUCCESS_STEPS <= self.steps <= 1000:
             raise ConfigError(f"steps is {self.steps}; expected {SUCCESS_STEPS} to 1000")
         if not 0 < self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}; expected a number in (0, 1]")

@@ -63,9 +63,7 @@ def adam(
     return learning_rate * mean / (np.sqrt(square) + _ADAM_EPSILON), first, second
 
 
-def step_sigma(
-    sigma: FloatArray, step: FloatArray, rule: SigmaRule, *, cap: float, floor: float
-) -> FloatArray:
+def step_sigma(sigma: FloatArray, step: FloatArray, rule: SigmaRule, *, cap: float, floor: float) -> FloatArray:
     """Add a step to sigma; `capped` allows at most cap * sigma of it, the floor holds always."""
     if rule == "capped":
         step = np.clip(step, -cap * sigma, cap * sigma)

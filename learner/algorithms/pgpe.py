@@ -100,8 +100,7 @@ class PGPE:
             check_number(name, getattr(self, name), bounds, expected)
         if self.initial_sigma < self.sigma_floor:
             raise ValueError(
-                f"initial_sigma is {self.initial_sigma}, expected sigma_floor "
-                f"({self.sigma_floor}) or more"
+                f"initial_sigma is {self.initial_sigma}, expected sigma_floor ({self.sigma_floor}) or more"
             )
 
     @property
@@ -193,9 +192,7 @@ class PGPE:
             to_sigma = np.zeros_like(to_sigma)  # the first generation only sets the baseline
         return to_mu, to_sigma, following
 
-    def _baselines(
-        self, state: PGPEState, eps: FloatArray, middle: FloatArray
-    ) -> tuple[float, float | None]:
+    def _baselines(self, state: PGPEState, eps: FloatArray, middle: FloatArray) -> tuple[float, float | None]:
         """Return the baseline of this update and the one to remember."""
         if self.baseline == "none":
             return 0.0, None
@@ -207,14 +204,10 @@ class PGPE:
             return mean, mean
         return state.baseline, _BASELINE_MEMORY * state.baseline + (1.0 - _BASELINE_MEMORY) * mean
 
-    def _moved(
-        self, state: PGPEState, gradient_mu: FloatArray, gradient_sigma: FloatArray
-    ) -> dict[str, FloatArray]:
+    def _moved(self, state: PGPEState, gradient_mu: FloatArray, gradient_sigma: FloatArray) -> dict[str, FloatArray]:
         """Return the arrays of the next state, by name."""
         step = self.learning_rate_sigma * gradient_sigma
-        sigma = step_sigma(
-            state.sigma, step, self.sigma_rule, cap=self.sigma_cap, floor=self.sigma_floor
-        )
+        sigma = step_sigma(state.sigma, step, self.sigma_rule, cap=self.sigma_cap, floor=self.sigma_floor)
         rate = self.learning_rate_mu
         if self.optimiser == "sgd":
             return {"mu": state.mu + rate * gradient_mu, "sigma": sigma}
@@ -246,6 +239,4 @@ class PGPE:
         for name in ("velocity", "first_moment", "second_moment"):
             wanted = state.mu.size if name in self._memory() else 0
             if (found := getattr(state, name).size) != wanted:
-                raise ValueError(
-                    f"state: {name} has {found} entries, expected {wanted} with {self.optimiser}"
-                )
+                raise ValueError(f"state: {name} has {found} entries, expected {wanted} with {self.optimiser}")

@@ -54,9 +54,7 @@ class PGPEState:
             object.__setattr__(self, name, _read_only(name, getattr(self, name)))
         self._check_sizes()
         if not (self.sigma > 0.0).all():
-            raise ValueError(
-                f"state: sigma must be positive everywhere, its least is {self.sigma.min()}"
-            )
+            raise ValueError(f"state: sigma must be positive everywhere, its least is {self.sigma.min()}")
         for name in ("baseline", "best"):
             object.__setattr__(self, name, _scalar(name, getattr(self, name)))
         count = self.generation
@@ -90,9 +88,7 @@ class PGPEState:
         if missing := sorted(known - set(values)):
             raise ValueError(f"state: missing {', '.join(missing)}")
         if unknown := sorted(set(values) - known):
-            raise ValueError(
-                f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(known))}"
-            )
+            raise ValueError(f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(known))}")
         return cls(**dict(values))  # type: ignore[arg-type]  # __post_init__ checks every type
 
 

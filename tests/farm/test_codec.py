@@ -176,7 +176,20 @@ def test_an_oversized_message_is_refused_unread(monkeypatch):
     refused(payload, f"a message of {len(payload)} bytes; at most {len(payload) - 1} are taken", "large")
 
 
-STRANGE = [None, True, 1.0, "1", -1, 2**64 - 1, [], [[]], {}, b"1", ext("<f8", [5], bytes(40)), ext("<i8", [1], bytes(8))]
+STRANGE = [
+    None,
+    True,
+    1.0,
+    "1",
+    -1,
+    2**64 - 1,
+    [],
+    [[]],
+    {},
+    b"1",
+    ext("<f8", [5], bytes(40)),
+    ext("<i8", [1], bytes(8)),
+]
 
 
 @pytest.mark.parametrize("value", [*STRANGE, 2], ids=str)
@@ -264,7 +277,9 @@ def test_truths_are_one_or_nothing():
     refused(pack(body(truths=ext("|b1", [3], b"\x00\x01\x02"))), "Sample.truths: not true or false")
 
 
-@pytest.mark.parametrize("dtype", [">f8", "<c16", "|O", "<U4", "<M8[s]", "|u1", "<f2", "f8", "", "nonsense", 1, None, []])
+@pytest.mark.parametrize(
+    "dtype", [">f8", "<c16", "|O", "<U4", "<M8[s]", "|u1", "<f2", "f8", "", "nonsense", 1, None, []]
+)
 def test_an_array_of_a_dtype_that_is_not_spoken_is_refused(dtype):
     refused(pack(body(doubles=ext(dtype, [2, 2], bytes(32)))), "not a message|unknown kind")
 
@@ -396,7 +411,9 @@ wild = st.recursive(
     | st.floats()
     | st.text(max_size=5)
     | st.binary(max_size=5)
-    | st.builds(ext, st.sampled_from(["<f8", "|b1", "x"]), st.lists(st.integers(0, 3), max_size=3), st.binary(max_size=24)),
+    | st.builds(
+        ext, st.sampled_from(["<f8", "|b1", "x"]), st.lists(st.integers(0, 3), max_size=3), st.binary(max_size=24)
+    ),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5) | st.binary(max_size=3), inner),
     max_leaves=12,
 )

@@ -184,9 +184,7 @@ def test_rollouts_of_a_batch_are_judged_apart():
 
 @pytest.mark.parametrize("action", [1e10, 1e200, np.inf, -np.inf, np.nan])
 def test_a_return_that_overflows_is_clamped(action):
-    outcome = task().judge(
-        frames(), np.full((1, STEPS, 8), action), START[None], np.array([STEPS]), np.array([False])
-    )
+    outcome = task().judge(frames(), np.full((1, STEPS, 8), action), START[None], np.array([STEPS]), np.array([False]))
     assert outcome.clamped[0]
     assert outcome.returns[0] == -1e12
 
@@ -309,7 +307,12 @@ def test_the_same_seed_draws_the_same():
 @pytest.mark.parametrize("steps", [3, 40])
 def test_the_order_of_draws_is_friction_mass_displacement_noise(steps):
     rng = np.random.default_rng(4)
-    expected = (rng.uniform(0.8, 1.2), rng.uniform(0.8, 1.2), rng.uniform(-0.002, 0.002, 3), rng.normal(0, 0.01, (steps, 8)))
+    expected = (
+        rng.uniform(0.8, 1.2),
+        rng.uniform(0.8, 1.2),
+        rng.uniform(-0.002, 0.002, 3),
+        rng.normal(0, 0.01, (steps, 8)),
+    )
     drawn = Perturbation.draw(np.random.default_rng(4), steps)
     for value, wanted in zip(dataclasses.astuple(drawn), expected, strict=True):
         np.testing.assert_array_equal(value, wanted)

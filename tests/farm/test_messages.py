@@ -95,7 +95,9 @@ MESSAGES = {
     "result of one": result(rollouts=1),
     "result without traces": result(steps=0),
     "result with a trajectory": result(trajectory=WireTrajectory.of(trajectory())),
-    "results": Results(**HEAD, worker="host/a1", results=(result(), result(1, trajectory=WireTrajectory.of(trajectory())))),
+    "results": Results(
+        **HEAD, worker="host/a1", results=(result(), result(1, trajectory=WireTrajectory.of(trajectory())))
+    ),
     "empty results": Results(**HEAD, worker="host/a1", results=()),
     "failure": Failure(**HEAD, worker="host/a1", index=3, error="ValueError: so it went"),
     "trajectory": WireTrajectory.of(trajectory()),

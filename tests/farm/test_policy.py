@@ -39,7 +39,7 @@ def kernel_error(features, size, bandwidth, seed):
     x, y = states(12, size, 1) * bandwidth, states(12, size, 2) * bandwidth
     errors = []
     for a, b in zip(x, y, strict=True):
-        exact = math.exp(-math.dist(a, b) ** 2 / (2 * bandwidth**2))
+        exact = math.exp(-(math.dist(a, b) ** 2) / (2 * bandwidth**2))
         errors.append(float(policy.features(a) @ policy.features(b)) - exact)
     return np.sqrt(np.mean(np.square(errors)))
 

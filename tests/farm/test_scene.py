@@ -48,7 +48,7 @@ def test_joints_have_the_names_order_and_ranges_of_the_hand(scene):
         assert (joint.qposadr[0], joint.dofadr[0]) == (i, i)
         assert scene.model.actuator(name).trnid[0] == joint.id
     np.testing.assert_array_equal(scene.model.jnt_range[:8], np.stack([LOWER, UPPER], axis=1))
-    np.testing.assert_array_equal(scene.model.actuator_ctrlrange, np.stack([LOWER, UPPER], axis=1))
+    np.testing.assert_allclose(scene.model.actuator_ctrlrange, np.stack([LOWER, UPPER], axis=1), atol=1e-12)
     assert scene.model.jnt_limited[:8].all()
 
 

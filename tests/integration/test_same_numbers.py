@@ -9,9 +9,9 @@ import pytest
 from processes import SMALL, Farm, children
 
 from farm.local import Place, free_endpoint, learn, open_run
-from learner.config import RunConfig
 from learner.algorithms import PGPE
-from learner.ledger import LedgerConfig
+from learner.config import RunConfig
+from learner.ledger.ledger import LedgerConfig
 
 CONFIG = RunConfig(generations=10, algorithm=PGPE(pairs=6, initial_sigma=1.0, sigma_rule="capped"))
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from learner.ledger import Assignment, Ledger, LedgerConfig
+from learner.ledger.ledger import Assignment, Ledger, LedgerConfig
 
 
 def started(jobs, workers=(), *, credits=4, seconds=None, **config):

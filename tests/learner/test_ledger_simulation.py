@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.ledger import Ledger, LedgerConfig
+from learner.ledger.ledger import Ledger, LedgerConfig
 
 LEASE = 3.0  # a dead or hung worker's token goes after at most this [s]
 

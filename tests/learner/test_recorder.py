@@ -24,11 +24,11 @@ from farm.errors import ConfigError
 from farm.hand import FINGERS, TIP_RADIUS
 from farm.scene import Scene
 from farm.trajectory import Trajectory
-from learner.curves import ramp
-from learner.drawing import ARROW, TOP_FORCE, Drawing, changes, rotate, solid
 from learner.progress import Progress
-from learner.recorder import Recorder, parts, record_replay
-from learner.recording_thread import RecorderThread
+from learner.recording.curves import ramp
+from learner.recording.drawing import ARROW, TOP_FORCE, Drawing, changes, rotate, solid
+from learner.recording.recorder import Recorder, parts, record_replay
+from learner.recording.thread import RecorderThread
 
 STEPS = 15
 HORIZON = 1.5
@@ -285,7 +285,7 @@ def test_a_torn_file_is_mended(start: Start, tmp_path: Path, scene: Scene) -> No
         import os, pickle, sys
         from pathlib import Path
         from farm import scene as scenes
-        from learner.recorder import Recorder
+        from learner.recording.recorder import Recorder
         recorder = Recorder(Path({str(path)!r}), run="try", scene=scenes.load("bar"), config="",
                             horizon={HORIZON})
         for progress in pickle.load(sys.stdin.buffer):
@@ -412,7 +412,7 @@ class Slow:
     def log(self, text: str, level: str = "INFO") -> None:
         self.lines.append((text, level))
 
-    def close(self) -> None:
+    def close(self, *, merge: bool = True) -> None:  # noqa: ARG002
         self.closed = True
 
 
@@ -465,7 +465,7 @@ def test_a_full_disk_is_noticed(tmp_path: Path) -> None:
         import pickle, resource, sys
         from pathlib import Path
         from farm import scene as scenes
-        from learner import recorder as recorders
+        from learner.recording import recorder as recorders
         recorders.FLUSH = 1.0
         recorder = recorders.Recorder(Path({str(tmp_path / "run.rrd")!r}), run="try",
                             scene=scenes.load("bar"), config="", horizon={HORIZON})
@@ -490,7 +490,7 @@ def test_a_recording_ends_before_the_disk_is_full(
 ) -> None:
     recorder = start()
     recorder.generation(progress(1), None, {}, rate=1.0)
-    monkeypatch.setattr("learner.recorder.RESERVE", 1 << 60)
+    monkeypatch.setattr("learner.recording.recorder.RESERVE", 1 << 60)
     with pytest.raises(OSError, match="are needed"):
         recorder.generation(progress(2), None, {}, rate=1.0)
     recorder.close()
@@ -499,7 +499,7 @@ def test_a_recording_ends_before_the_disk_is_full(
 
 
 def test_the_learner_does_without_rerun() -> None:
-    code = "import sys, learner, learner.recording_thread, learner.recording_files as f; "
+    code = "import sys, learner, learner.recording.thread, learner.recording.files as f; "
     code += "sys.exit('rerun' in sys.modules)"
     root = Path(__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

@@ -33,7 +33,7 @@ class CpuBackend:
             raise ConfigError(f"unknown task {spec.task!r}; known are {', '.join(TASKS)}")
         try:
             config, policy = TaskConfig(**spec.task_config), PolicyConfig(**spec.policy_config)
-        except TypeError as error:
+        except (TypeError, ValueError) as error:
             raise ConfigError(f"a specification that this release does not understand: {error}") from None
         features = Features(frequencies=spec.frequencies, phases=spec.phases)
         size = STATES[config.state].size

@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 from learner.algorithms import PGPE, Diverged
 
 CHOICES = {name: get_args(hint) for name, hint in get_type_hints(PGPE).items() if get_args(hint)}
-COMBINATIONS = [
-    dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())
-]
+COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 
 
 def state_of(config, mu, sigma, **others):

@@ -11,9 +11,7 @@ import pytest
 from learner.algorithms import ALGORITHMS, PGPE, PGPEState
 
 CHOICES = {name: get_args(hint) for name, hint in get_type_hints(PGPE).items() if get_args(hint)}
-COMBINATIONS = [
-    dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())
-]
+COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 
 
 def sample(seed, config, size=3):

@@ -25,11 +25,11 @@ from farm.arrays import AnyArray
 from farm.errors import ConfigError
 from farm.scene import Scene
 from farm.trajectory import Trajectory
-from learner import blueprint, curves
-from learner.drawing import Drawing, trace
 from learner.progress import Progress
-from learner.recording_files import compact, next_part, parts
-from learner.rows import begin, log_static, row, rows, send, times
+from learner.recording import blueprint, curves
+from learner.recording.drawing import Drawing, trace
+from learner.recording.files import compact, next_part, parts
+from learner.recording.rows import begin, log_static, row, rows, send, times
 
 __all__ = ["Recorder", "parts", "record_replay"]
 
@@ -78,6 +78,7 @@ class Recorder:
         self._path, self._horizon, self._generation = path, horizon, done
         self._last = time.time() - horizon
         self._broken = False
+        self._run, self._scene, self._config = run, scene, config
         self._drawing = Drawing(scene)
         self._server = None if serve is None else (serve[0], _free_port(*serve))
         sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
@@ -136,8 +137,15 @@ class Recorder:
         at = times("generation", self._generation, np.array([self._start]), np.array([time.time()]))
         self._stream.send_columns("/log", at, row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
-    def close(self) -> None:
+    def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
+        """Record named rollouts at physics rate into a file of their own; see `record_replay`."""
+        record_replay(path, run=self._run, scene=self._scene, config=self._config, rollouts=rollouts)
+
+    def close(self, *, merge: bool = True) -> None:
         """Write everything out, merge the parts and compact them; a broken recording is left as it is.
+
+        Args:
+          merge: false leaves the parts as they are, for somebody in a hurry.
 
         Raises:
           OSError: the file takes no more.
@@ -146,7 +154,7 @@ class Recorder:
             return
         self._flush()
         self._stream.disconnect()
-        if self._path is not None:
+        if self._path is not None and merge:
             compact(self._path)
 
     def _flush(self) -> None:

@@ -4,7 +4,8 @@ import contextlib
 import logging
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Final, Protocol
 
 from farm.arrays import AnyArray
@@ -39,7 +40,11 @@ class Recording(Protocol):
         """Record a line."""
         ...
 
-    def close(self) -> None:
+    def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
+        """Record rollouts into a file of their own."""
+        ...
+
+    def close(self, *, merge: bool = True) -> None:
         """End the recording."""
         ...
 
@@ -56,6 +61,7 @@ class RecorderThread:
         self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._failed = threading.Event()
         self._dropped = 0
+        self._merge = True
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
@@ -91,15 +97,21 @@ class RecorderThread:
         """Have a line recorded."""
         self._put(lambda: self._recorder.log(text, level))
 
-    def close(self, timeout: float | None = None) -> bool:
+    def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
+        """Have rollouts recorded into a file of their own."""
+        self._put(lambda: self._recorder.replay(path, rollouts))
+
+    def close(self, timeout: float | None = None, *, merge: bool = True) -> bool:
         """Record what waits and end the recording.
 
         Args:
           timeout: how long that may take [s]; None for as long as it takes.
+          merge: whether to compact the file as well.
 
         Returns:
           whether everything is recorded.
         """
+        self._merge = merge
         self._queue.put(None)
         self._thread.join(timeout)
         if self._thread.is_alive():
@@ -115,7 +127,7 @@ class RecorderThread:
         try:
             while (call := self._queue.get()) is not None:
                 call()
-            self._recorder.close()
+            self._recorder.close(merge=self._merge)
         except Exception as error:
             self._failed.set()
             log.error("the recording ends here, learning goes on: %s", error)
@@ -126,4 +138,4 @@ class RecorderThread:
         while not self._queue.empty():
             self._queue.get()
         with contextlib.suppress(Exception):
-            self._recorder.close()
+            self._recorder.close(merge=self._merge)

@@ -118,9 +118,7 @@ class Books:
         heapq.heapify(free)
         return free
 
-    def pick(
-        self, index: int, free: list[tuple[int, str]], avoided: Container[str], most: int
-    ) -> str | None:
+    def pick(self, index: int, free: list[tuple[int, str]], avoided: Container[str], most: int) -> str | None:
         """Take from the heap the worker with the fewest jobs that may have this one, if any."""
         passed: list[tuple[int, str]] = []
         picked = None

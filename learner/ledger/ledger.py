@@ -17,8 +17,8 @@ import math
 from collections.abc import Container, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
-from learner.books import Books, Worker
-from learner.pace import LedgerConfig, Pace
+from learner.ledger.books import Books, Worker
+from learner.ledger.pace import LedgerConfig, Pace
 
 __all__ = ["Assignment", "Ledger", "LedgerConfig", "Verdict"]
 

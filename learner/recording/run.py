@@ -10,10 +10,9 @@ from farm.tasks.finger_gait import CONTROL_PERIOD
 from farm.trajectory import Trajectory
 from learner import config as configs
 from learner.config import RunConfig
-from learner.folder import RunFolder
 from learner.learner import Evaluation, Learner, Report
-from learner.recorder import Recorder, record_replay
-from learner.recording_thread import RecorderThread
+from learner.recording.recorder import Recorder
+from learner.recording.thread import RecorderThread
 
 log = logging.getLogger(__name__)
 
@@ -30,12 +29,11 @@ class Recording(logging.Handler):
           ConfigError: the address is taken, or the file cannot be written.
         """
         super().__init__(logging.INFO)
-        self._learner, self._scene = learner, scene
-        self._config = markdown(learner.config)
+        self._learner = learner
         folder = learner.folder
         try:
             recorder = Recorder(
-                folder.recording if to_file else None, run=folder.name, scene=scene, config=self._config,
+                folder.recording if to_file else None, run=folder.name, scene=scene, config=markdown(learner.config),
                 horizon=learner.config.task.steps * CONTROL_PERIOD, serve=serve, done=learner.state.generation,
             )  # fmt: skip
         except OSError as error:
@@ -43,6 +41,7 @@ class Recording(logging.Handler):
         self.uri = recorder.uri
         self._thread = RecorderThread(recorder)
         self._best: tuple[str, Trajectory] | None = None
+        self._ended = False
         logging.getLogger().addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -50,36 +49,27 @@ class Recording(logging.Handler):
         self._thread.log(record.getMessage(), record.levelname)
 
     def generation(self, report: Report) -> None:
-        """Show a generation; keep the best rollout at physics rate."""
+        """Show a generation; the best rollout at physics rate goes into replay.rrd when there is a new one."""
         self._thread.generation(report.progress, report.sample, report.traces, report.rate)
         if report.replay is not None:
-            self._keep_best(report.replay, report.replay_generation)
+            self._best = (f"best rollout, generation {report.replay_generation}", report.replay)
+            self._thread.replay(self._learner.folder.replay, [self._best])
 
     def end(self, evaluation: Evaluation) -> None:
-        """Write the replays of the best and of the final rollout."""
+        """Write replay.rrd once more: the best and the final rollout."""
+        self._ended = True
         if evaluation.replay is not None:
-            self._keep_best(evaluation.replay, self._learner.best_generation)
-        final = evaluation.mean.trajectory
-        if final is not None:
+            self._best = (f"best rollout, generation {self._learner.best_generation}", evaluation.replay)
+        shown = [] if self._best is None else [self._best]
+        if evaluation.mean.trajectory is not None:
             name = f"mean policy after generation {self._learner.state.generation}"
-            self._write([self._best, (name, final.trajectory())])
+            shown.append((name, evaluation.mean.trajectory.trajectory()))
+        self._thread.replay(self._learner.folder.replay, shown)
 
     def finish(self) -> None:
-        """Write out what waits, and close."""
+        """Write out what waits, and close; an interrupted run is in a hurry and merges when it goes on."""
         logging.getLogger().removeHandler(self)
-        self._thread.close(_CLOSE)
-
-    def _keep_best(self, rollout: Trajectory, generation: int) -> None:
-        self._best = (f"best rollout so far, generation {generation}", rollout)
-        self._write([self._best])
-
-    def _write(self, rollouts: list[tuple[str, Trajectory] | None]) -> None:
-        folder: RunFolder = self._learner.folder
-        try:
-            shown = [rollout for rollout in rollouts if rollout is not None]
-            record_replay(folder.replay, run=folder.name, scene=self._scene, config=self._config, rollouts=shown)
-        except Exception as error:
-            log.warning("no replay recorded: %s", error)
+        self._thread.close(_CLOSE, merge=self._ended)
 
 
 def markdown(config: RunConfig) -> str:

@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from farm.arrays import FloatArray, IntArray
-from learner.drawing import Columns
+from learner.recording.drawing import Columns
 
 APPLICATION: Final = "rolloutfarm"
 Times = list[rr.TimeColumn]

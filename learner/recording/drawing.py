@@ -21,7 +21,20 @@ from farm.hand import FINGERS, JOINTS, TIP_RADIUS
 from farm.rewards import TERMS
 from farm.scene import Geometry, Scene
 from farm.trajectory import Trajectory
-from learner.curves import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, Colour, lines, pack, ramp
+from learner.recording.curves import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    YELLOW,
+    Colour,
+    lines,
+    pack,
+    ramp,
+)
 
 FINGER_COLOURS: Final[Mapping[str, Colour]] = dict(zip(FINGERS, (SKY, GREEN, PURPLE), strict=True))
 TERM_COLOURS: Final = (YELLOW, BLUE, GREY, ORANGE, VERMILLION)
