@@ -139,7 +139,8 @@ def _generations(run: Run) -> tuple[float, float, float, int]:
             begun = now
             first = report
         end = now
-    assert begun is not None and last is not None
+    assert begun is not None
+    assert last is not None
     wall, own, theirs = (b - a for a, b in zip(begun, end, strict=True))
     return wall, own, theirs, last.progress.generation - first.progress.generation
 

@@ -2,8 +2,8 @@
 
 FarmError                 anything we can say in one line
   ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
+    CheckpointError       a run folder that cannot be continued or read
   MessageError            bytes from the network that are not what they should be
-  CheckpointError         a run folder that cannot be continued
   RunError                a run that cannot go on (exit status 1)
 """
 

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 
 from farm.errors import ConfigError
 from farm.policy import PolicyConfig
+from farm.randomness import SEEDS
 from farm.tasks.finger_gait import TaskConfig
 from learner.algorithms import PGPE
 
@@ -24,7 +25,7 @@ class RunConfig:
     """The task."""
     policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(controller="kernel"))
     """The controller."""
-    algorithm: PGPE = field(default_factory=lambda: PGPE(initial_sigma=1.0, sigma_rule="capped"))
+    algorithm: PGPE = field(default_factory=lambda: PGPE(initial_mu=1.75, initial_sigma=0.8, sigma_rule="capped"))
     """The learning rule."""
     seed: int = 0
     """Seed of everything random in the run."""
@@ -41,8 +42,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        if not 0 <= self.seed < 2**63:
-            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^63 - 1")
+        if not 0 <= self.seed < SEEDS:
+            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
         if not 0 <= self.generations <= 10_000_000:
             raise ConfigError(f"generations is {self.generations}; expected 0 or more")
         if self.stop_when_solved is not None and self.stop_when_solved < 1:

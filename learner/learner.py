@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from farm import randomness
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import CheckpointError, ConfigError, RunError
 from farm.messages import Job, Result, Spec
@@ -70,7 +71,7 @@ class Evaluation:
 
 def evaluation_jobs(rollouts: int, seed: int) -> list[Job]:
     """The mean policy on perturbed starts, and last on the nominal one at physics rate."""
-    trials = [_mean_job(i, rate="none", perturbation=(seed, i)) for i in range(rollouts)]
+    trials = [_mean_job(i, rate="none", perturbation=randomness.trial(seed, i)) for i in range(rollouts)]
     return [*trials, _mean_job(rollouts, rate="physics", perturbation=None)]
 
 
@@ -182,10 +183,17 @@ class Learner:
     def _explore(self, farm: Dispatcher) -> FloatArray:
         """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
         config, state = self.config, self.state
-        eps = config.algorithm.ask(state, np.random.default_rng((config.seed, state.generation)))
+        eps = config.algorithm.ask(state, randomness.exploration(config.seed, state.generation))
         signs = (1, -1) if config.algorithm.estimator == "symmetric" else (1,)
         jobs = [
-            Job(index=i, origin="mu", signs=signs, perturbation=self._perturbation(i), rate="none", eps=row)
+            Job(
+                index=i,
+                origin="mu",
+                signs=signs,
+                perturbation=self._perturbation(state.generation, i),
+                rate="none",
+                eps=row,
+            )
             for i, row in enumerate(eps)
         ]
         jobs.append(_mean_job(len(jobs), rate="control", perturbation=None))
@@ -193,8 +201,8 @@ class Learner:
         farm.begin(state.generation, state.mu, state.sigma, [*jobs, *replay])
         return eps
 
-    def _perturbation(self, index: int) -> tuple[int, ...] | None:
-        return (self.config.seed, self.state.generation, index) if self.config.task.perturb else None
+    def _perturbation(self, generation: int, index: int) -> tuple[int, ...] | None:
+        return randomness.training(self.config.seed, generation, index) if self.config.task.perturb else None
 
     def _replay_job(self, index: int) -> list[Job]:
         """The best rollout so far once more at physics rate, if that has not been done."""
@@ -216,7 +224,7 @@ class Learner:
         if before.best is None or returns.max() > before.best:
             row, column = np.unravel_index(int(returns.argmax()), returns.shape)
             theta = before.mu + (1, -1)[column] * eps[row]
-            seed = (self.config.seed, before.generation, int(row)) if self.config.task.perturb else None
+            seed = self._perturbation(before.generation, int(row))
             best = Job(index=0, origin="zero", signs=(1,), perturbation=seed, rate="none", eps=theta)
             generation, replayed = self.state.generation, False
         self._at = replace(
@@ -276,7 +284,7 @@ def start(config: RunConfig, run: str) -> Checkpoint:
       ConfigError: the run to start from cannot be used.
     """
     size = STATES[config.task.state].size
-    features = Features.draw(config.policy, size, np.random.default_rng((config.seed, 2**32)))
+    features = Features.draw(config.policy, size, randomness.features(config.seed))
     state = config.algorithm.init(_policy(config, features).size)
     if config.init_from is not None:
         state, features = _taken_over(config, state)

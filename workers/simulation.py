@@ -5,7 +5,8 @@ others share its batch, on their order, or on threads. They equal, bit for bit, 
 rollout at a time in a plain `mj_step` loop.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -84,11 +85,21 @@ class Stepper:
 
     def step(self, ids: IntArray, count: int) -> None:
         """Advance the simulations of these ids by physics steps."""
-        self.batch.step(ids, nstep=count)
+        with self._failures():
+            self.batch.step(ids, nstep=count)
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:
         """Advance the simulations of these ids by one physics step for each of their controls, (n, steps, 8)."""
-        self.batch.rollout(controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids)
+        with self._failures():
+            self.batch.rollout(controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids)
+
+    @contextmanager
+    def _failures(self) -> Iterator[None]:
+        """A simulation in which MuJoCo itself raised counts as blown up; the others went on."""
+        try:
+            yield
+        except mujoco.batch.SimulationError as error:
+            self.state[error.ids] = np.nan
 
     def frames(self, ids: IntArray) -> Frames:
         """Measure: joint positions now, forces as of the last physics step's beginning (as mj_step leaves them)."""
@@ -126,7 +137,7 @@ class Simulation:
         """Close start and goal grip, record the demonstration.
 
         Raises:
-          ConfigError: unknown object, one that the fingers cannot reach, or a goal grip that does not hold it.
+          ConfigError: unknown object, one that the fingers cannot reach, or a grip that does not hold it.
         """
         scenes.quiet()
         self.scene = scenes.load(config.object)
@@ -137,6 +148,7 @@ class Simulation:
         self._nominal = Stepper(self.scene, perturbed=False, threads=threads)
         self._perturbed: Stepper | None = None
         self._threads = threads
+        self._demonstrate(config.start_grip, self._commands)
         goal = self._demonstrate(config.goal_grip, grasping.command(GRIPS[config.goal_grip]))
         self.task = FingerGait(config, goal, self._commands)
         self.start = self._close(self._nominal, self._commands, np.zeros((1, 3)))
@@ -171,7 +183,7 @@ class Simulation:
         active = np.arange(count)
         for t in range(steps):
             x = self.task.observe(now, None if noise is None else noise[active, t])
-            actions = self.policy.actions(weights[active], x)
+            actions = self.policy.actions(weights, x)
             last = self.policy.targets(actions, self._commands, last)
             stepper.ctrl[active] = last
             record.act(t, active, actions, last)
@@ -183,7 +195,7 @@ class Simulation:
             going = ~failed & touching(now.force)
             if not going.all():
                 record.end(t, active[~going], active[failed])
-                active, last = active[going], last[going]
+                active, last, weights = active[going], last[going], weights[going]
                 now = Frames(now.qpos[going], now.force[going], now.place[going])
                 if not len(active):
                     break
@@ -228,13 +240,17 @@ class Simulation:
         return Start(stepper.state[ids].copy(), stepper.frames(ids))
 
     def _demonstrate(self, grip: str, commands: FloatArray) -> Demonstration:
-        """Close the goal grip, release, let it settle, and record it."""
+        """Close a grip, release, let it settle, and record it.
+
+        Raises:
+          ConfigError: it does not hold the object.
+        """
         self._close(self._nominal, commands, np.zeros((1, 3)))
         ids = np.zeros(1, dtype=np.int64)
         self._nominal.step(ids, SETTLE)
         frames = self._nominal.frames(ids)
         if not touching(frames.force)[0]:
-            raise ConfigError(f"grip {grip!r} does not hold object {self.scene.object_name!r}; take another goal grip")
+            raise ConfigError(f"grip {grip!r} does not hold object {self.scene.object_name!r}; take another grip")
         images = tactile.image(frames.force, frames.place)
         return Demonstration(joints=frames.joints[0], images=images[0], points=tactile.contact_points(images)[0])
 

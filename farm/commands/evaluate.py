@@ -15,6 +15,7 @@ from rich.table import Table
 from farm import arguments
 from farm.errors import ConfigError
 from farm.local import simulate
+from farm.randomness import SEEDS
 from learner.folder import RunFolder
 from learner.learner import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
 
@@ -36,8 +37,8 @@ class EvaluateCommand:
         """Check the numbers."""
         if not 1 <= self.rollouts <= 1_000_000:
             raise ConfigError(f"rollouts is {self.rollouts}; expected 1 to 1000000")
-        if not 0 <= self.seed < 2**63:
-            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^63 - 1")
+        if not 0 <= self.seed < SEEDS:
+            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
 
 
 def main(words: Sequence[str]) -> int:

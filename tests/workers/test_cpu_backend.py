@@ -172,11 +172,11 @@ def test_parameters_of_a_job():
 
 
 def test_the_seed_of_a_perturbation_is_all_there_is_to_it(backend):
-    seeds = [(1,), (1,), (2,), (1, 0)]
+    seeds = [(1, 5), (1, 5), (2, 5), (1, 6)]
     results = backend.run(MU, [job(i, perturbation=seed, **MEAN) for i, seed in enumerate(seeds)])
     assert_rows_equal(results[0], 0, results[1], 0)
-    assert len({result.returns[0] for result in results[:3]}) == 2
-    drawn = Perturbation.draw(np.random.default_rng((2,)), 15)
+    assert len({result.returns[0] for result in results}) == 3
+    drawn = Perturbation.draw(np.random.default_rng((2, 5)), 15)
     rollouts = backend._simulation.run(MU[None], [drawn])
     assert rollouts.outcome.returns[0] == results[2].returns[0]
 

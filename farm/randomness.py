@@ -1,0 +1,34 @@
+"""Where every random number of a run comes from. Pure.
+
+Each use has a number of its own in front, and all seeds are equally long: numpy pads a shorter
+seed with zeros, so that (7, 3) and (7, 3, 0) would be the same stream.
+"""
+
+from typing import Final
+
+import numpy as np
+
+SEEDS: Final = 2**32
+"""Seeds are below this: one 32-bit word each."""
+
+_FEATURES, _EXPLORATION, _TRAINING, _TRIAL = range(1, 5)
+
+
+def features(seed: int) -> np.random.Generator:
+    """For the random Fourier features of a run."""
+    return np.random.default_rng((_FEATURES, seed, 0, 0))
+
+
+def exploration(seed: int, generation: int) -> np.random.Generator:
+    """For a generation's eps."""
+    return np.random.default_rng((_EXPLORATION, seed, generation, 0))
+
+
+def training(seed: int, generation: int, pair: int) -> tuple[int, ...]:
+    """Seed of the perturbation that a pair is trained under."""
+    return (_TRAINING, seed, generation, pair)
+
+
+def trial(seed: int, rollout: int) -> tuple[int, ...]:
+    """Seed of the perturbation of one rollout of an evaluation."""
+    return (_TRIAL, seed, rollout, 0)
