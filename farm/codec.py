@@ -6,9 +6,11 @@ Decoding never raises anything but MessageError, whatever the bytes.
 """
 
 import dataclasses
+import functools
 import math
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, Final, TypeVar
 
 import msgpack
@@ -105,18 +107,24 @@ def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
     """A dataclass from a map, every field checked."""
     if not isinstance(value, dict):
         raise MessageError(f"a {type(value).__name__} where a {kind.__name__} was expected")
-    hints = typing.get_type_hints(kind)
-    fields = dataclasses.fields(kind)
-    unknown = set(value) - {f.name for f in fields} - (extra or set())
-    missing = [f.name for f in fields if f.name not in value]
+    fields = _fields(kind)
+    unknown = value.keys() - fields.keys() - (extra or set())
+    missing = fields.keys() - value.keys()
     if unknown or missing:
-        names = ", ".join(sorted(str(n)[:40] for n in unknown) + missing)
+        names = ", ".join(sorted(str(name)[:40] for name in unknown | missing))
         raise MessageError(f"{kind.__name__}: unknown or missing {names}")
-    made = {f.name: _value(f"{kind.__name__}.{f.name}", hints[f.name], f.metadata, value[f.name]) for f in fields}
+    made = {name: _value(f"{kind.__name__}.{name}", *field, value[name]) for name, field in fields.items()}
     try:
         return kind(**made)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise MessageError(f"{kind.__name__}: {error}") from None
+
+
+@functools.cache
+def _fields(kind: type) -> dict[str, tuple[Any, Mapping[str, Any]]]:
+    """Annotation and metadata of each field: working them out takes longer than reading a message."""
+    hints = typing.get_type_hints(kind)
+    return {field.name: (hints[field.name], field.metadata) for field in dataclasses.fields(kind)}
 
 
 def _value(name: str, hint: Any, metadata: Any, value: Any) -> Any:  # noqa: ANN401, PLR0911

@@ -16,6 +16,8 @@ class LedgerConfig:
 
     chunk_seconds: float = 0.08
     """Work sent to a worker in one message [s], by the running median."""
+    least_seconds: float = 0.015
+    """Towards the end of a round chunks shrink down to this [s]: rollouts in small batches are slower."""
     straggler_factor: float = 4.0
     """A job out longer than this many running medians is copied to another worker."""
     straggler_seconds: float = 1.0
@@ -29,6 +31,7 @@ class LedgerConfig:
         """Check every value."""
         for name, least in (
             ("chunk_seconds", 0.0),
+            ("least_seconds", 0.0),
             ("straggler_factor", 1.0),
             ("straggler_seconds", 0.0),
         ):
@@ -71,12 +74,12 @@ class Pace:
         """Return the number of jobs to send at once.
 
         Some `chunk_seconds` of work, but at most half a worker's share of what remains, so that
-        chunks shrink towards the end and all workers end together. One job as long as nothing is
-        known about its duration.
+        chunks shrink towards the end and all workers end together; never below `least_seconds`,
+        unless a worker's whole share is less. One job as long as nothing is known about its duration.
         """
         if self._median is None:
             return 1
-        share = -(-remaining // (2 * max(workers, 1)))
-        # A median of 0 (a coarse clock) only says that the share decides.
-        fitting = self._config.chunk_seconds / max(self._median, 1e-9)
-        return max(1, min(share, math.floor(fitting + 0.5)))
+        seconds = max(self._median, 1e-9)  # a median of 0 (a coarse clock) only says that the share decides
+        share, half = (-(-remaining // (parts * max(workers, 1))) for parts in (1, 2))
+        least = min(share, math.floor(self._config.least_seconds / seconds))
+        return max(1, least, min(half, math.floor(self._config.chunk_seconds / seconds + 0.5)))

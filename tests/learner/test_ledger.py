@@ -102,7 +102,7 @@ def test_answers_one_by_one_are_not_followed_by_chunks_of_one():
 
 
 def test_chunks_shrink_towards_the_end():
-    ledger = started(40, ["a", "b"], credits=100, seconds=0.001)
+    ledger = started(40, ["a", "b"], credits=100, seconds=0.001, least_seconds=1e-6)
     chunks, sizes = ledger.assign(0.0), []
     while chunks:  # each answers its oldest chunk in turn
         chunk, *chunks = chunks
@@ -112,6 +112,15 @@ def test_chunks_shrink_towards_the_end():
     assert sum(sizes) == 40
     assert sizes[0] == 10
     assert all(later <= before for before, later in pairwise(sizes))
+
+
+def test_chunks_do_not_shrink_below_what_is_worth_a_message():
+    ledger = started(40, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
+    assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [10, 10, 10, 10]
+    ledger = started(20, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
+    assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [8, 8, 4]
+    ledger = started(6, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
+    assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [3, 3]
 
 
 def test_credits_are_the_limit_and_two_chunks_fit_into_them():
