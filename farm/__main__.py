@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from farm import __version__
-from farm.errors import ConfigError, FarmError
+from farm.errors import ConfigError, FarmError, Interrupted
 
 COMMANDS: Final = {
     "run": "learner and local workers together: learns the gait and records it",
@@ -15,6 +15,8 @@ COMMANDS: Final = {
     "evaluate": "the learnt mean policy on perturbed starts",
     "replay": "the learnt gait again, at physics rate, into a recording",
     "view": "opens a run's recording in the Rerun viewer",
+    "router": "a standing rendezvous that outlives learners",
+    "certificates": "a small certificate authority, for farms of several machines",
     "runs": "a table of the runs in a folder",
 }
 """Commands and what they are for; each is a module of farm.commands with a function `main`."""
@@ -34,18 +36,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if name not in COMMANDS:
             raise ConfigError(f"unknown command {name!r}; known are {', '.join(COMMANDS)} (see farm --help)")
         return int(importlib.import_module(f"farm.commands.{name}").main(words[1:]))
+    except (KeyboardInterrupt, Interrupted):
+        return 130
     except FarmError as error:
         sys.stderr.write(f"farm: {error}\n")
         return 2 if isinstance(error, ConfigError) else 1
-    except KeyboardInterrupt:
-        return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 0
 
 
 def _overview() -> str:
-    rows = "".join(f"  farm {name:<10}{text}\n" for name, text in COMMANDS.items())
+    rows = "".join(f"  farm {name:<14}{text}\n" for name, text in COMMANDS.items())
     return (
         "rolloutfarm: a hand learns to change its grip by touch, on as many machines as you like.\n\n"
         f"{rows}\n  farm COMMAND --help says what a command takes; farm --version.\n"

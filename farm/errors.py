@@ -5,6 +5,7 @@ FarmError                 anything we can say in one line
     CheckpointError       a run folder that cannot be continued or read
   MessageError            bytes from the network that are not what they should be
   RunError                a run that cannot go on (exit status 1)
+  Interrupted             the user ended it before there was anything to save (exit status 130)
 """
 
 
@@ -30,3 +31,7 @@ class CheckpointError(ConfigError):
 
 class RunError(FarmError):
     """A run that cannot go on; what was learnt so far is saved."""
+
+
+class Interrupted(FarmError):  # noqa: N818  not an error
+    """The user ended it before there was anything to save."""

@@ -13,17 +13,18 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from farm import keys, session
 from farm import scene as scenes
-from farm import session
 from farm.errors import CheckpointError, ConfigError, RunError
 from farm.messages import Job, Result
 from farm.scene import Scene
 from farm.session import Session
+from farm.tls import Bundle
 from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.algorithms import Diverged
@@ -59,6 +60,10 @@ class Place:
     """Routers to dial instead of listening."""
     farm: str = "farm"
     """Name of the farm."""
+    tls: Bundle | None = None
+    """The learner's certificates."""
+    trusted: bool = False
+    """Listen to other machines without certificates."""
     record: bool = True
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
@@ -104,6 +109,9 @@ class Run:
             state = "finished"
         except (Stopped, GeneratorExit):
             state = "interrupted"
+        except KeyboardInterrupt:
+            state = "interrupted"
+            raise
         except Diverged as error:
             state = "diverged"
             raise RunError(f"the run diverged: {error}; everything before is saved") from None
@@ -113,8 +121,12 @@ class Run:
     def _finish(self, state: str, evaluation: Evaluation | None) -> None:
         workers = max(len(self._farm.workers), len(self.worker_pids))
         self.summary = self.learner.summary(state, workers, evaluation)
-        self.learner.folder.write_summary(self.summary)
-        log.info("run %s %s after generation %d", self.learner.folder.name, state, self.learner.state.generation)
+        log.info("%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s", self.summary)
+        try:
+            self.learner.folder.write_summary(self.summary)
+        except OSError as error:
+            if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
+                raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
 
 
 def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False) -> Iterator[Report]:
@@ -141,25 +153,32 @@ def open_run(
     """Everything a run needs, opened in an order that leaves nothing behind when a part fails."""
     scene = scenes.load(config.task.object)
     folder = RunFolder(path)
-    at = _resumed(folder, config) if resume else start(config, folder.name)
+    keys.checked("run", folder.name)
     if place.record or place.serve:
         check_rerun()
     with ExitStack() as stack:
-        link = stack.enter_context(_session(place, stopped))
         if resume:
-            folder.write_config(config)
-        else:
-            folder = RunFolder.create(path, config)
-        learner = Learner(config, folder, at)
+            stack.enter_context(folder.held())
+        at = _resumed(folder, config) if resume else start(config, folder.name)
+        link = stack.enter_context(_session(place, stopped))
+        if not resume:
+            RunFolder.create(path, config)
+            stack.enter_context(folder.held())
         try:
+            if resume:
+                folder.rewind(at)
+                folder.write_config(config)
+            learner = Learner(config, folder, at)
             recording = stack.enter_context(_recording(place, learner, scene)) if place.record or place.serve else None
-        except ConfigError:
+            stack.enter_context(_log_file(folder))
+        except (ConfigError, OSError) as error:
             if not resume:
                 folder.discard()
+            if isinstance(error, OSError):
+                raise RunError(f"cannot write to {folder.path}: {error.strerror}") from None
             raise
-        stack.enter_context(_log_file(folder))
         tend = _Tending(stopped)
-        farm = Dispatcher(link, place.farm, learner.spec, _how_to_join(place), tend, place.ledger)
+        farm = Dispatcher(link, place.farm, learner.spec, how_to_join(place), tend, place.ledger)
         if place.workers:
             flags = [*_worker_flags(place), "--log-level", "WARNING"]  # what they do, the learner says
             tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
@@ -179,8 +198,7 @@ def _resumed(folder: RunFolder, config: RunConfig) -> Checkpoint:
             raise CheckpointError(
                 f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
             )
-    folder.rewind(at)
-    return replace(at, run=folder.name)
+    return at
 
 
 def free_endpoint() -> str:
@@ -200,15 +218,15 @@ class _Tending:
     def __call__(self) -> bool:
         if self.pool and time.monotonic() > self._next:
             self._next = time.monotonic() + _TEND
-            if len(self.pool.tend()) == len(self.pool.pids) == 0 and not self.pool.pids:
+            if self.pool.tend() and not self.pool.pids:
                 raise RunError("no local worker keeps running; their own messages above say why")
         return self._stopped()
 
 
 def _session(place: Place, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
     if place.connect:
-        return session.connect(place.connect, None, stopped)
-    return session.listen(place.listen)
+        return session.connect(place.connect, None, stopped, place.tls)
+    return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted)
 
 
 def _worker_flags(place: Place) -> list[str]:
@@ -216,21 +234,31 @@ def _worker_flags(place: Place) -> list[str]:
     return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), "--farm", place.farm]
 
 
-def _how_to_join(place: Place) -> str:
+def how_to_join(place: Place) -> str:
+    """The command by which workers join."""
     flags = _worker_flags(place)
-    return " ".join(["farm worker", *(flags if place.farm != "farm" else flags[:-2])])
+    tls = ["--tls", "worker-NAME"] if place.tls else []
+    return " ".join(["farm worker", *(flags if place.farm != "farm" else flags[:-2]), *tls])
+
+
+class _LogFile(logging.FileHandler):
+    """Leaves out what cannot be written: a full disk is told of elsewhere."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802  logging's name
+        """Say nothing."""
 
 
 @contextmanager
 def _log_file(folder: RunFolder) -> Iterator[None]:
-    handler = logging.FileHandler(folder.log, encoding="utf-8")
+    handler = _LogFile(folder.log, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.getLogger().addHandler(handler)
     try:
         yield
     finally:
         logging.getLogger().removeHandler(handler)
-        handler.close()
+        with suppress(OSError):
+            handler.close()
 
 
 @contextmanager

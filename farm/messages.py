@@ -122,7 +122,7 @@ class Result:
     clamped: BoolArray = array("|b1", 1)
     """(R,)"""
     traces: AnyArray = array("<f4", 3)
-    """Tactile traces [N], (R, T, 54), zero after the end; T is 0 when the run keeps none."""
+    """Tactile traces [N], (R, T, 54), zero after the end."""
 
     def __post_init__(self) -> None:
         """Check that all speak of as many rollouts."""

@@ -5,6 +5,7 @@ that moves samples into the application's queue, so that the link is always drai
 reads the queue owns all state and does all the publishing.
 """
 
+import ipaddress
 import json
 import logging
 import queue
@@ -13,11 +14,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import zenoh
 
-from farm.errors import ConfigError, FarmError
+from farm.errors import ConfigError, FarmError, Interrupted
+from farm.tls import Bundle, access_control
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +27,7 @@ _CHANNEL: Final = 10_000  # samples a subscription holds before its thread moves
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
+_REMIND: Final = 60.0  # [s] between two lines about the same trouble
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -60,17 +63,33 @@ class Event:
     """For liveliness: whether the token appeared or went."""
 
 
-def check_endpoint(endpoint: str) -> str:
-    """The endpoint, if it has the form Zenoh takes (it accepts some nonsense silently).
+def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
+    """The host of an endpoint, if it has the form Zenoh takes (it accepts some nonsense silently).
+
+    Args:
+      endpoint: tcp/HOST:PORT, or tls/HOST:PORT with certificates.
+      encrypted: whether there are certificates.
 
     Raises:
-      ConfigError: otherwise.
+      ConfigError: another form, or certificates and protocol do not go together.
     """
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
-    if protocol != "tcp" or not host or not port.isdigit() or not int(port) < 65536:
+    if protocol not in ("tcp", "tls") or not host or not port.isdigit() or not int(port) < 65536:
         raise ConfigError(f"endpoint {endpoint!r} is not of the form tcp/HOST:PORT, for example tcp/127.0.0.1:7447")
-    return endpoint
+    if protocol == "tls" and not encrypted:
+        raise ConfigError(f"endpoint {endpoint} needs certificates: give their folder with --tls")
+    if protocol == "tcp" and encrypted:
+        raise ConfigError(f"endpoint {endpoint} is not encrypted, but --tls is given: take tls/{address}")
+    return host
+
+
+def _reachable(host: str) -> bool:
+    """Whether other machines may be able to reach what listens there."""
+    try:
+        return not ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host != "localhost"
 
 
 class Session:
@@ -156,16 +175,38 @@ class Session:
         self._threads.append(thread)
 
 
-@contextmanager
-def listen(endpoint: str) -> Iterator[Session]:
-    """A session that is the farm's rendezvous itself.
+def router_settings(endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False) -> dict[str, object]:
+    """Zenoh's settings for a session that others dial, by the paths of its configuration.
+
+    Args:
+      endpoint: where it listens.
+      farm: name of the farm, for access control.
+      bundle: the learner's certificates; with them only those on its roster get in.
+      trusted: listen to other machines without certificates.
 
     Raises:
-      ConfigError: the endpoint is malformed, or its port is in use.
+      ConfigError: the endpoint is malformed, or open to other machines without certificates.
     """
-    check_endpoint(endpoint)
+    host = check_endpoint(endpoint, encrypted=bundle is not None)
+    if bundle is None and _reachable(host) and not trusted:
+        raise ConfigError(
+            f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
+            "--trust-network if everybody on that network may read everything and pose as a worker"
+        )
+    secured = {} if bundle is None else {**bundle.listening(), "access_control": access_control(farm, bundle.roster())}
+    return {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
+
+
+@contextmanager
+def listen(endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False) -> Iterator[Session]:
+    """A session that is the farm's rendezvous itself; for the arguments see `router_settings`.
+
+    Raises:
+      ConfigError: the endpoint is malformed, open to other machines without certificates, or its port in use.
+    """
+    settings = router_settings(endpoint, farm, bundle, trusted=trusted)
     try:
-        session = _open(_ROUTER, "listen", [endpoint])
+        session = _open(settings)
     except zenoh.ZError as error:
         raise ConfigError(
             f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? choose another with --listen"
@@ -175,49 +216,60 @@ def listen(endpoint: str) -> Iterator[Session]:
 
 
 @contextmanager
-def connect(endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool]) -> Iterator[Session]:
+def connect(
+    endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None
+) -> Iterator[Session]:
     """A session that dials a learner or a router, and keeps trying.
 
     Args:
       endpoints: where to dial; any one that answers will do.
+      bundle: our certificates, for tls endpoints.
       timeout: give up after [s]; None for never.
       stopped: asked between tries, true ends them.
 
     Raises:
-      FarmError: nobody answered in time, or it was stopped.
+      FarmError: nobody answered in time; Interrupted: it was stopped.
     """
     for endpoint in endpoints:
-        check_endpoint(endpoint)
-    with _closing(_dial(endpoints, timeout, stopped)) as opened:
+        check_endpoint(endpoint, encrypted=bundle is not None)
+    settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
+    if bundle is not None:
+        settings |= bundle.dialling()
+    with _closing(_dial(settings, ", ".join(endpoints), timeout, stopped)) as opened:
         yield opened
 
 
-def _dial(endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool]) -> zenoh.Session:
-    where = ", ".join(endpoints)
+def _dial(
+    settings: Mapping[str, object], where: str, timeout: float | None, stopped: Callable[[], bool]
+) -> zenoh.Session:
+    # A refused handshake looks like nobody: Zenoh does not say why.
+    hint = (
+        "; the learner may refuse our certificate: same authority, still valid, on its roster?"
+        if "tls/" in where
+        else ""
+    )
     begun = told = time.monotonic()
     while True:
         try:
-            return _open(_CLIENT, "connect", list(endpoints))
+            return _open(settings)
         except zenoh.ZError as error:
             now = time.monotonic()
             if stopped():
-                raise FarmError(f"stopped before {where} answered") from None
+                raise Interrupted(f"stopped before {where} answered") from None
             if timeout is not None and now - begun > timeout:
                 raise FarmError(
-                    f"nobody answers at {where} after {timeout:g} s: start a learner there, or check --connect"
+                    f"nobody answers at {where} after {timeout:g} s: start a learner there, or check --connect{hint}"
                 ) from None
-            if now - told >= 3.0 or told == begun:
+            if now - told >= _REMIND or told == begun:
                 told = now
-                log.warning("nobody answers at %s yet, trying again (%s)", where, _first_line(error))
+                log.warning("nobody answers at %s yet, trying again (%s)%s", where, _first_line(error), hint)
             time.sleep(0.1)  # zenoh itself waits up to _OPEN_S for an address that does not refuse
 
 
-def _open(mode: Mapping[str, object], direction: Literal["listen", "connect"], endpoints: list[str]) -> zenoh.Session:
+def _open(settings: Mapping[str, object]) -> zenoh.Session:
     config = zenoh.Config()
-    for key, value in {**_COMMON, **mode, f"{direction}/endpoints": endpoints}.items():
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
-    if direction == "connect":
-        config.insert_json5("listen/endpoints", "[]")
     return zenoh.open(config)
 
 
@@ -232,4 +284,6 @@ def _closing(session: zenoh.Session) -> Iterator[Session]:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+    """What zenoh says, without where in its sources."""
+    lines = str(error).splitlines() or [type(error).__name__]
+    return lines[0].partition(" at /")[0][:120]

@@ -49,11 +49,15 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     """Replace the file by a new one, or leave the old one as it is."""
     body = codec.encode(checkpoint)
     aside = path.with_name(path.name + ".new")
-    with aside.open("wb") as file:
-        file.write(_MAGIC + hashlib.sha256(body).digest() + body)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    try:
+        with aside.open("wb") as file:
+            file.write(_MAGIC + hashlib.sha256(body).digest() + body)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError:
+        aside.unlink(missing_ok=True)
+        raise
 
 
 def load(path: Path) -> Checkpoint:

@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 from farm.errors import ConfigError
 from farm.policy import PolicyConfig
@@ -45,9 +45,14 @@ class RunConfig:
         if not 0 <= self.seed < SEEDS:
             raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
         if not 0 <= self.generations <= 10_000_000:
-            raise ConfigError(f"generations is {self.generations}; expected 0 or more")
+            raise ConfigError(f"generations is {self.generations}; expected 0 to 10000000")
         if self.stop_when_solved is not None and self.stop_when_solved < 1:
             raise ConfigError(f"stop-when-solved is {self.stop_when_solved}; expected 1 or more")
+        kinds = {f.name: f.type for f in dataclasses.fields(self)}
+        for name in ("init_sigma", "traces"):
+            value, known = getattr(self, name), get_args(kinds[name])
+            if value not in known:
+                raise ConfigError(f"{name.replace('_', '-')} is {value!r}; known are {', '.join(known)}")
 
 
 PRESETS: Final[dict[str, RunConfig]] = {
@@ -107,15 +112,15 @@ def read(path: Path) -> RunConfig:
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
     """Settings that differ: name, old and new value."""
-    yield from _changes("", dataclasses.asdict(old), dataclasses.asdict(new))
+    yield from _changes(dataclasses.asdict(old), dataclasses.asdict(new))
 
 
-def _changes(prefix: str, old: dict[str, Any], new: dict[str, Any]) -> Iterator[tuple[str, object, object]]:
+def _changes(old: dict[str, Any], new: dict[str, Any]) -> Iterator[tuple[str, object, object]]:
     for name, value in old.items():
         if isinstance(value, dict):
-            yield from _changes("", value, new[name])
+            yield from _changes(value, new[name])
         elif value != new[name]:
-            yield prefix + name.replace("_", "-"), value, new[name]
+            yield name.replace("_", "-"), value, new[name]
 
 
 def _build(kind: type[Any], values: dict[str, Any], prefix: str) -> Any:  # noqa: ANN401  a dataclass of that kind
@@ -132,15 +137,15 @@ def _build(kind: type[Any], values: dict[str, Any], prefix: str) -> Any:  # noqa
                 raise ConfigError(f"{prefix}{name} is {value!r}; expected a table of settings")
             made[name] = _build(type(nested), value, f"{prefix}{name}.")
         else:
-            made[name] = _scalar(f"{prefix}{name}", nested, value)
+            made[name] = _scalar(f"{prefix}{name}", nested, value, fields[name].type)
     return kind(**made)
 
 
-def _scalar(name: str, default: object, value: object) -> object:
-    """The value, if it is of the default's type (a float may be written as an int)."""
+def _scalar(name: str, default: object, value: object, kind: object) -> object:
+    """The value, if it is of the default's type (a float may be written as an int), or of an optional's kind."""
     if isinstance(default, float) and type(value) is int:
         return float(value)
-    optional = default is None
-    if (optional and (value is None or type(value) in (int, str))) or type(value) is type(default):
+    known = get_args(kind) if default is None else (type(default),)
+    if type(value) in known:
         return value
-    raise ConfigError(f"{name} is {value!r}; expected a {type(default).__name__}")
+    raise ConfigError(f"{name} is {value!r}; expected {' or '.join(k.__name__ for k in known)}")

@@ -18,8 +18,10 @@ from farm import codec, keys
 from farm.arrays import FloatArray
 from farm.codec import M
 from farm.errors import MessageError, RunError
+from farm.hand import FINGERS
 from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
 from farm.session import Event, Session
+from farm.tactile import TAXELS
 from learner.ledger.ledger import Ledger, LedgerConfig
 
 log = logging.getLogger(__name__)
@@ -51,6 +53,7 @@ class Dispatcher:
         self._session, self._farm, self._stopped = session, farm, stopped
         self._ledger = Ledger(ledger or LedgerConfig())
         self._how_to_join = how_to_join
+        self._trace = (spec.task_config["steps"], len(FINGERS) * TAXELS)
         self._incarnation = secrets.token_hex(8)
         self._spec = codec.encode(spec)
         self._header = Generation(
@@ -125,7 +128,7 @@ class Dispatcher:
     def _take(self, event: Event) -> None:
         try:
             if event.topic == "want":
-                self._want(_decode(event, Want))
+                self._want(_decode(event, Want), keys.tail(event.key, keys.want(self._farm, "")))
             elif event.topic == "worker":
                 self._liveliness(event)
             else:
@@ -133,7 +136,10 @@ class Dispatcher:
         except MessageError as error:
             self._ignore(error.kind, f"on {event.key}: {error}")
 
-    def _want(self, want: Want) -> None:
+    def _want(self, want: Want, sender: str) -> None:
+        if want.worker != sender:
+            self._ignore("foreign", f"of {want.worker} from {sender}")
+            return
         if want.worker in self._gone:
             return
         if want.worker not in self._ledger.workers:
@@ -185,7 +191,8 @@ class Dispatcher:
         if not 0 <= result.index < len(self._jobs):
             return False
         job = self._jobs[result.index]
-        return len(result.returns) == len(job.signs) and (result.trajectory is None) == (job.rate == "none")
+        rollouts, seen = len(job.signs), job.rate != "none"
+        return result.traces.shape == (rollouts, *self._trace) and (result.trajectory is not None) == seen
 
     def _failed(self, failure: Failure) -> None:
         if not 0 <= failure.index < len(self._jobs):

@@ -12,9 +12,13 @@ docs/files.md describes them. The checkpoint is written last: what the other fil
 is cut off when the run is resumed.
 """
 
+import fcntl
 import json
 import math
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -82,7 +86,11 @@ class RunFolder:
         except OSError as error:
             raise ConfigError(f"cannot make the run folder {path}: {error.strerror}") from None
         folder = cls(path)
-        folder.write_config(config)
+        try:
+            folder.write_config(config)
+        except OSError as error:
+            folder.discard()
+            raise ConfigError(f"cannot write to the run folder {path}: {error.strerror}") from None
         return folder
 
     @classmethod
@@ -95,6 +103,22 @@ class RunFolder:
         if not (path / "config.json").is_file():
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         return cls(path)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other processes from going on with the run; released when this one ends, however it ends.
+
+        Raises:
+          ConfigError: another process holds it.
+        """
+        folder = os.open(self.path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        except BlockingIOError:
+            raise ConfigError(f"another process is working on the run in {self.path}: let it end first") from None
+        finally:
+            os.close(folder)
 
     def discard(self) -> None:
         """Remove a new run that could not begin."""
@@ -126,7 +150,7 @@ class RunFolder:
             file.write(json.dumps(progress.to_dict()) + "\n")
         path = self.path / "parameters"
         if not path.exists():
-            path.write_bytes(_parameters_head(len(mu), generations))
+            _replace(path, _parameters_head(len(mu), generations))
         head, _ = _read_head(path)
         if progress.generation % head["every"] == 0:
             row = np.empty(1, _row_type(len(mu)))
@@ -137,7 +161,7 @@ class RunFolder:
     def progress(self) -> list[Progress]:
         """Every whole line of progress.jsonl."""
         try:
-            lines = (self.path / "progress.jsonl").read_text("utf-8").splitlines()
+            lines = (self.path / "progress.jsonl").read_text("utf-8", "replace").splitlines()
         except OSError:
             return []
         out = []
@@ -147,6 +171,11 @@ class RunFolder:
             except ValueError:
                 break  # torn by a crash, or of another version: nothing behind it is trusted
         return out
+
+    def every(self, parameters: int, generations: int) -> int:
+        """Every how many generations are kept in `parameters`, or would be of a new run."""
+        path = self.path / "parameters"
+        return int(_read_head(path)[0]["every"]) if path.exists() else every(parameters, generations)
 
     def parameters(self) -> "np.ndarray[Any, Any]":
         """Rows of `parameters`: fields generation, mu (P,) and sigma (P,).
@@ -195,14 +224,14 @@ def _row_type(parameters: int) -> "np.dtype[Any]":
     return np.dtype([("generation", "<i8"), ("mu", "<f8", (parameters,)), ("sigma", "<f8", (parameters,))])
 
 
-def _parameters_head(parameters: int, generations: int) -> bytes:
+def _parameters_head(parameters: int, generations: int) -> str:
     head = {
         "version": _PARAMETERS_VERSION,
         "parameters": parameters,
         "every": every(parameters, generations),
         "row": "<i8 generation, <f8[parameters] mu, <f8[parameters] sigma",
     }
-    return json.dumps(head).encode() + b"\n"
+    return json.dumps(head) + "\n"
 
 
 def _read_head(path: Path) -> tuple[dict[str, Any], int]:
@@ -222,5 +251,9 @@ def _read_head(path: Path) -> tuple[dict[str, Any], int]:
 def _replace(path: Path, text: str) -> None:
     """Write a whole file or leave the old one."""
     aside = path.with_name(path.name + ".new")
-    aside.write_text(text, "utf-8")
-    aside.replace(path)
+    try:
+        aside.write_text(text, "utf-8")
+        aside.replace(path)
+    except OSError:
+        aside.unlink(missing_ok=True)
+        raise

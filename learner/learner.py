@@ -88,18 +88,24 @@ class Learner:
         Raises:
           CheckpointError: the checkpoint does not fit the configuration.
         """
-        self.config, self.folder, self._at = config, folder, at
+        # The replay of the best is shown again: replay.rrd is written anew by whoever ends the run.
+        self.config, self.folder, self._at = config, folder, replace(at, replayed=at.best is None)
         try:
             self.state: PGPEState = config.algorithm.restore(at.state)
         except ValueError as error:
             raise CheckpointError(f"{folder.checkpoint}: {error}") from None
         self._before = at.reissued
-        folder.save(at)
+        folder.save(self._at)
+
+    @property
+    def run(self) -> str:
+        """The name that the run began with; its folder may have another by now."""
+        return self._at.run
 
     @property
     def spec(self) -> Spec:
-        """What workers simulate."""
-        return specification(self.config, self._at)
+        """What workers simulate, under the folder's name: copies of a run may go on side by side."""
+        return replace(specification(self.config, self._at), run=self.folder.name)
 
     @property
     def over(self) -> bool:
@@ -129,7 +135,14 @@ class Learner:
             if not self.over:
                 eps = self._explore(farm)
             progress = self._progress(results, returns, farm)
-            self._save(progress)
+            try:
+                self._save(progress)
+            except OSError as error:
+                self.state, self._at = before, last
+                raise RunError(
+                    f"cannot write to {self.folder.path}: {error.strerror}; the run stands as of generation "
+                    f"{before.generation}: make room and --resume it"
+                ) from None
             yield Report(
                 progress=progress,
                 rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
@@ -154,18 +167,19 @@ class Learner:
 
     def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
         """What came out, as summary.json says it."""
-        progress = self.folder.progress()
+        at = self.state.generation
+        rates = [p.success_rate for p in self.folder.progress() if p.generation == at]
         mean = evaluation.mean if evaluation else None
         numbers = self.state.mu.astype("<f8").tobytes() + self.state.sigma.astype("<f8").tobytes()
         return {
             "run": self.folder.name,
             "seed": self.config.seed,
-            "generations": self.state.generation,
+            "generations": at,
             "rollouts": self._at.rollouts,
             "best_return": self.state.best,
             "mean_policy_return": float(mean.returns[0]) if mean else None,
             "mean_policy_success": bool(mean.success[0]) if mean else None,
-            "success_rate": progress[-1].success_rate if progress else None,
+            "success_rate": rates[-1] if rates else None,
             "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
             "parameters_sha256": hashlib.sha256(numbers).hexdigest(),
             "seconds": round(self._at.seconds, 3),
@@ -220,7 +234,8 @@ class Learner:
         farm: Dispatcher,
     ) -> None:
         """Bring the checkpoint up to date after an update."""
-        best, generation, replayed = self._at.best, self._at.best_generation, True
+        best, generation = self._at.best, self._at.best_generation
+        replayed = self._at.replayed or len(results) > len(eps) + 1
         if before.best is None or returns.max() > before.best:
             row, column = np.unravel_index(int(returns.argmax()), returns.shape)
             theta = before.mu + (1, -1)[column] * eps[row]
@@ -267,14 +282,8 @@ class Learner:
         )
 
     def _save(self, progress: Progress) -> None:
-        try:
-            self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
-            self.folder.save(self._at)
-        except OSError as error:
-            raise RunError(
-                f"cannot write to {self.folder.path}: {error.strerror}; the run stands as of generation "
-                f"{progress.generation - 1}: make room and --resume it"
-            ) from None
+        self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
+        self.folder.save(self._at)
 
 
 def start(config: RunConfig, run: str) -> Checkpoint:

@@ -65,8 +65,8 @@ class Progress:
         Raises:
           ValueError: another version, or a field is missing.
         """
-        if values.get("version") != VERSION:
-            raise ValueError(f"progress version {values.get('version')!r}, expected {VERSION}")
+        if not isinstance(values, dict) or values.get("version") != VERSION:
+            raise ValueError(f"not a line of progress.jsonl, version {VERSION}: {str(values)[:80]}")
         missing = [f.name for f in fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f"progress line without {', '.join(missing)}")

@@ -22,6 +22,7 @@ DOORS = {
     "mujoco": ("farm/scene.py", "workers/grip.py", "workers/simulation.py"),
     "rerun": ("learner/recording/",),
     "rich": ("farm/commands/",),
+    "cryptography": ("farm/commands/certificates.py",),
 }
 """The only modules that may import a package from outside."""
 

@@ -14,12 +14,14 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from farm import __version__, codec, keys
 from farm.errors import ConfigError, FarmError, MessageError
 from farm.messages import Chunk, Failure, Generation, Results, Spec, Want
 from farm.session import Event, Session, check_endpoint, connect
+from farm.tls import Bundle, find
 from workers.backends import BACKENDS, Backend
 
 log = logging.getLogger(__name__)
@@ -40,7 +42,9 @@ class WorkerConfig:
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     name: str = ""
-    """Name of this worker (default: the host's name)."""
+    """Name of this worker (default: the host's name; with --tls its certificate's)."""
+    tls: Path | None = None
+    """Folder with certificates (farm certificates makes it); needed to dial tls/HOST:PORT."""
     timeout: float | None = None
     """Give up when nobody answers for so long at the start [s] (default: keep trying)."""
     backend: str = "cpu"
@@ -48,19 +52,27 @@ class WorkerConfig:
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""
+        bundle = self.bundle
+        if bundle is not None:
+            object.__setattr__(self, "name", bundle.name)
         if not self.name:
             host = socket.gethostname().split(".")[0]
             object.__setattr__(self, "name", "".join(c if c.isascii() and c.isalnum() else "-" for c in host) or "host")
         if not self.connect:
-            object.__setattr__(self, "connect", ("tcp/127.0.0.1:7447",))
+            object.__setattr__(self, "connect", (f"{'tcp' if self.tls is None else 'tls'}/127.0.0.1:7447",))
         for endpoint in self.connect:
-            check_endpoint(endpoint)
+            check_endpoint(endpoint, encrypted=self.tls is not None)
         keys.checked("farm", self.farm)
         keys.checked("worker", self.name)
         if self.backend not in BACKENDS:
             raise ConfigError(f"unknown backend {self.backend!r}; known are {', '.join(BACKENDS)}")
         if self.timeout is not None and not 0 <= self.timeout < float("inf"):
             raise ConfigError(f"timeout is {self.timeout}; expected a number of seconds")
+
+    @property
+    def bundle(self) -> Bundle | None:
+        """The worker's certificates."""
+        return None if self.tls is None else find(self.tls, "worker", self.name)
 
 
 @dataclass
@@ -77,7 +89,7 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
     Raises:
       FarmError: nobody answered within the timeout.
     """
-    with connect(config.connect, config.timeout, stopped) as session:
+    with connect(config.connect, config.timeout, stopped, config.bundle) as session:
         worker = Worker(config, session)
         worker.join()
         log.info("joined farm %s as %s", config.farm, worker.id)
@@ -94,7 +106,7 @@ class Worker:
         self._config = config
         self._session = session
         self._runs: OrderedDict[str, _Served] = OrderedDict()
-        self._backends: OrderedDict[str, Backend | FarmError] = OrderedDict()
+        self._backends: OrderedDict[str, Backend | Exception] = OrderedDict()
         self._busy = time.monotonic()
 
     def join(self) -> None:
@@ -175,7 +187,7 @@ class Worker:
         backend = self._backend(header)
         if backend is None:
             return
-        if isinstance(backend, FarmError):
+        if isinstance(backend, Exception):
             for job in chunk.jobs:
                 self._fail(chunk, job.index, backend)
             return
@@ -200,7 +212,7 @@ class Worker:
             ),
         )
 
-    def _backend(self, header: Generation) -> Backend | FarmError | None:
+    def _backend(self, header: Generation) -> Backend | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
         if header.spec not in self._backends:
             payload = self._session.ask(keys.spec(self._config.farm, header.run), _ASK)
@@ -211,18 +223,18 @@ class Worker:
                 spec = codec.decode(payload, Spec)
                 self._backends[header.spec] = BACKENDS[self._config.backend](spec)
                 log.info("serving run %s", header.run)
-            except FarmError as error:
-                log.error("cannot serve run %s: %s", header.run, error)
+            except Exception as error:  # the learner is told, and decides
+                log.error("cannot serve run %s: %s", header.run, error, exc_info=not isinstance(error, FarmError))
                 self._backends[header.spec] = error
         self._backends.move_to_end(header.spec)
         while len(self._backends) > _KEEP:
             _, oldest = self._backends.popitem(last=False)
-            if not isinstance(oldest, FarmError):
+            if not isinstance(oldest, Exception):
                 oldest.close()
         return self._backends[header.spec]
 
     def _fail(self, chunk: Chunk, index: int, error: Exception) -> None:
-        text = f"{type(error).__name__}: {error}"[:500]
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:500]
         self._answer(
             chunk,
             Failure(

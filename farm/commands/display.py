@@ -13,7 +13,7 @@ from rich.table import Table
 from learner.learner import Report
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
-_SPARK = 40
+_SPARK = 30  # fits into 80 columns
 
 
 class Display(Protocol):

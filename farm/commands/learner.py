@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from farm.commands.learning import learn
 from farm.commands.options import LearnerOptions, parse
-from farm.local import Place
+from farm.local import LISTEN, Place
 from learner.config import RunConfig
 
 
@@ -22,4 +22,5 @@ class LearnerCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, begin = parse(LearnerCommand, words, "farm learner")
-    return learn(command.options, command.run, Place(), resumed, begin)
+    place = Place() if command.options.tls is None else Place(listen=LISTEN.replace("tcp/", "tls/"))
+    return learn(command.options, command.run, place, resumed, begin)

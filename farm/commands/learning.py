@@ -6,9 +6,10 @@ from dataclasses import replace
 from farm.commands import display, logs, options
 from farm.commands.options import LearnerOptions
 from farm.commands.signals import stop_flag
-from farm.local import Place, Run, open_run
+from farm.local import Place, Run, how_to_join, open_run
+from farm.tls import find
 from learner.config import RunConfig
-from learner.folder import RunFolder, every
+from learner.folder import RunFolder
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM, as of a shell."""
@@ -18,13 +19,15 @@ def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunF
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up(chosen.log_level)
     place = replace(place, connect=chosen.connect, farm=chosen.farm, record=chosen.record)
-    place = replace(place, listen=chosen.listen or place.listen)
+    place = replace(place, listen=chosen.listen or place.listen, trusted=chosen.trust_network)
+    if chosen.tls is not None:
+        place = replace(place, tls=find(chosen.tls, "learner"))
     if chosen.serve is not None:
         place = replace(place, serve=options.address(chosen.serve))
     path = chosen.out / options.run_name(chosen, config) if resumed is None else resumed.path
     if resumed is not None:
         options.check_resume(begin, config, resumed)
-    with stop_flag() as stop:
+    with stop_flag("saving and ending") as stop:
         opened = open_run(config, path, place, resume=resumed is not None, stopped=stop.is_set)
         with opened as run:
             _announce(run, place)
@@ -39,21 +42,19 @@ def _announce(run: Run, place: Place) -> None:
     name, at = run.learner.folder.path, run.learner.state.generation
     sys.stdout.write(f"run {name}" + (f", going on after generation {at}\n" if at else "\n"))
     if not place.workers:
-        where = ", ".join(place.connect) or place.listen
-        sys.stdout.write(f"workers join with: farm worker --connect {where}\n")
+        sys.stdout.write(f"workers join with: {how_to_join(place)}\n")
     if run.live is not None:
         sys.stdout.write(f"live: rerun {run.live}   (in a browser: rerun --web-viewer {run.live})\n")
-    kept = every(run.learner.state.mu.size, run.learner.config.generations)
+    kept = run.learner.folder.every(run.learner.state.mu.size, run.learner.config.generations)
     if kept > 1:
-        sys.stdout.write(f"parameters: every {kept}th generation is kept, to stay below 100 MB\n")
+        sys.stdout.write(f"parameters: one generation in {kept} is kept, to stay below 100 MB\n")
     sys.stdout.flush()
 
 
 def _conclude(run: Run, place: Place) -> None:
     """What came out, and what to do next."""
     summary, folder = run.summary, run.learner.folder.path
-    lines = [f"{summary['state']} after {summary['generations']} generations, {summary['rollouts']} rollouts, "
-             f"{summary['seconds']:.0f} s"]  # fmt: skip
+    lines = []
     if summary["mean_policy_return"] is not None:
         success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
         lines.append(

@@ -1,14 +1,12 @@
-"""Where messages go: to the terminal, and to a run's log file."""
+"""Messages on the terminal."""
 
 import logging
 import sys
-from pathlib import Path
 from typing import Final
 
 from farm.errors import ConfigError
 
 LEVELS: Final = ("DEBUG", "INFO", "WARNING", "ERROR")
-_FORMAT: Final = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
 def set_up(level: str) -> None:
@@ -23,11 +21,3 @@ def set_up(level: str) -> None:
     handler.setFormatter(logging.Formatter("%(message)s"))
     handler.setLevel(level.upper())
     logging.basicConfig(level=min(logging.INFO, logging.getLevelName(level.upper())), handlers=[handler], force=True)
-
-
-def also_to(path: Path) -> logging.Handler:
-    """Everything from INFO on into a file as well; close the handler at the end."""
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter(_FORMAT))
-    logging.getLogger().addHandler(handler)
-    return handler

@@ -35,6 +35,10 @@ class LearnerOptions:
     """Where workers can reach the learner (default: tcp/127.0.0.1:7447; farm run: any free port)."""
     connect: tuple[str, ...] = ()
     """Dial a router instead of listening, repeatable."""
+    tls: Path | None = None
+    """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
+    trust_network: bool = False
+    """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     log_level: str = "INFO"
@@ -48,7 +52,7 @@ class LearnerOptions:
         if self.listen is not None and self.connect:
             raise ConfigError("--listen and --connect exclude each other: a learner listens, or dials a router")
         for endpoint in (*self.connect, *([self.listen] if self.listen else [])):
-            check_endpoint(endpoint)
+            check_endpoint(endpoint, encrypted=self.tls is not None)
         if self.serve is not None:
             address(self.serve)
 

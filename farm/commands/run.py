@@ -30,5 +30,7 @@ class RunCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, begin = parse(RunCommand, words, "farm run")
+    if command.options.tls is not None:
+        raise ConfigError("farm run is for one machine; with --tls start farm learner and farm worker")
     place = Place(workers=command.workers, listen=free_endpoint())
     return learn(command.options, command.run, place, resumed, begin)

@@ -1,5 +1,6 @@
 """`farm view`: a run's recording in the Rerun viewer."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -32,7 +33,16 @@ def main(words: Sequence[str]) -> int:
     files = [command.run] if command.run.is_file() else parts(command.run / "run.rrd")
     if not files:
         raise ConfigError(f"no recording in {command.run}: give a run's folder or a .rrd file")
+    if not command.web and not _display():
+        raise ConfigError(
+            f"no display to open a window on: --web serves a browser, or copy {files[0]} to another machine"
+        )
     flags = ["--web-viewer"] if command.web else []
     return subprocess.run(
         [sys.executable, "-m", "rerun", *map(str, files), "--bind", "127.0.0.1", *flags], check=False
     ).returncode
+
+
+def _display() -> bool:
+    """Whether a window can be opened; only Linux says."""
+    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))

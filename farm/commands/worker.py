@@ -34,7 +34,7 @@ def main(words: Sequence[str]) -> int:
     command = arguments.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
     processes = command.processes or len(os.sched_getaffinity(0))
-    with stop_flag() as stop, Pool(processes, _flags(command), dict(os.environ)) as pool:
+    with stop_flag("leaving") as stop, Pool(processes, _flags(command), dict(os.environ)) as pool:
         while not stop.wait(0.2):
             ended = pool.tend()
             if ended and not pool.pids:
@@ -49,6 +49,8 @@ def _flags(command: WorkerCommand) -> list[str]:
     config = command.worker
     flags = [word for endpoint in config.connect for word in ("--connect", endpoint)]
     flags += ["--farm", config.farm, "--name", config.name, "--backend", config.backend]
+    if config.tls is not None:
+        flags += ["--tls", str(config.tls)]
     if config.timeout is not None:
         flags += ["--timeout", str(config.timeout)]
     return [*flags, "--log-level", command.log_level.upper()]

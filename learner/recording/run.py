@@ -33,7 +33,7 @@ class Recording(logging.Handler):
         folder = learner.folder
         try:
             recorder = Recorder(
-                folder.recording if to_file else None, run=folder.name, scene=scene, config=markdown(learner.config),
+                folder.recording if to_file else None, run=learner.run, scene=scene, config=markdown(learner.config),
                 horizon=learner.config.task.steps * CONTROL_PERIOD, serve=serve, done=learner.state.generation,
             )  # fmt: skip
         except OSError as error:

@@ -1,0 +1,66 @@
+"""`farm router`: a standing rendezvous that outlives learners."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from farm import arguments, keys
+from farm.commands import logs
+from farm.commands.signals import stop_flag
+from farm.local import LISTEN
+from farm.session import listen, router_settings
+from farm.tls import find
+
+
+@dataclass(frozen=True, kw_only=True)
+class RouterCommand:
+    """A standing rendezvous: learners, workers and viewers dial it; access control lives here."""
+
+    listen: str | None = None
+    """Where it can be reached (default: tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447)."""
+    tls: Path | None = None
+    """Folder with certificates (farm certificates makes it): the learner's bundle serves the router."""
+    trust_network: bool = False
+    """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
+    farm: str = "farm"
+    """Name of the farm that access control is for."""
+    print_config: bool = False
+    """Print the configuration for a zenohd of the same release, and end."""
+    log_level: str = "INFO"
+    """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        keys.checked("farm", self.farm)
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(RouterCommand, words, "farm router")
+    logs.set_up(command.log_level)
+    bundle = None if command.tls is None else find(command.tls, "learner")
+    endpoint = command.listen or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"))
+    if command.print_config:
+        settings = router_settings(endpoint, command.farm, bundle, trusted=command.trust_network)
+        sys.stdout.write(json.dumps(_nested(settings), indent=2) + "\n")
+        return 0
+    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=command.trust_network):
+        sys.stdout.write(f"router at {endpoint}; learners and workers dial it with --connect\n")
+        sys.stdout.flush()
+        stop.wait()
+    return 0
+
+
+def _nested(settings: dict[str, object]) -> dict[str, Any]:
+    """Settings by path as the tree that zenohd reads."""
+    tree: dict[str, Any] = {}
+    for path, value in settings.items():
+        *parents, leaf = path.split("/")
+        branch = tree
+        for name in parents:
+            branch = branch.setdefault(name, {})
+        branch[leaf] = value
+    return tree
