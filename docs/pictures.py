@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 import assets
 from farm import tactile
 from farm.arrays import FloatArray
+from farm.hand import TIP_RADIUS
 from farm.policy import Features, Policy, PolicyConfig
 from farm.scene import load
 from farm.states import STATES
@@ -101,9 +102,9 @@ def _photograph(qpos: FloatArray) -> Image.Image:
 def tactile_picture() -> str:
     """Side view with the rows' angles, front view with numbered taxels, and the image of one contact."""
     contact = _direction(np.deg2rad(14.0), np.deg2rad(20.0))
-    force = tactile.image(np.array([2.0]), contact[None] * 0.012)
+    force = tactile.image(np.array([2.0]), contact[None] * TIP_RADIUS)
     parts = [
-        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 960 400" font-family="DejaVu Sans, Arial, sans-serif" font-size="14">',
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 960 400" font-family="DejaVu Sans, Arial, sans-serif">',
         '<rect width="960" height="400" fill="#ffffff"/>',
         *_side(170, 215, 105),
         *_front(470, 215, 130, force, contact),
@@ -125,9 +126,8 @@ def _side(x: float, y: float, radius: float) -> list[str]:
     half = np.deg2rad(np.linspace(-90, 90, 61)) + tactile.TILT
     edge = " ".join(f"{x + radius * np.sin(a):.1f},{y - radius * np.cos(a):.1f}" for a in half)
     width = 0.8 * radius
-    out.append(
-        f'<rect x="{x - width:.1f}" y="{y}" width="{2 * width:.1f}" height="{1.25 * radius:.1f}" rx="8" fill="#e3e5e8"/>'
-    )
+    link = f'x="{x - width:.1f}" y="{y}" width="{2 * width:.1f}" height="{1.25 * radius:.1f}"'
+    out.append(f'<rect {link} rx="8" fill="#e3e5e8"/>')
     out.append(f'<circle cx="{x}" cy="{y}" r="{radius}" fill="#f2f3f5" stroke="#b6bac2"/>')
     out.append(f'<polygon points="{edge}" fill="#cfe3f3" stroke="#5b7f9c" stroke-width="1.5"/>')
     out.append(_line(x, y, x, y - 1.3 * radius, "#8a8f98", dashed=True))

@@ -244,7 +244,7 @@ def how_to_join(place: Place) -> str:
 class _LogFile(logging.FileHandler):
     """Leaves out what cannot be written: a full disk is told of elsewhere."""
 
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802  logging's name
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's name
         """Say nothing."""
 
 

@@ -31,6 +31,7 @@ IDLE: Final = 1.0
 
 _ASK: Final = 1.0  # [s] for an answer to a query
 _KEEP: Final = 8  # runs whose tasks are kept built
+_TELL: Final = 1000  # different lines about messages that make no sense
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +109,7 @@ class Worker:
         self._runs: OrderedDict[str, _Served] = OrderedDict()
         self._backends: OrderedDict[str, Backend | Exception] = OrderedDict()
         self._busy = time.monotonic()
+        self._told: set[str] = set()
 
     def join(self) -> None:
         """Subscribe, then show up: in that order, or the first jobs are lost."""
@@ -123,7 +125,7 @@ class Worker:
             try:
                 self._take(event)
             except MessageError as error:
-                log.warning("ignored a message on %s: %s", event.key, error)
+                self._ignore(f"on {event.key}: {error}")
         chunk = self._next()
         if chunk is not None:
             self._run(chunk)
@@ -152,6 +154,12 @@ class Worker:
             self._want(idle=False)
         else:
             self._runs.pop(keys.tail(event.key, keys.learner_token(self._config.farm, "")), None)
+
+    def _ignore(self, text: str) -> None:
+        """Tell of a message that makes no sense, once."""
+        if text not in self._told and len(self._told) < _TELL:
+            self._told.add(text)
+            log.warning("ignored a message %s", text)
 
     def _begin(self, header: Generation) -> None:
         """A new round: work of older ones is void."""

@@ -21,9 +21,11 @@ class Farm:
         self.folder = folder
         self._started: list[subprocess.Popen[str]] = []
 
-    def start(self, *words: str) -> "subprocess.Popen[str]":
+    def start(self, *words: str, host: str | None = None) -> "subprocess.Popen[str]":
+        """Start a command, in a network namespace if one is named."""
+        where = [] if host is None else ["ip", "netns", "exec", host]
         process = subprocess.Popen(
-            [sys.executable, "-m", "farm", *words],
+            [*where, sys.executable, "-m", "farm", *words],
             cwd=self.folder,
             env={**os.environ, "COLUMNS": "120", "OPENBLAS_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,

@@ -1,0 +1,40 @@
+"""A run from Python: learn with two local workers, then read what came out.
+
+    python examples/learn.py [--generations 60] [--out runs/example]
+
+Any setting of `farm run` is a field of RunConfig or of one of its three parts.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from farm.errors import FarmError
+from farm.local import learn
+from learner.config import RunConfig
+
+
+def main() -> None:
+    """Learn, and print a line a generation."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--generations", type=int, default=60)
+    parser.add_argument("--out", type=Path, default=Path("runs/example"))
+    arguments = parser.parse_args()
+
+    config = RunConfig(seed=3, generations=arguments.generations)
+    config = replace(config, algorithm=replace(config.algorithm, pairs=20))
+    for report in learn(config, arguments.out, workers=2):
+        p = report.progress
+        print(f"{p.generation:4d}  mean policy {p.mean_policy_return:8.3f}  success {p.success_rate:4.0%}")
+
+    summary = json.loads((arguments.out / "summary.json").read_text("utf-8"))
+    print(f"{summary['state']}: robust success {summary['robust_success_rate']:.0%} in {arguments.out}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except FarmError as error:
+        sys.exit(f"learn.py: {error}")

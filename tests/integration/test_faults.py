@@ -1,0 +1,261 @@
+"""Whatever dies, hangs, slows down or is cut off: every pair counts once, and the numbers stay the same.
+
+Each test ends with the hash of the undisturbed run, and says how long the run stood still at most;
+`pytest --measurements FILE` writes that down (docs/reliability.md holds ours).
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from processes import Farm, children
+
+from farm.local import free_endpoint
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
+
+GENERATIONS = 60
+SETTINGS = ("--name", "r", "--pairs", "6", "--generations", str(GENERATIONS), "--no-record")
+Check = Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    farm = Farm(tmp_path_factory.mktemp("undisturbed"))
+    farm.call("run", *SETTINGS)
+    return str(farm.summary("r")["parameters_sha256"])
+
+
+@pytest.fixture
+def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check:
+    """Every pair once, the same hash, and no longer a standstill than allowed [s]."""
+
+    def done(what: str, allowed: float, away: float = 0.0) -> None:
+        lines = farm.progress("r")
+        assert [line["generation"] for line in lines] == list(range(1, GENERATIONS + 1))
+        assert [line["rollouts"] for line in lines] == [12 * g for g in range(1, GENERATIONS + 1)]
+        assert farm.summary("r")["parameters_sha256"] == undisturbed
+        times = [line["seconds"] for line in lines]
+        still = max(away, *(b - a for a, b in zip(times, times[1:], strict=False)))
+        path = request.config.getoption("--measurements")
+        if path:
+            with Path(path).open("a") as file:
+                file.write(f"| {what} | {lines[-1]['reissued']} | {still:.1f} | {allowed:g} |\n")
+        assert still <= allowed
+
+    return done
+
+
+def finish(process: "subprocess.Popen[str]") -> None:
+    said, _ = process.communicate(timeout=150)
+    assert process.returncode == 0, said
+
+
+def resume(farm: Farm, *flags: str) -> float:
+    """Start a killed learner again and see it finish; how long until its first generation [s]."""
+    done, begun = len(farm.progress("r")), time.monotonic()
+    learner = farm.start("learner", "--resume", "runs/r", "--no-record", *flags)
+    farm.wait_for(lambda: len(farm.progress("r")) > done)
+    away = time.monotonic() - begun
+    finish(learner)
+    return away
+
+
+def running(farm: Farm, generation: int = 10) -> None:
+    farm.wait_for(lambda: len(farm.progress("r")) >= generation)
+
+
+def start(
+    farm: Farm, *worker_flags: str, processes: int = 2
+) -> tuple["subprocess.Popen[str]", "subprocess.Popen[str]"]:
+    """A learner, and the command that holds its workers."""
+    endpoint = free_endpoint()
+    learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
+    workers = farm.start("worker", "--connect", endpoint, "--processes", str(processes), *worker_flags)
+    return learner, workers
+
+
+def test_a_worker_killed(farm: Farm, check: Check) -> None:
+    learner, workers = start(farm)
+    running(farm)
+    os.kill(children(workers.pid)[0], signal.SIGKILL)
+    finish(learner)
+    check("worker killed", 5)
+
+
+def test_a_worker_frozen_and_thawed(farm: Farm, check: Check) -> None:
+    learner, workers = start(farm)
+    running(farm)
+    frozen = children(workers.pid)[0]
+    os.kill(frozen, signal.SIGSTOP)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 40)
+    os.kill(frozen, signal.SIGCONT)
+    finish(learner)
+    check("worker stopped (SIGSTOP), later continued", 10)
+
+
+def test_a_worker_slow_by_a_hundred_times(farm: Farm, check: Check) -> None:
+    learner, workers = start(farm)
+    running(farm)
+    slow, over = children(workers.pid)[0], threading.Event()
+
+    def hinder() -> None:
+        while not over.is_set():
+            os.kill(slow, signal.SIGSTOP)
+            over.wait(0.198)
+            os.kill(slow, signal.SIGCONT)
+            over.wait(0.002)
+
+    thread = threading.Thread(target=hinder)
+    thread.start()
+    try:
+        finish(learner)
+    finally:
+        over.set()
+        thread.join()
+        os.kill(slow, signal.SIGCONT)
+    check("worker slow by 100 times", 15)
+
+
+def test_a_learner_killed_and_back_at_another_address(farm: Farm, check: Check) -> None:
+    first, second = free_endpoint(), free_endpoint()
+    learner = farm.start("learner", "--listen", first, *SETTINGS)
+    farm.start("worker", "--connect", first, "--connect", second, "--processes", "2")
+    running(farm)
+    learner.kill()
+    learner.communicate(timeout=10)
+    away = resume(farm, "--listen", second)
+    check("learner killed, back at a second --connect", 15, away)
+
+
+def test_a_learner_behind_a_router_killed_and_back(farm: Farm, check: Check) -> None:
+    endpoint = free_endpoint()
+    farm.start("router", "--listen", endpoint)
+    learner = farm.start("learner", "--connect", endpoint, *SETTINGS)
+    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    running(farm)
+    learner.kill()
+    learner.communicate(timeout=10)
+    away = resume(farm, "--connect", endpoint)
+    check("learner behind a router killed and back", 15, away)
+
+
+def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:
+    endpoint = free_endpoint()
+    router = farm.start("router", "--listen", endpoint)
+    learner = farm.start("learner", "--connect", endpoint, *SETTINGS)
+    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    running(farm)
+    router.kill()
+    router.communicate(timeout=10)
+    farm.start("router", "--listen", endpoint)
+    finish(learner)
+    check("router killed and back", 15)
+
+
+def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:
+    endpoint = free_endpoint()
+    learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
+    for _ in range(2):
+        farm.start("worker", "--connect", endpoint, "--processes", "1", "--name", "same")
+    running(farm)
+    finish(learner)
+    assert farm.progress("r")[-1]["workers"] == 2
+    check("two workers of one name", 5)
+
+
+def test_clocks_that_jump(farm: Farm, check: Check) -> None:
+    library = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
+    if not library.exists():
+        pytest.skip("libfaketime is not installed (Debian: faketime)")
+    clock = farm.folder / "clock"
+    clock.write_text("+0\n")
+    os.environ |= {"LD_PRELOAD": str(library), "FAKETIME_TIMESTAMP_FILE": str(clock), "FAKETIME_NO_CACHE": "1"}
+    os.environ["FAKETIME_DONT_FAKE_MONOTONIC"] = "1"
+    try:
+        learner, _ = start(farm)
+    finally:
+        for name in ("LD_PRELOAD", "FAKETIME_TIMESTAMP_FILE", "FAKETIME_NO_CACHE", "FAKETIME_DONT_FAKE_MONOTONIC"):
+            del os.environ[name]
+    for generation, jump in ((5, "+3600\n"), (20, "-86400\n"), (35, "+0\n")):
+        running(farm, generation)
+        clock.write_text(jump)
+    finish(learner)
+    check("clocks jump by an hour and a day", 5)
+
+
+class Link:
+    """Two hosts, each a network namespace, and the wire between them."""
+
+    def __init__(self) -> None:
+        tag = uuid.uuid4().hex[:6]
+        self.learner, self.worker = f"farm-l-{tag}", f"farm-w-{tag}"
+        self._ends = (f"fl{tag}", f"fw{tag}")
+        for host in (self.learner, self.worker):
+            self._ip("netns", "add", host)
+        self._ip("link", "add", self._ends[0], "type", "veth", "peer", "name", self._ends[1])
+        for host, end, address in zip((self.learner, self.worker), self._ends, ("1", "2"), strict=True):
+            self._ip("link", "set", end, "netns", host)
+            for words in (("addr", "add", f"10.77.0.{address}/24", "dev", end), ("link", "set", end, "up")):
+                self._ip("-n", host, *words)
+            self._ip("-n", host, "link", "set", "lo", "up")
+
+    def cut(self) -> None:
+        self._ip("-n", self.worker, "link", "set", self._ends[1], "down")
+
+    def heal(self) -> None:
+        self._ip("-n", self.worker, "link", "set", self._ends[1], "up")
+
+    def disturb(self, *netem: str) -> None:
+        command = ["tc", "-n", self.worker, "qdisc", "add", "dev", self._ends[1], "root", "netem", *netem]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("this kernel has no netem")
+
+    def close(self) -> None:
+        for host in (self.learner, self.worker):
+            self._ip("netns", "del", host)
+
+    def _ip(self, *words: str) -> None:
+        subprocess.run(["ip", *words], check=True, capture_output=True)
+
+
+@pytest.fixture
+def link() -> Iterator[Link]:
+    if os.geteuid() != 0 or not shutil.which("ip"):
+        pytest.skip("network namespaces need root and iproute2")
+    made = Link()
+    yield made
+    made.close()
+
+
+def apart(farm: Farm, link: Link) -> "subprocess.Popen[str]":
+    """A learner on one host, two workers on the other."""
+    endpoint = "tcp/10.77.0.1:7447"
+    learner = farm.start("learner", "--listen", endpoint, "--trust-network", *SETTINGS, host=link.learner)
+    farm.start("worker", "--connect", endpoint, "--processes", "2", host=link.worker)
+    running(farm)
+    return learner
+
+
+@pytest.mark.parametrize("seconds", [3, 15])
+def test_a_link_that_is_cut(farm: Farm, check: Check, link: Link, seconds: int) -> None:
+    learner = apart(farm, link)
+    link.cut()
+    threading.Event().wait(seconds)  # the fault itself lasts so long
+    link.heal()
+    finish(learner)
+    check(f"link cut for {seconds} s", seconds + 15)
+
+
+def test_a_link_that_loses_and_delays(farm: Farm, check: Check, link: Link) -> None:
+    learner = apart(farm, link)
+    link.disturb("delay", "40ms", "20ms", "loss", "5%")
+    finish(learner)
+    check("5 % of packets lost, 40 +- 20 ms delay", 15)

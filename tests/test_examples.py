@@ -1,0 +1,29 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+LEARN = Path(__file__).parents[1] / "examples" / "learn.py"
+
+
+def _learn(folder: Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, LEARN, "--generations", "3", "--out", folder / "run"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_learn_runs_and_says_what_came_out(tmp_path: Path) -> None:
+    ended = _learn(tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    lines = ended.stdout.splitlines()
+    assert len(lines) == 4
+    assert lines[-1].startswith("finished: robust success")
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["state"], summary["generations"], summary["rollouts"]) == ("finished", 3, 3 * 2 * 20)
+
+
+def test_learn_overwrites_nothing(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    ended = _learn(tmp_path)
+    assert ended.returncode == 1
+    assert "never overwritten" in ended.stderr
+    assert "Traceback" not in ended.stderr
