@@ -15,6 +15,7 @@ COMMANDS: Final = {
     "evaluate": "the learnt mean policy on perturbed starts",
     "replay": "the learnt gait again, at physics rate, into a recording",
     "view": "opens a run's recording in the Rerun viewer",
+    "status": "which runs and workers a farm has, and how they are doing",
     "router": "a standing rendezvous that outlives learners",
     "certificates": "a small certificate authority, for farms of several machines",
     "runs": "a table of the runs in a folder",

@@ -7,6 +7,8 @@
 <farm>/run/<run>/spec              queryable: what is simulated
 <farm>/run/<run>/generation        published and queryable: the round that is on
 <farm>/run/<run>/result/<worker>   results
+<farm>/run/<run>/status            queryable: how it is doing
+<farm>/refused/<worker>            why a learner gives a worker no jobs
 """
 
 import re
@@ -61,6 +63,16 @@ def generation(farm: str, run: str) -> str:
 def result(farm: str, run: str, worker: str) -> str:
     """Where results of a run are published; worker `**` for all."""
     return f"{farm}/run/{run}/result/{worker}"
+
+
+def status(farm: str, run: str) -> str:
+    """Where a learner answers how its run is doing; run `*` for all."""
+    return f"{farm}/run/{run}/status"
+
+
+def refused(farm: str, worker: str) -> str:
+    """Where a learner tells a worker why it gets no jobs."""
+    return f"{farm}/refused/{worker}"
 
 
 def tail(key: str, prefix: str) -> str:

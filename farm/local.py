@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import assets
 from farm import keys, session
 from farm import scene as scenes
 from farm.errors import CheckpointError, ConfigError, RunError
@@ -27,6 +28,7 @@ from farm.session import Session
 from farm.tls import Bundle
 from learner import checkpoint as checkpoints
 from learner import config as configs
+from learner.admission import Admission
 from learner.algorithms import Diverged
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
@@ -64,6 +66,8 @@ class Place:
     """The learner's certificates."""
     trusted: bool = False
     """Listen to other machines without certificates."""
+    mixed: bool = False
+    """Admit workers whose machines round differently."""
     record: bool = True
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
@@ -178,7 +182,16 @@ def open_run(
                 raise RunError(f"cannot write to {folder.path}: {error.strerror}") from None
             raise
         tend = _Tending(stopped)
-        farm = Dispatcher(link, place.farm, learner.spec, how_to_join(place), tend, place.ledger)
+        farm = Dispatcher(
+            link,
+            place.farm,
+            learner.spec,
+            config.generations,
+            how_to_join(place),
+            tend,
+            Admission(assets.digest(), learner.canary, mixed=place.mixed),
+            place.ledger,
+        )
         if place.workers:
             flags = [*_worker_flags(place), "--log-level", "WARNING"]  # what they do, the learner says
             tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))

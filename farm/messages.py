@@ -29,6 +29,10 @@ class Want:
     """It has had nothing to do for a while: what a learner believes it holds is lost."""
     version: str
     """Release of the worker's software."""
+    assets: str
+    """Digest of its hand and objects."""
+    canary: str
+    """Digest of the numbers its machine gives."""
 
     def __post_init__(self) -> None:
         """Check the number."""
@@ -152,6 +156,48 @@ class Failure:
     worker: str
     index: int
     error: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Why a run gives a worker no jobs, learner to worker."""
+
+    run: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerStatus:
+    """How a worker is doing, as a learner sees it."""
+
+    worker: str
+    version: str
+    canary: str
+    rollouts: int
+    """It has brought so many."""
+    rate: float
+    """Rollouts a second, over the last ten."""
+    seen: float
+    """Since it was last heard of [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunStatus:
+    """How a run is doing, answered by its learner."""
+
+    run: str
+    generation: int
+    generations: int
+    return_mean: float | None
+    mean_policy_return: float | None
+    open: int
+    """Jobs of this round that are not done."""
+    reissued: int
+    refused: int
+    """Workers that were refused."""
+    ignored: dict[str, Any]
+    """Messages that did not count, by kind."""
+    workers: tuple[WorkerStatus, ...]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -136,6 +136,11 @@ def quiet() -> None:
     mujoco.MjLogConfig.set(config)
 
 
+def digest() -> str:
+    """Hash of every asset: machines that differ in it simulate something else."""
+    return assets.digest()
+
+
 def load(object_name: str) -> Scene:
     """Compile the hand with the object of that name.
 

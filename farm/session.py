@@ -144,11 +144,14 @@ class Session:
 
     def ask(self, key: str, timeout: float) -> bytes | None:
         """One answer to a query on the key, None when there is none in time [s]."""
+        return next(self.ask_all(key, timeout), None)
+
+    def ask_all(self, key: str, timeout: float) -> Iterator[bytes]:
+        """Every answer to a query on the key that comes in time [s]."""
         with suppress(zenoh.ZError):
             for reply in self._session.get(key, timeout=timeout):
                 if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-        return None
+                    yield reply.ok.payload.to_bytes()
 
     def close(self) -> None:
         """Take everything back and wait for the threads: one that is left in Rust aborts the interpreter's exit."""

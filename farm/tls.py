@@ -147,13 +147,14 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
     """What a worker may send, and what it may be sent."""
     own, told, asked = f"{name}/**", keys.generation(farm, "*"), [keys.spec(farm, "*"), keys.generation(farm, "*")]
+    sent = [keys.inbox(farm, own), keys.refused(farm, own), told]
     return [
         ("ingress", ["put"], [keys.want(farm, own), keys.result(farm, "*", own)]),
-        ("ingress", ["declare_subscriber"], [keys.inbox(farm, own), told]),
+        ("ingress", ["declare_subscriber"], sent),
         ("ingress", ["query"], asked),
         ("ingress", _TOKENS, [keys.worker_token(farm, own)]),
         ("ingress", _WATCHES, [keys.learner_token(farm, "*")]),
-        ("egress", ["put"], [keys.inbox(farm, own), told]),
+        ("egress", ["put"], sent),
         ("egress", ["reply", "declare_queryable"], asked),
         ("egress", _TOKENS, [keys.learner_token(farm, "*")]),
         # The learners' own wildcard subscriptions, or the worker would see nobody to send to.
@@ -164,7 +165,8 @@ def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
 
 def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
     """A viewer sees which learners and workers there are, and what runs are about."""
-    told, asked = [keys.generation(farm, "*")], [keys.spec(farm, "*"), keys.generation(farm, "*")]
+    told = [keys.generation(farm, "*")]
+    asked = [keys.spec(farm, "*"), keys.generation(farm, "*"), keys.status(farm, "*")]
     tokens = [keys.learner_token(farm, "*"), keys.worker_token(farm, "**")]
     return [
         ("ingress", ["declare_subscriber"], told),

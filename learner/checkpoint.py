@@ -37,6 +37,8 @@ class Checkpoint:
     """The best rollout so far, as a job that runs it again."""
     best_generation: int
     """The generation it came from."""
+    canary: str | None
+    """Digest of the numbers of the machines that simulated; None as long as none has."""
     replayed: bool
     """Whether it has been recorded at physics rate."""
     frequencies: FloatArray = array("<f8", 2)

@@ -19,14 +19,18 @@ from farm.arrays import FloatArray
 from farm.codec import M
 from farm.errors import MessageError, RunError
 from farm.hand import FINGERS
-from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
+from farm.messages import Chunk, Failure, Generation, Job, Refusal, Result, Results, RunStatus, Spec, Want
 from farm.session import Event, Session
 from farm.tactile import TAXELS
+from learner.admission import Admission
+from learner.census import Census
 from learner.ledger.ledger import Ledger, LedgerConfig
+from learner.progress import Progress
 
 log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] between two looks at whether to stop
+_STATUS: Final = 0.5  # [s] between two refreshments of the status
 _PATIENCE: Final = 3.0  # [s] without workers before the user is told
 
 
@@ -42,14 +46,17 @@ class Dispatcher:
         session: Session,
         farm: str,
         spec: Spec,
+        generations: int,
         how_to_join: str,
         stopped: Callable[[], bool],
+        admission: Admission,
         ledger: LedgerConfig | None = None,
     ) -> None:
         """Show the run on the network: subscriptions first, the liveliness token last."""
         self.run = spec.run
         self.ignored: Counter[str] = Counter()
-        """Messages that were not counted, by kind: stale, doubled, foreign, bad, large, version."""
+        """Messages that were not counted, by kind: stale, doubled, foreign, refused, bad, large, version."""
+        self.admission = admission
         self._session, self._farm, self._stopped = session, farm, stopped
         self._ledger = Ledger(ledger or LedgerConfig())
         self._how_to_join = how_to_join
@@ -64,12 +71,18 @@ class Dispatcher:
         self._results: dict[int, Result] = {}
         self._told: set[str] = set()
         self._gone: set[str] = set()  # whose last words may still be on the way
+        self._refused: dict[str, str] = {}
+        self._census = Census()
+        self._progress: Progress | None = None
+        self._generations, self._status, self._status_due = generations, b"", 0.0
         self._alone = time.monotonic()
         session.subscribe("want", keys.want(farm, "**"))
         session.subscribe("result", keys.result(farm, self.run, "**"))
         session.watch("worker", keys.worker_token(farm, "**"))
         session.answer(keys.spec(farm, self.run), lambda: self._spec)
         session.answer(keys.generation(farm, self.run), lambda: codec.encode(self._header))
+        session.answer(keys.status(farm, self.run), lambda: self._status)
+        self._tell_status()
         session.token(keys.learner_token(farm, self.run))
 
     @property
@@ -110,6 +123,7 @@ class Dispatcher:
                 self._take(event)
             self._hand_out()
             self._tell_when_alone()
+            self._tell_status()
             if self._stopped():
                 raise Stopped
         return [self._results[index] for index in range(len(self._jobs))]
@@ -142,9 +156,23 @@ class Dispatcher:
             return
         if want.worker in self._gone:
             return
+        refusal = self.admission.refusal(want)
+        if refusal is not None:
+            self._refuse(want.worker, refusal)
+            return
         if want.worker not in self._ledger.workers:
             log.info("worker %s joined (release %s)", want.worker, want.version)
-        self._ledger.want(want.worker, want.credits, time.monotonic(), idle=want.idle)
+        now = time.monotonic()
+        self._ledger.want(want.worker, want.credits, now, idle=want.idle)
+        self._census.asked(want, now)
+
+    def _refuse(self, worker: str, reason: str) -> None:
+        """Tell both sides; the worker every time it asks, or it may never hear it."""
+        if worker not in self._refused:
+            log.warning("worker %s is refused: %s", worker, reason)
+        self._refused[worker] = reason
+        message = codec.encode(Refusal(run=self.run, reason=reason))
+        self._session.publish(keys.refused(self._farm, worker), message, block=False)
 
     def _liveliness(self, event: Event) -> None:
         worker = keys.tail(event.key, keys.worker_token(self._farm, ""))
@@ -152,6 +180,8 @@ class Dispatcher:
             self._gone.discard(worker)
             return
         self._gone.add(worker)
+        self._refused.pop(worker, None)
+        self._census.left(worker)
         if worker in self._ledger.workers:
             again = self._ledger.lost(worker)
             log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
@@ -169,6 +199,8 @@ class Dispatcher:
                 raise first from None
         if message.worker != sender or message.run != self.run:
             self._ignore("foreign", f"of {message.worker} on {event.key}")
+        elif message.worker in self._refused:
+            self._ignore("refused", f"of {message.worker}, which is not admitted")
         elif (message.incarnation, message.round) != (self._incarnation, self._header.round):
             self.ignored["stale"] += 1
         elif isinstance(message, Failure):
@@ -186,6 +218,7 @@ class Dispatcher:
                 self._results[result.index] = result
             else:
                 self.ignored[verdict] += 1
+        self._census.did(message.worker, sum(len(result.returns) for result in good), time.monotonic())
 
     def _fits(self, result: Result) -> bool:
         if not 0 <= result.index < len(self._jobs):
@@ -214,6 +247,31 @@ class Dispatcher:
             )  # fmt: skip
             # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
             self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)
+
+    def report(self, progress: Progress) -> None:
+        """Take in how the last generation went, for people who ask."""
+        self._progress = progress
+
+    def _tell_status(self) -> None:
+        """Keep the answer to status queries fresh; they are answered on another thread, which may not look here."""
+        now = time.monotonic()
+        if now < self._status_due:
+            return
+        self._status_due = now + _STATUS
+        last = self._progress
+        status = RunStatus(
+            run=self.run,
+            generation=self._header.generation,
+            generations=self._generations,
+            return_mean=last.return_mean if last else None,
+            mean_policy_return=last.mean_policy_return if last else None,
+            open=self._ledger.remaining,
+            reissued=self._ledger.reissued,
+            refused=len(self._refused),
+            ignored=dict(self.ignored),
+            workers=self._census.status(now),
+        )
+        self._status = codec.encode(status)
 
     def _tell_when_alone(self) -> None:
         now = time.monotonic()

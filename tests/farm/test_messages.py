@@ -17,11 +17,14 @@ from farm.messages import (
     Failure,
     Generation,
     Job,
+    Refusal,
     Result,
     Results,
+    RunStatus,
     Spec,
     Want,
     WireTrajectory,
+    WorkerStatus,
 )
 from farm.trajectory import Trajectory
 
@@ -73,8 +76,21 @@ def result(rollouts=2, steps=15, **changes):
 HEAD = {"run": "run-1", "incarnation": "ab12", "round": 7}
 
 MESSAGES = {
-    "want": Want(worker="host/a1", credits=64, idle=False, version="0.1.0"),
-    "want nothing": Want(worker="host/a1", credits=0, idle=True, version=""),
+    "refusal": Refusal(run="first", reason="its hand is another"),
+    "status": RunStatus(
+        run="first",
+        generation=3,
+        generations=150,
+        return_mean=-5.4,
+        mean_policy_return=None,
+        open=4,
+        reissued=1,
+        refused=0,
+        ignored={"stale": 2},
+        workers=(WorkerStatus(worker="host/a1", version="0.1.0", canary="c", rollouts=9, rate=0.9, seen=0.1),),
+    ),  # fmt: skip
+    "want": Want(worker="host/a1", credits=64, idle=False, version="0.1.0", assets="a", canary="c"),
+    "want nothing": Want(worker="host/a1", credits=0, idle=True, version="", assets="a", canary="c"),
     "spec": Spec(
         run="run-1",
         task="finger-gait",

@@ -23,9 +23,12 @@ class Farm:
 
     def start(self, *words: str, host: str | None = None) -> "subprocess.Popen[str]":
         """Start a command, in a network namespace if one is named."""
+        return self.start_python("-m", "farm", *words, host=host)
+
+    def start_python(self, *words: str, host: str | None = None) -> "subprocess.Popen[str]":
         where = [] if host is None else ["ip", "netns", "exec", host]
         process = subprocess.Popen(
-            [*where, sys.executable, "-m", "farm", *words],
+            [*where, sys.executable, *words],
             cwd=self.folder,
             env={**os.environ, "COLUMNS": "120", "OPENBLAS_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,

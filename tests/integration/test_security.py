@@ -90,7 +90,7 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
         w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
         for posing in (w2, eva):
             posing.token(keys.worker_token("farm", "w1/1-abc"))
-            want = Want(worker="w1/1-abc", credits=100, idle=True, version="0")
+            want = Want(worker="w1/1-abc", credits=100, idle=True, version="0", assets="a", canary="c")
             posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))
         farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "2")
         seen = []

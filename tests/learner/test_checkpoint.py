@@ -30,7 +30,8 @@ def checkpoint(**changed: object) -> Checkpoint:
     state = replace(state, mu=EXTREMES, sigma=np.abs(EXTREMES) + 1e-300, best=-0.1, baseline=1 / 3, generation=7)
     values = {
         "run": "first", "config": to_dict(RunConfig(seed=3)), "state": state.to_dict(), "rollouts": 210, "reissued": 4,
-        "seconds": 12.3456789012345678, "solved": 2, "best": BEST, "best_generation": 5, "replayed": False,
+        "seconds": 12.3456789012345678, "solved": 2, "best": BEST, "best_generation": 5, "canary": "c0",
+        "replayed": False,
         "frequencies": RNG.normal(size=(5, 8)), "phases": RNG.uniform(size=5),
     }  # fmt: skip
     return Checkpoint(**(values | changed))  # type: ignore[arg-type]

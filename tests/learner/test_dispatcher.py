@@ -18,6 +18,7 @@ from farm.local import free_endpoint
 from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
 from farm.session import Session, connect, listen
 from learner import dispatcher as dispatchers
+from learner.admission import Admission
 from learner.dispatcher import Dispatcher, Stopped
 from learner.ledger.ledger import LedgerConfig
 
@@ -67,7 +68,10 @@ class Worker:
         return codec.decode(self.next("inbox"), Chunk)
 
     def want(self, credits: int, *, idle: bool = False) -> None:
-        self.say(keys.want(FARM, self.name), Want(worker=self.name, credits=credits, idle=idle, version="0"))
+        self.say(
+            keys.want(FARM, self.name),
+            Want(worker=self.name, credits=credits, idle=idle, version="0", assets="a", canary="c"),
+        )
 
     def say(self, key: str, message: object) -> None:
         self.session.publish(key, message if isinstance(message, bytes) else codec.encode(message))
@@ -98,7 +102,9 @@ class Learner:
 
     def show(self, ledger: LedgerConfig = PATIENT, stopped: Callable[[], bool] | None = None) -> Dispatcher:
         join = "farm worker --connect here"
-        self.farm = Dispatcher(self.session, FARM, SPEC, join, stopped or self.stop.is_set, ledger)
+        self.farm = Dispatcher(
+            self.session, FARM, SPEC, 9, join, stopped or self.stop.is_set, Admission("a", None), ledger
+        )
         return self.farm
 
     def collect(self, todo: list[Job]) -> "Future[list[Result]]":
@@ -205,9 +211,14 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     worker = hire("a/1")
     with monkeypatch.context() as other:
         other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
-        newer = codec.encode(Want(worker="a/1", credits=1, idle=False, version="9"))
+        newer = codec.encode(Want(worker="a/1", credits=1, idle=False, version="9", assets="a", canary="c"))
     inbox = keys.want(FARM, worker.name)
-    for nonsense in (b"", b"\xc1", newer, Want(worker="b/1", credits=50, idle=False, version="0")):
+    for nonsense in (
+        b"",
+        b"\xc1",
+        newer,
+        Want(worker="b/1", credits=50, idle=False, version="0", assets="a", canary="c"),
+    ):
         worker.say(inbox, nonsense)
     worker.want(1)
     collected = learner.collect(jobs(4))
@@ -219,7 +230,7 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
         replace(honest, results=(result(0, steps=2),)), replace(honest, results=(result(4),)),
         replace(honest, run="other"), replace(honest, worker="b/1"),
         replace(honest, round=0), replace(honest, incarnation="0" * 16),
-        Want(worker="a/1", credits=1, idle=False, version="0"),
+        Want(worker="a/1", credits=1, idle=False, version="0", assets="a", canary="c"),
         Failure(run=RUN, incarnation=first.incarnation, round=first.round, worker="a/1", index=99, error="no"),
         Failure(run=RUN, incarnation="gone", round=first.round, worker="a/1", index=0, error="no"),
     ]  # fmt: skip

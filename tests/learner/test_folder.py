@@ -33,7 +33,7 @@ def checkpoint(generation: int) -> Checkpoint:
     state = replace(PGPE().init(P), generation=generation)
     return Checkpoint(
         run="r", config=to_dict(RunConfig()), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0, solved=0,
-        best=None, best_generation=0, replayed=True, frequencies=np.empty((0, 8)), phases=np.empty(0),
+        best=None, best_generation=0, canary=None, replayed=True, frequencies=np.empty((0, 8)), phases=np.empty(0),
     )  # fmt: skip
 
 

@@ -43,8 +43,8 @@ class Backend:
             raise RuntimeError("no such\n  machine")
 
     def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
-        self.go.wait(WAIT)
         self.ran.append(self.name)
+        self.go.wait(WAIT)
         if any(job.index == 13 for job in jobs):
             raise ArithmeticError("thirteen")
         return [result(job.index, float((mu + job.eps).sum())) for job in jobs]
@@ -220,16 +220,16 @@ def test_chunks_of_rounds_gone_by_are_dropped(stage: Stage) -> None:
 def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
+    stage.next("want")
     Backend.go.clear()
-    learner.announce()
     learner.send(worker.id, 0)
-    until(lambda: Backend.made)
+    until(lambda: Backend.ran)
     for index in (1, 2):
         learner.send(worker.id, index)
     learner.header = replace(learner.header, round=3)
     learner.announce()
     learner.send(worker.id, 3)
-    until(lambda: worker._session.events.qsize() >= 4)
+    until(lambda: worker._session.events.qsize() == 4)
     Backend.go.set()
     assert [(indices(said), said.round) for said in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
 
@@ -237,19 +237,18 @@ def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
 def test_two_runs_in_turn(stage: Stage) -> None:
     learners = [Learner(stage.session, run) for run in ("a", "b")]
     worker = stage.hire()
+    for _ in learners:
+        stage.next("want")
     Backend.go.clear()
-    for learner in learners:
-        learner.announce()
     learners[0].send(worker.id, 0)
-    until(lambda: Backend.made)
-    waiting = worker._session.events.qsize()
-    for learner, sent in ((learners[0], (1, 2)), (learners[1], (0, 1, 2))):
+    until(lambda: Backend.ran)
+    for learner, sent in zip(learners, ((1, 2), (0, 1, 2)), strict=True):
         for index in sent:
             learner.send(worker.id, index)
-    until(lambda: worker._session.events.qsize() >= waiting + 5)
+    until(lambda: worker._session.events.qsize() == 5)
     Backend.go.set()
     answers = [stage.results("a", "b") for _ in range(6)]
-    assert Backend.ran == ["a", "b", "a", "b", "a", "b"]
+    assert Backend.ran == ["a", "a", "b", "a", "b", "b"]  # b shows up after the first
     assert [indices(said) for said in answers if said.run == "b"] == [[0], [1], [2]]
     assert Backend.made == ["a", "b"]
 
@@ -315,7 +314,12 @@ def test_messages_it_cannot_read(
     inbox, generation = keys.inbox(FARM, worker.id), keys.generation(FARM, "r")
     stage.next("worker")
     for key in (inbox, generation, generation):
-        for payload in (b"", b"\xc1", newer, codec.encode(Want(worker="w", credits=1, idle=False, version="0"))):
+        for payload in (
+            b"",
+            b"\xc1",
+            newer,
+            codec.encode(Want(worker="w", credits=1, idle=False, version="0", assets="a", canary="c")),
+        ):
             stage.session.publish(key, payload)
     learner.announce()
     learner.send(worker.id, 1)

@@ -1,0 +1,101 @@
+"""`farm status`: which runs and workers a farm has, and how they are doing."""
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+
+from farm import arguments, codec, keys
+from farm.commands import logs
+from farm.commands.signals import stop_flag
+from farm.errors import MessageError
+from farm.local import LISTEN
+from farm.messages import RunStatus
+from farm.session import Session, connect
+from farm.tls import find
+
+_ANSWER = 1.0  # [s] that learners have to answer
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatusCommand:
+    """Which runs and workers a farm has, and how they are doing; refreshed until Ctrl-C on a terminal."""
+
+    connect: tuple[str, ...] = ()
+    """Where a learner or a router listens, repeatable (default: tcp/127.0.0.1:7447)."""
+    farm: str = "farm"
+    """Name of the farm."""
+    tls: Path | None = None
+    """Folder with certificates: a viewer's bundle."""
+    name: str = ""
+    """Which viewer's, where the folder holds several."""
+    json: bool = False
+    """Print JSON once instead of a table."""
+    timeout: float = 5.0
+    """Give up when nobody answers for so long [s]."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(StatusCommand, words, "farm status")
+    keys.checked("farm", command.farm)
+    logs.set_up("ERROR")
+    bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
+    endpoints = command.connect or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"),)
+    with stop_flag() as stop, connect(endpoints, command.timeout, stop.is_set, bundle) as session:
+        runs = ask(session, command.farm)
+        if command.json:
+            sys.stdout.write(json.dumps([dataclasses.asdict(run) for run in runs], indent=2) + "\n")
+            return 0
+        console = Console()
+        if not console.is_terminal:
+            console.print(_tables(runs))
+            return 0
+        _watch(console, lambda: ask(session, command.farm), runs, stop.wait)
+    return 0
+
+
+def ask(session: Session, farm: str) -> list[RunStatus]:
+    """What the farm's learners say, by run."""
+    runs = []
+    for payload in session.ask_all(keys.status(farm, "*"), _ANSWER):
+        try:
+            runs.append(codec.decode(payload, RunStatus))
+        except MessageError:
+            continue  # another release; its own side says so
+    return sorted(runs, key=lambda run: run.run)
+
+
+def _watch(
+    console: Console, look: Callable[[], list[RunStatus]], runs: list[RunStatus], wait: Callable[[float], bool]
+) -> None:
+    with Live(_tables(runs), console=console, auto_refresh=False) as live:
+        while not wait(1.0):
+            live.update(_tables(look()), refresh=True)
+
+
+def _tables(runs: list[RunStatus]) -> Group:
+    if not runs:
+        return Group("no runs: no learner answers")
+    table = Table(title=time.strftime("runs at %H:%M:%S"))
+    for name in ("run", "generation", "return", "mean policy", "jobs open", "re-issued", "ignored", "refused"):
+        table.add_column(name, justify="left" if name in ("run", "ignored") else "right")
+    workers = Table(title="workers")
+    for name in ("worker", "release", "numbers", "run", "rollouts", "rollouts/s", "last seen"):
+        workers.add_column(name, justify="right" if name.startswith(("rollouts", "last")) else "left")
+    for run in runs:
+        ignored = ", ".join(f"{kind} {count}" for kind, count in sorted(run.ignored.items())) or "-"
+        figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
+        generation = f"{run.generation}/{run.generations}"
+        table.add_row(run.run, generation, *figures, str(run.open), str(run.reissued), ignored, str(run.refused))
+        for worker in run.workers:
+            seen, done = f"{worker.seen:.0f} s", str(worker.rollouts)
+            workers.add_row(worker.worker, worker.version, worker.canary[:8], run.run, done, f"{worker.rate:.0f}", seen)
+    return Group(table, workers)

@@ -1,0 +1,49 @@
+"""`farm status`, and who is refused."""
+
+import json
+
+from processes import SMALL, Farm
+
+from farm.local import free_endpoint
+
+
+def test_runs_and_workers_are_seen(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
+    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.wait_for(lambda: len(farm.progress("r")) > 20)
+    (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
+    assert run["run"] == "r"
+    assert 0 < run["generation"] <= run["generations"] == 100000
+    assert len(run["workers"]) == 2
+    assert all(worker["rollouts"] > 0 and worker["rate"] > 0 for worker in run["workers"])
+    assert run["ignored"] == {}
+    said = farm.call("status", "--connect", endpoint)
+    assert "100000" in said
+    assert "workers" in said
+
+
+def test_nobody_there(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    said = farm.call("status", "--connect", endpoint, "--timeout", "1", status=1)
+    assert f"nobody answers at {endpoint}" in said
+
+
+def test_a_worker_with_other_assets_is_refused_on_both_sides(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learner = farm.start("learner", "--name", "r", "--generations", "5", "--listen", endpoint, *SMALL)
+    code = (
+        "import sys, assets; assets.digest = lambda: 'paw'; from workers.__main__ import main;"
+        f"sys.argv = ['worker', '--connect', '{endpoint}']; sys.exit(main())"
+    )
+    stranger = farm.start_python("-c", code)
+    assert stranger.stdout
+    lines = iter(stranger.stdout.readline, "")
+    line = next(line for line in lines if "does not take" in line)
+    assert "run r does not take this worker: its hand or objects are others" in line
+    (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
+    assert (run["refused"], run["workers"]) == (1, [])
+    farm.start("worker", "--connect", endpoint, "--processes", "1")
+    said, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, said
+    assert said.count("is refused: its hand or objects are others") == 1

@@ -1,0 +1,52 @@
+"""The canary changes with anything that changes a number, and with nothing else."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from farm import policy, rewards, tactile
+from workers import canary, simulation
+
+
+def fresh() -> str:
+    canary.digest.cache_clear()
+    return canary.digest()
+
+
+def test_every_process_says_the_same() -> None:
+    command = [sys.executable, "-c", "from workers import canary; print(canary.digest())"]
+    other = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    assert other == fresh()
+
+
+def _tactile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tactile, "KAPPA", np.nextafter(tactile.KAPPA, 9.0))
+
+
+def _reward(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rewards, "RETURN_SCALE", np.nextafter(rewards.RETURN_SCALE, 1.0))
+
+
+def _policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = policy.Policy.features
+    monkeypatch.setattr(policy.Policy, "features", lambda self, x: np.nextafter(whole(self, x), 1.0))
+
+
+def _kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = policy.Policy._kernel
+    monkeypatch.setattr(policy.Policy, "_kernel", lambda self, theta, x: np.nextafter(whole(self, theta, x), 2.0))
+
+
+def _physics(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation, "CLOSING", simulation.CLOSING + 1)
+
+
+@pytest.mark.parametrize("change", [_tactile, _reward, _policy, _kernel, _physics])
+def test_the_last_bit_of_anything_shows(monkeypatch: pytest.MonkeyPatch, change) -> None:
+    before = fresh()
+    change(monkeypatch)
+    assert fresh() != before
+    monkeypatch.undo()
+    assert fresh() == before
