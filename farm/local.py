@@ -47,6 +47,7 @@ log = logging.getLogger(__name__)
 LISTEN: Final = "tcp/127.0.0.1:7447"
 """Where a learner listens unless told otherwise."""
 
+_REMEMBERED: Final = 5.0  # [s] for which a router may believe that a killed learner is still there
 _TEND: Final = 0.5  # [s] between two looks at the worker processes
 
 
@@ -165,6 +166,7 @@ def open_run(
             stack.enter_context(folder.held())
         at = _resumed(folder, config) if resume else start(config, folder.name)
         link = stack.enter_context(_session(place, stopped))
+        _check_alone(link, place, folder.name, stopped)
         if not resume:
             RunFolder.create(path, config)
             stack.enter_context(folder.held())
@@ -236,6 +238,18 @@ class _Tending:
         return self._stopped()
 
 
+def _check_alone(link: Session, place: Place, run: str, stopped: Callable[[], bool]) -> None:
+    """See that no other learner has a run of this name behind the same router: they would void each other's work.
+
+    Raises:
+      ConfigError: one has, and stays longer than a dead one would be remembered.
+    """
+    until = time.monotonic() + _REMEMBERED
+    while place.connect and link.present(keys.learner_token(place.farm, run), 1.0):
+        if time.monotonic() > until or stopped():
+            raise ConfigError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
+
+
 def _session(place: Place, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
     if place.connect:
         return session.connect(place.connect, None, stopped, place.tls)
@@ -249,7 +263,8 @@ def _worker_flags(place: Place) -> list[str]:
 
 def how_to_join(place: Place) -> str:
     """The command by which workers join."""
-    flags = _worker_flags(place)
+    host = socket.gethostname()  # of an address that means all of them, others need the name
+    flags = [flag.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:") for flag in _worker_flags(place)]
     tls = ["--tls", "worker-NAME"] if place.tls else []
     return " ".join(["farm worker", *(flags if place.farm != "farm" else flags[:-2]), *tls])
 

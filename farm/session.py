@@ -142,6 +142,10 @@ class Session:
 
         self._start(serve, f"answer {key}")
 
+    def present(self, key: str, timeout: float) -> bool:
+        """Whether a liveliness token of the key is there, as far as is known in time [s]."""
+        return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=timeout))
+
     def ask(self, key: str, timeout: float) -> bytes | None:
         """One answer to a query on the key, None when there is none in time [s]."""
         return next(self.ask_all(key, timeout), None)

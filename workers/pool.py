@@ -23,6 +23,7 @@ class Pool:
         # One thread a process: the cores are shared out among processes.
         self._environment = {**environment, **dict.fromkeys(_ENVIRONMENT, "1")}
         self._restarts = 0
+        self._missed: set[int] = set()
         self._processes = [self._start() for _ in range(processes)]
 
     def _start(self) -> "subprocess.Popen[bytes]":
@@ -43,7 +44,10 @@ class Pool:
             if status is None:
                 continue
             if status in (0, 1, 2) or self._restarts >= _RESTARTS:
-                given_up.append(status)  # it ended by itself and has said why
+                given_up.append(status)  # it ended by itself and has said why, or keeps dying
+                if process.pid not in self._missed:
+                    self._missed.add(process.pid)
+                    log.warning("worker process %d ended with status %d and is not replaced", process.pid, status)
                 continue
             self._restarts += 1
             log.warning("worker process %d ended with status %d; starting another", process.pid, status)

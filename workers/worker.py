@@ -40,15 +40,15 @@ class WorkerConfig:
     """A worker and where it works."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable (default: tcp/127.0.0.1:7447)."""
+    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     name: str = ""
-    """Name of this worker (default: the host's name; with --tls its certificate's)."""
+    """Name of this worker; without one: the host's, with --tls the certificate's."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed to dial tls/HOST:PORT."""
     timeout: float | None = None
-    """Give up when nobody answers for so long at the start [s] (default: keep trying)."""
+    """Give up when nobody answers for so long at the start [s]; None: keep trying."""
     backend: str = "cpu"
     """What simulates: cpu."""
 

@@ -13,7 +13,7 @@ from learner.config import RunConfig
 class LearnerCommand:
     """The learner alone; workers join it from this machine or others with `farm worker`."""
 
-    options: LearnerOptions = field(default_factory=LearnerOptions)
+    learner: LearnerOptions = field(default_factory=LearnerOptions)
     """Where the run comes from and where it goes."""
     run: RunConfig = field(default_factory=RunConfig)
     """The run."""
@@ -22,5 +22,5 @@ class LearnerCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, begin = parse(LearnerCommand, words, "farm learner")
-    place = Place() if command.options.tls is None else Place(listen=LISTEN.replace("tcp/", "tls/"))
-    return learn(command.options, command.run, place, resumed, begin)
+    place = Place() if command.learner.tls is None else Place(listen=LISTEN.replace("tcp/", "tls/"))
+    return learn(command.learner, command.run, place, resumed, begin)

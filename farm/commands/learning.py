@@ -6,6 +6,7 @@ from dataclasses import replace
 from farm.commands import display, logs, options
 from farm.commands.options import LearnerOptions
 from farm.commands.signals import stop_flag
+from farm.errors import ConfigError
 from farm.local import Place, Run, how_to_join, open_run
 from farm.tls import find
 from learner.config import RunConfig
@@ -26,6 +27,8 @@ def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunF
         place = replace(place, serve=options.address(chosen.serve))
     path = chosen.out / options.run_name(chosen, config) if resumed is None else resumed.path
     if resumed is not None:
+        if chosen.name:
+            raise ConfigError("--name is for a new run; a resumed one keeps its name")
         options.check_resume(begin, config, resumed)
     with stop_flag("saving and ending") as stop:
         opened = open_run(config, path, place, resume=resumed is not None, stopped=stop.is_set)

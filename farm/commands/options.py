@@ -26,13 +26,13 @@ class LearnerOptions:
     out: Path = Path("runs")
     """Folder that run folders are made in."""
     name: str = ""
-    """Name of the run and its folder (default: task-preset-sSEED-UTC time)."""
+    """Name of the run and its folder; without one: task-preset-sSEED-UTC time."""
     record: bool = True
     """Record the run with Rerun."""
     serve: str | None = None
     """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
     listen: str | None = None
-    """Where workers can reach the learner (default: tcp/127.0.0.1:7447; farm run: any free port)."""
+    """Where workers can reach the learner; None: tcp/127.0.0.1:7447, with farm run any free port."""
     connect: tuple[str, ...] = ()
     """Dial a router instead of listening, repeatable."""
     tls: Path | None = None

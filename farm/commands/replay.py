@@ -22,7 +22,7 @@ class ReplayCommand:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: Path | None = None
-    """Recording to write (default: gait.rrd in the run's folder)."""
+    """Recording to write; None: gait.rrd in the run's folder."""
 
 
 def main(words: Sequence[str]) -> int:

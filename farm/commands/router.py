@@ -20,7 +20,7 @@ class RouterCommand:
     """A standing rendezvous: learners, workers and viewers dial it; access control lives here."""
 
     listen: str | None = None
-    """Where it can be reached (default: tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447)."""
+    """Where it can be reached; None: tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it): the learner's bundle serves the router."""
     trust_network: bool = False

@@ -14,7 +14,7 @@ from learner.config import RunConfig
 class RunCommand:
     """Learner and local workers together: learns the gait and records it."""
 
-    options: LearnerOptions = field(default_factory=LearnerOptions)
+    learner: LearnerOptions = field(default_factory=LearnerOptions)
     """Where the run comes from and where it goes."""
     workers: int = 2
     """Worker processes on this machine."""
@@ -30,7 +30,7 @@ class RunCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, begin = parse(RunCommand, words, "farm run")
-    if command.options.tls is not None:
+    if command.learner.tls is not None:
         raise ConfigError("farm run is for one machine; with --tls start farm learner and farm worker")
     place = Place(workers=command.workers, listen=free_endpoint())
-    return learn(command.options, command.run, place, resumed, begin)
+    return learn(command.learner, command.run, place, resumed, begin)

@@ -36,17 +36,18 @@ def main(words: Sequence[str]) -> int:
         sys.stdout.write(json.dumps(rows, indent=2) + "\n")
         return 0
     table = Table()
-    for name in ("run", "state", "generation", "rollouts", "mean policy", "success", "robust", "parameters"):
-        table.add_column(name, justify="left" if name in ("run", "state", "parameters") else "right")
+    for name in ("run", "state", "generation", "return", "success", "robust", "hash"):
+        left = name in ("run", "state", "hash")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name != "run", overflow="fold")
     for row in rows:
         robust = row["robust_success_rate"]
         value = row["mean_policy_return"]
         table.add_row(
-            row["run"], row["state"], str(row["generations"]), str(row["rollouts"]),
+            row["run"], row["state"], str(row["generations"]),
             "" if value is None else f"{value:.3f}",
             {True: "yes", False: "no", None: ""}[row["mean_policy_success"]],
             "" if robust is None else f"{robust:.0%}",
-            (row["parameters_sha256"] or "")[:12],
+            (row["parameters_sha256"] or "")[:8],
         )  # fmt: skip
     Console().print(table)
     return 0

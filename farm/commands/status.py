@@ -29,7 +29,7 @@ class StatusCommand:
     """Which runs and workers a farm has, and how they are doing; refreshed until Ctrl-C on a terminal."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable (default: tcp/127.0.0.1:7447)."""
+    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
     farm: str = "farm"
     """Name of the farm."""
     tls: Path | None = None

@@ -19,7 +19,7 @@ class WorkerCommand:
     worker: WorkerConfig = field(default_factory=WorkerConfig)
     """Where they work."""
     processes: int | None = None
-    """Worker processes (default: one a core)."""
+    """Worker processes; None: one a core."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
