@@ -37,7 +37,8 @@ def hold(object_name: str, grip: str) -> None:
     far = np.full((1, policy.size), 50.0)  # so far from any joint position that the kernel is zero
     rollouts = Simulation(config, policy).run(far, [None], substeps=1)
     start = rollouts.start.pose
-    for seconds in SECONDS:
+    held = rollouts.outcome.steps[0] * 0.1
+    for seconds in (s for s in SECONDS if s <= held):
         frames = rollouts.start if seconds == 0 else rollouts.frames
         at = () if seconds == 0 else (round(seconds / TIMESTEP) - 1,)
         force = frames.force[(0, *at)].sum(axis=-1)

@@ -82,7 +82,7 @@ class _ClosedLoop:
         size = STATES[config.task.state].size
         rng = np.random.default_rng(0)
         policy = Policy(config.policy, size, Features.draw(config.policy, size, rng))
-        self._simulation = Simulation(config.task, policy, threads=cores)
+        self._simulation = Simulation(config.task, policy, threads=cores, capacity=200)
         self._theta = np.full((200, policy.size), STILL)
         draws: list[Perturbation | None] = [None] * 100
         if config.task.perturb:

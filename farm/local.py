@@ -165,6 +165,8 @@ def open_run(
         if resume:
             stack.enter_context(folder.held())
         at = _resumed(folder, config) if resume else start(config, folder.name)
+        if place.workers:
+            CpuBackend(specification(config, at))  # says in time what no worker could simulate
         link = stack.enter_context(_session(place, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:

@@ -57,7 +57,9 @@ class RunConfig:
 
 PRESETS: Final[dict[str, RunConfig]] = {
     "default": RunConfig(),
-    "thesis": RunConfig(task=TaskConfig(), policy=PolicyConfig(), algorithm=PGPE(sigma_rule="bare")),
+    "thesis": RunConfig(
+        task=TaskConfig(), policy=PolicyConfig(), algorithm=PGPE(normaliser="thesis", sigma_rule="bare")
+    ),
 }
 """Configurations by name: what learns most surely, and the thesis' own set-up."""
 

@@ -26,7 +26,7 @@ from farm.tasks.finger_gait import SUBSTEPS, FingerGait, Frames, Outcome, Pertur
 from workers.grip import Grasping
 
 CAPACITY: Final = 64
-"""Rollouts stepped together; more are done in turns."""
+"""Rollouts that a worker steps together; more are done in turns."""
 
 CLOSING: Final = 100
 """Physics steps in which a grip is closed round the frozen object."""
@@ -36,6 +36,9 @@ RAMP: Final = 50
 
 SETTLE: Final = 50
 """Physics steps from the release of the goal grip until its demonstration is recorded."""
+
+HOLD: Final = 200
+"""Physics steps from the release for which a grip must hold the object by itself to be taken."""
 
 _LIMIT: Final = 1e8  # a state beyond it has blown up, finite or not
 
@@ -66,12 +69,12 @@ class Rollouts:
 
 
 class Stepper:
-    """A mujoco.batch of CAPACITY simulations of one scene, with what is measured bound."""
+    """A mujoco.batch of simulations of one scene, with what is measured bound."""
 
-    def __init__(self, scene: Scene, *, perturbed: bool, threads: int = 1) -> None:
+    def __init__(self, scene: Scene, capacity: int, *, perturbed: bool, threads: int = 1) -> None:
         """Perturbed simulations have friction and mass of their own."""
         self.scene = scene
-        self.batch = mujoco.batch.Batch(scene.model, CAPACITY, threads)
+        self.batch = mujoco.batch.Batch(scene.model, capacity, threads)
         self.state: FloatArray = self.batch.state
         self.ctrl = self.batch.bind("ctrl")
         self._qpos = self.batch.bind("qpos")
@@ -133,8 +136,14 @@ class Stepper:
 class Simulation:
     """Simulates controllers of one run: closes the grips once, then runs rollouts."""
 
-    def __init__(self, config: TaskConfig, policy: Policy, threads: int = 1) -> None:
+    def __init__(self, config: TaskConfig, policy: Policy, threads: int = 1, capacity: int = CAPACITY) -> None:
         """Close start and goal grip, record the demonstration.
+
+        Args:
+          config: the task.
+          policy: the controller.
+          threads: of the physics; the rest of a step runs on one.
+          capacity: rollouts stepped together; more are done in turns.
 
         Raises:
           ConfigError: unknown object, one that the fingers cannot reach, or a grip that does not hold it.
@@ -145,9 +154,9 @@ class Simulation:
         grasping = Grasping(self.scene)
         self._waiting = grasping.command(())
         self._commands = grasping.command(GRIPS[config.start_grip])
-        self._nominal = Stepper(self.scene, perturbed=False, threads=threads)
+        self._nominal = Stepper(self.scene, capacity, perturbed=False, threads=threads)
         self._perturbed: Stepper | None = None
-        self._threads = threads
+        self._threads, self._capacity = threads, capacity
         self._demonstrate(config.start_grip, self._commands)
         goal = self._demonstrate(config.goal_grip, grasping.command(GRIPS[config.goal_grip]))
         self.task = FingerGait(config, goal, self._commands)
@@ -167,7 +176,7 @@ class Simulation:
         parts, done = [], 0
         nominal = sum(p is None for p in perturbations)
         while done < len(order):
-            stop = min(done + CAPACITY, nominal if done < nominal else len(order))
+            stop = min(done + self._capacity, nominal if done < nominal else len(order))
             chosen = order[done:stop]
             parts.append(self._run(theta[chosen], [perturbations[i] for i in chosen], substeps))
             done = stop
@@ -210,7 +219,7 @@ class Simulation:
             self._nominal.state[:count] = start.rows
             return self._nominal, start, None
         if self._perturbed is None:
-            self._perturbed = Stepper(self.scene, perturbed=True, threads=self._threads)
+            self._perturbed = Stepper(self.scene, self._capacity, perturbed=True, threads=self._threads)
         first = {id(p): i for i, p in reversed(list(enumerate(real)))}
         own = sorted(first.values())
         self._perturbed.set_conditions(real)
@@ -249,7 +258,8 @@ class Simulation:
         ids = np.zeros(1, dtype=np.int64)
         self._nominal.step(ids, SETTLE)
         frames = self._nominal.frames(ids)
-        if not touching(frames.force)[0]:
+        self._nominal.step(ids, HOLD - SETTLE)
+        if not touching(self._nominal.frames(ids).force)[0]:
             raise ConfigError(f"grip {grip!r} does not hold object {self.scene.object_name!r}; take another grip")
         images = tactile.image(frames.force, frames.place)
         return Demonstration(joints=frames.joints[0], images=images[0], points=tactile.contact_points(images)[0])

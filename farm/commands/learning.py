@@ -66,7 +66,7 @@ def _conclude(run: Run, place: Place) -> None:
         )
     lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
     if summary["state"] == "interrupted":
-        lines.append(f"go on with: farm run --resume {folder}")
+        lines.append(f"go on with: farm {'run' if place.workers else 'learner'} --resume {folder}")
     elif place.record:
         lines.append(f"look at it with: farm view {folder}")
     sys.stdout.write("\n".join(lines) + "\n")

@@ -14,7 +14,7 @@ _SAMPLES = 64
 class LedgerConfig:
     """How jobs are handed out, and when one is given to a second worker or given up."""
 
-    chunk_seconds: float = 0.08
+    chunk_seconds: float = 0.2
     """Work sent to a worker in one message [s], by the running median."""
     least_seconds: float = 0.015
     """Towards the end of a round chunks shrink down to this [s]: rollouts in small batches are slower."""

@@ -147,17 +147,14 @@ def test_a_learner_behind_a_router_killed_and_back(farm: Farm, check: Check) -> 
     check("learner behind a router killed and back", 15, away)
 
 
-def test_a_second_learner_of_one_name_is_refused(farm: Farm, check: Check) -> None:
+def test_a_second_learner_of_one_name_is_refused(farm: Farm) -> None:
     endpoint = free_endpoint()
     farm.start("router", "--listen", endpoint)
-    learner = farm.start("learner", "--connect", endpoint, *SETTINGS)
-    farm.start("worker", "--connect", endpoint, "--processes", "2")
-    running(farm)
+    farm.start("learner", "--connect", endpoint, *SETTINGS)
+    farm.wait_for(lambda: (farm.folder / "runs/r/log.txt").exists())
     said = farm.call("learner", "--connect", endpoint, "--out", "elsewhere", *SETTINGS, status=2)
     assert "a learner of run r is on farm farm already: take another --name" in said
     assert not (farm.folder / "elsewhere").exists()
-    finish(learner)
-    check("second learner with the same run name", 5)
 
 
 def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:

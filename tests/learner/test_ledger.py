@@ -10,7 +10,7 @@ from learner.ledger.ledger import Assignment, Ledger, LedgerConfig
 
 def started(jobs, workers=(), *, credits=4, seconds=None, **config):
     """Return a ledger in a round of `jobs`; `seconds` a job are known from a round before."""
-    ledger = Ledger(LedgerConfig(**config))
+    ledger = Ledger(LedgerConfig(**{"chunk_seconds": 0.08, **config}))
     if seconds is not None:
         ledger.begin(1)
         ledger.want("teacher", 1, now=-seconds)
