@@ -30,11 +30,13 @@ from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.admission import Admission
 from learner.algorithms import Diverged
+from learner.beginning import specification, start
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.dispatcher import Dispatcher, Stopped
+from learner.evaluation import Evaluation
 from learner.folder import RunFolder
-from learner.learner import Evaluation, Learner, Report, specification, start
+from learner.learner import Learner, Report
 from learner.ledger.ledger import LedgerConfig
 from workers.backends.cpu import CpuBackend
 from workers.pool import Pool

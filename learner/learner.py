@@ -5,39 +5,29 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from farm import randomness
 from farm.arrays import AnyArray, FloatArray
-from farm.errors import CheckpointError, ConfigError, RunError
+from farm.errors import CheckpointError, RunError
 from farm.messages import Job, Result, Spec
-from farm.policy import Features, Policy
-from farm.states import STATES
 from farm.trajectory import Trajectory
-from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.algorithms import PGPEState
+from learner.beginning import specification
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.dispatcher import Dispatcher
+from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, evaluation_jobs, mean_job
 from learner.folder import RunFolder
 from learner.progress import Progress
 
 log = logging.getLogger(__name__)
 
-EVALUATION_ROLLOUTS: Final = 100
-"""Rollouts of the evaluation at the end of a run, and of a plain `farm evaluate`."""
-
-EVALUATION_SEED: Final = 0
-"""Its seed."""
-
 REPLAY_EVERY: Final = 10
 """Generations between two recordings of the best rollout at physics rate: near its end, most bring a new best."""
-
-_ZERO: Final = np.empty(0)  # an eps of zeros, on the wire
 
 
 @dataclass(frozen=True)
@@ -55,28 +45,6 @@ class Report:
     """The best rollout so far at physics rate, once there is a new one."""
     replay_generation: int
     """The generation the replayed rollout came from."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The end of a run: the mean policy, unperturbed and perturbed."""
-
-    mean: Result
-    """One rollout under nominal conditions, at physics rate."""
-    robust_success_rate: float
-    """Part of the perturbed rollouts that succeeded."""
-    replay: Trajectory | None
-    """The best rollout of the run at physics rate, if it has not been shown yet."""
-
-
-def evaluation_jobs(rollouts: int, seed: int) -> list[Job]:
-    """The mean policy on perturbed starts, and last on the nominal one at physics rate."""
-    trials = [_mean_job(i, rate="none", perturbation=randomness.trial(seed, i)) for i in range(rollouts)]
-    return [*trials, _mean_job(rollouts, rate="physics", perturbation=None)]
-
-
-def _mean_job(index: int, rate: str, perturbation: tuple[int, ...] | None) -> Job:
-    return Job(index=index, origin="mu", signs=(1,), perturbation=perturbation, rate=rate, eps=_ZERO)
 
 
 class Learner:
@@ -216,7 +184,7 @@ class Learner:
             )
             for i, row in enumerate(eps)
         ]
-        jobs.append(_mean_job(len(jobs), rate="control", perturbation=None))
+        jobs.append(mean_job(len(jobs), rate="control", perturbation=None))
         replay = self._replay_job(len(jobs)) if state.generation % REPLAY_EVERY == 0 else []
         farm.begin(state.generation, state.mu, state.sigma, [*jobs, *replay])
         return eps
@@ -291,53 +259,6 @@ class Learner:
     def _save(self, progress: Progress) -> None:
         self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
         self.folder.save(self._at)
-
-
-def start(config: RunConfig, run: str) -> Checkpoint:
-    """A run before its first generation.
-
-    Raises:
-      ConfigError: the run to start from cannot be used.
-    """
-    size = STATES[config.task.state].size
-    features = Features.draw(config.policy, size, randomness.features(config.seed))
-    state = config.algorithm.init(_policy(config, features).size)
-    if config.init_from is not None:
-        state, features = _taken_over(config, state)
-    return Checkpoint(
-        run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
-        solved=0, best=None, best_generation=0, canary=None, replayed=True,
-        frequencies=features.frequencies, phases=features.phases,
-    )  # fmt: skip
-
-
-def specification(config: RunConfig, at: Checkpoint) -> Spec:
-    """What a run simulates, for workers."""
-    settings = configs.to_dict(config)
-    return Spec(
-        run=at.run, task="finger-gait", task_config=settings["task"], policy_config=settings["policy"],
-        frequencies=at.frequencies, phases=at.phases,
-    )  # fmt: skip
-
-
-def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Features]:
-    """Start from another run: its mean, perhaps its sigma, and the features that its parameters belong to."""
-    other = RunFolder.open(Path(str(config.init_from)))
-    theirs = other.read_config()
-    for there, here in ((theirs.policy, config.policy), (theirs.task.state, config.task.state)):
-        if there != here:
-            raise ConfigError(
-                f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"
-            )
-    at = checkpoints.load(other.checkpoint)
-    state = replace(fresh, mu=at.state["mu"])
-    if config.init_sigma == "run":
-        state = replace(state, sigma=at.state["sigma"])
-    return state, Features(at.frequencies, at.phases)
-
-
-def _policy(config: RunConfig, features: Features) -> Policy:
-    return Policy(config.policy, STATES[config.task.state].size, features)
 
 
 def _trajectory(result: Result) -> Trajectory | None:

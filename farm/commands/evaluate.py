@@ -16,8 +16,8 @@ from farm import arguments
 from farm.errors import ConfigError
 from farm.local import simulate
 from farm.randomness import SEEDS
+from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
 from learner.folder import RunFolder
-from learner.learner import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,8 @@ from farm import arguments
 from farm import scene as scenes
 from farm.errors import RunError
 from farm.local import check_rerun, simulate
+from learner.evaluation import evaluation_jobs
 from learner.folder import RunFolder
-from learner.learner import evaluation_jobs
 
 
 @dataclass(frozen=True, kw_only=True)

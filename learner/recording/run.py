@@ -10,7 +10,8 @@ from farm.tasks.finger_gait import CONTROL_PERIOD
 from farm.trajectory import Trajectory
 from learner import config as configs
 from learner.config import RunConfig
-from learner.learner import Evaluation, Learner, Report
+from learner.evaluation import Evaluation
+from learner.learner import Learner, Report
 from learner.recording.recorder import Recorder
 from learner.recording.thread import RecorderThread
 

@@ -1,0 +1,122 @@
+"""A farm whose workers die and join at random, for as long as you like: memory, and the numbers in the end.
+
+    python benchmarks/soak.py [--minutes 60] [--every 3]
+
+A learner runs while, every few seconds, a worker is killed or another one joins (one to four at a
+time). Then the same number of generations is learnt again with nobody disturbed: the hashes must agree.
+"""
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from farm.local import Place, free_endpoint, open_run
+from learner.config import RunConfig
+
+MOST = 4  # workers at a time
+
+
+class Crowd:
+    """Workers that come and go."""
+
+    def __init__(self, endpoint: str, every: float) -> None:
+        self.killed = self.joined = 0
+        self.megabytes: list[float] = []
+        self._command = [sys.executable, "-m", "workers", "--connect", endpoint, "--log-level", "ERROR"]
+        self._random, self._every = random.Random(0), every
+        self._over = threading.Event()
+        self._workers: list[subprocess.Popen[bytes]] = []
+        self._thread = threading.Thread(target=self._live)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End them all."""
+        self._over.set()
+        self._thread.join()
+        for worker in self._workers:
+            worker.terminate()
+            worker.wait()
+
+    def _live(self) -> None:
+        self._join()
+        while not self._over.wait(self._every):
+            self.megabytes.append(max(_megabytes(worker.pid) for worker in self._workers))
+            if len(self._workers) == MOST or (len(self._workers) > 1 and self._random.random() < 0.5):
+                self._kill()
+            else:
+                self._join()
+
+    def _join(self) -> None:
+        self._workers.append(subprocess.Popen(self._command))
+        self.joined += 1
+
+    def _kill(self) -> None:
+        worker = self._workers.pop(self._random.randrange(len(self._workers)))
+        worker.send_signal(signal.SIGKILL)
+        worker.wait()
+        self.killed += 1
+
+
+def main() -> None:
+    """Soak, learn again, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--every", type=float, default=3.0, help="seconds between two changes among the workers")
+    arguments = parser.parse_args()
+    config = RunConfig(generations=1_000_000)
+    with tempfile.TemporaryDirectory() as folder:
+        soaked, crowd, learner = _soak(config, Path(folder) / "soaked", arguments.minutes * 60, arguments.every)
+        calm = replace(config, generations=soaked["generations"])
+        place = Place(workers=2, listen=free_endpoint(), record=False)
+        with open_run(calm, Path(folder) / "calm", place) as run:
+            for _ in run.learn():
+                pass
+    print("| minutes | generations | rollouts | killed | joined | re-issued | learner MB | worker MB | same hash |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    print(
+        f"| {arguments.minutes:g} | {soaked['generations']} | {soaked['rollouts']} | {crowd.killed} | {crowd.joined} "
+        f"| {soaked['reissued']} | {_from_to(learner)} | {_from_to(crowd.megabytes)} "
+        f"| {'yes' if soaked['parameters_sha256'] == run.summary['parameters_sha256'] else 'NO'} |"
+    )
+    if soaked["parameters_sha256"] != run.summary["parameters_sha256"]:
+        sys.exit(1)
+
+
+def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[dict[str, object], Crowd, list[float]]:
+    until, learner = time.monotonic() + seconds, []
+    place = Place(listen=free_endpoint(), record=False)
+    with open_run(config, path, place, stopped=lambda: time.monotonic() > until) as run:
+        crowd = Crowd(place.listen, every)
+        try:
+            for report in run.learn():
+                if report.progress.generation % 20 == 0:
+                    learner.append(_megabytes(os.getpid()))
+        finally:
+            crowd.close()
+    return run.summary, crowd, learner
+
+
+def _megabytes(pid: int) -> float:
+    """Resident memory of a process; 0 when it has just ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:
+        return 0.0
+
+
+def _from_to(megabytes: list[float]) -> str:
+    """Largest in the first and in the last quarter."""
+    quarter = max(1, len(megabytes) // 4)
+    return f"{max(megabytes[:quarter]):.0f} to {max(megabytes[-quarter:]):.0f}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""How a run begins: its first state, its random features, and what its workers are told."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from farm import randomness
+from farm.errors import ConfigError
+from farm.messages import Spec
+from farm.policy import Features, Policy
+from farm.states import STATES
+from learner import checkpoint as checkpoints
+from learner import config as configs
+from learner.algorithms import PGPEState
+from learner.checkpoint import Checkpoint
+from learner.config import RunConfig
+from learner.folder import RunFolder
+
+
+def start(config: RunConfig, run: str) -> Checkpoint:
+    """A run before its first generation.
+
+    Raises:
+      ConfigError: the run to start from cannot be used.
+    """
+    size = STATES[config.task.state].size
+    features = Features.draw(config.policy, size, randomness.features(config.seed))
+    state = config.algorithm.init(_policy(config, features).size)
+    if config.init_from is not None:
+        state, features = _taken_over(config, state)
+    return Checkpoint(
+        run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
+        solved=0, best=None, best_generation=0, canary=None, replayed=True,
+        frequencies=features.frequencies, phases=features.phases,
+    )  # fmt: skip
+
+
+def specification(config: RunConfig, at: Checkpoint) -> Spec:
+    """What a run simulates, for workers."""
+    settings = configs.to_dict(config)
+    return Spec(
+        run=at.run, task="finger-gait", task_config=settings["task"], policy_config=settings["policy"],
+        frequencies=at.frequencies, phases=at.phases,
+    )  # fmt: skip
+
+
+def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Features]:
+    """Start from another run: its mean, perhaps its sigma, and the features that its parameters belong to."""
+    other = RunFolder.open(Path(str(config.init_from)))
+    theirs = other.read_config()
+    for there, here in ((theirs.policy, config.policy), (theirs.task.state, config.task.state)):
+        if there != here:
+            raise ConfigError(
+                f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"
+            )
+    at = checkpoints.load(other.checkpoint)
+    state = replace(fresh, mu=at.state["mu"])
+    if config.init_sigma == "run":
+        state = replace(state, sigma=at.state["sigma"])
+    return state, Features(at.frequencies, at.phases)
+
+
+def _policy(config: RunConfig, features: Features) -> Policy:
+    return Policy(config.policy, STATES[config.task.state].size, features)
