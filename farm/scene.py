@@ -1,6 +1,5 @@
 """Assets to a compiled MuJoCo model with named indices; one of the two doors to mujoco."""
 
-import hashlib
 from dataclasses import dataclass
 from typing import Final
 
@@ -55,8 +54,6 @@ class Scene:
 
     model: mujoco.MjModel
     object_name: str
-    digest: str
-    """Hash of the assets the model was made of."""
 
     @property
     def object_qpos(self) -> slice:
@@ -154,5 +151,4 @@ def load(object_name: str) -> Scene:
     parts["object.xml"] = assets.path(f"objects/{object_name}.xml").read_bytes()
     includes = "".join(f'<include file="{name}"/>' for name in parts)
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{includes}</mujoco>", assets=parts)
-    digest = hashlib.sha256(b"".join(parts.values())).hexdigest()
-    return Scene(model=model, object_name=object_name, digest=digest)
+    return Scene(model=model, object_name=object_name)
