@@ -27,7 +27,7 @@ from farm.policy import Features, Policy
 from farm.states import STATES
 from farm.tasks.finger_gait import SUBSTEPS, Perturbation
 from learner.config import PRESETS, RunConfig
-from learner.learner import Report
+from learner.report import Report
 from workers.simulation import CLOSING, Simulation
 
 STILL = 50.0  # every parameter: so far from any joint position that the kernel is zero

@@ -1,4 +1,4 @@
-"""How surely a preset learns: runs of several seeds, one table (docs/results.md holds ours).
+"""How surely a preset learns: runs of several seeds, one table (docs/seeds.md holds ours).
 
     python benchmarks/seeds.py [--preset default] [--seeds 10] [--out runs/seeds-default]
 

@@ -3,7 +3,8 @@
     python benchmarks/soak.py [--minutes 60] [--every 3]
 
 A learner runs while, every few seconds, a worker is killed or another one joins (one to four at a
-time). Then the same number of generations is learnt again with nobody disturbed: the hashes must agree.
+time). Then the same number of generations is learnt again with nobody disturbed: the hashes must agree, and memory
+must not have grown; the exit status says so.
 """
 
 import argparse
@@ -87,7 +88,9 @@ def main() -> None:
         f"| {'yes' if soaked['parameters_sha256'] == run.summary['parameters_sha256'] else 'NO'} |"
     )
     if soaked["parameters_sha256"] != run.summary["parameters_sha256"]:
-        sys.exit(1)
+        sys.exit("other numbers than undisturbed")
+    if not _flat(learner) or not _flat(crowd.megabytes):
+        sys.exit("memory grows")
 
 
 def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[dict[str, object], Crowd, list[float]]:
@@ -110,6 +113,12 @@ def _megabytes(pid: int) -> float:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
     except OSError:
         return 0.0
+
+
+def _flat(megabytes: list[float]) -> bool:
+    """Whether the last quarter needs hardly more than the first."""
+    quarter = max(1, len(megabytes) // 4)
+    return max(megabytes[-quarter:]) < 1.1 * max(megabytes[:quarter]) + 10
 
 
 def _from_to(megabytes: list[float]) -> str:

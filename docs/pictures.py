@@ -1,52 +1,53 @@
 """Makes the pictures of the documentation that come from the code itself.
 
-    MUJOCO_GL=egl python docs/pictures.py [--out docs/pictures]
+    MUJOCO_GL=egl python docs/pictures.py [--out docs/pictures] [--run runs/NAME]
 
 hand.png: the hand waiting, in the start grip, in the goal grip. tactile.svg: where the taxels are, and what
-one contact gives. (viewer.png is the Rerun viewer on a run's recording.) Needs the extra `learner`: it brings pillow.
+one contact gives. gait.gif, with --run: a run's first and last policy, from `farm run --seed 0`. (viewer.png is the
+Rerun viewer on a run's recording.) Needs the extra `video`.
 """
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-import assets
-from farm import tactile
+from farm import rendering, tactile, video
 from farm.arrays import FloatArray
+from farm.finished import again
 from farm.hand import TIP_RADIUS
 from farm.policy import Features, Policy, PolicyConfig
-from farm.scene import load
+from farm.scene import CONTACTS, load
 from farm.states import STATES
-from farm.tasks.finger_gait import TaskConfig
+from farm.tasks.finger_gait import Frames, TaskConfig
+from learner.folder import RunFolder
 from workers.grip import Grasping
 from workers.simulation import Simulation
 
 PANEL: Final = (400, 450)
 """Width and height of one hand [pixels]."""
 
-_SMOOTH: Final = 2  # rendered so much larger, for smooth edges
-_LIGHT: Final = """<mujoco>
-  <include file="hand.xml"/><include file="finger_gait.xml"/><include file="object.xml"/>
-  <asset><texture type="skybox" builtin="flat" rgb1="0.94 0.95 0.96" width="64" height="64"/></asset>
-  <visual>
-    <global offwidth="1600" offheight="1600"/><headlight ambient="0.45 0.45 0.45" diffuse="0.55 0.55 0.55"/>
-  </visual>
-</mujoco>"""
+SIDE: Final = (400, 340)
+"""Width and height of one hand of the animation [pixels]."""
+
 _RAMP: Final = np.array([[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float)
 
 
 def main() -> None:
-    """Make both."""
+    """Make them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "pictures")
-    out = parser.parse_args().out
+    parser.add_argument("--run", type=Path)
+    chosen = parser.parse_args()
+    out = chosen.out
     out.mkdir(parents=True, exist_ok=True)
     (out / "tactile.svg").write_text(tactile_picture(), "utf-8")
     hand_picture().save(out / "hand.png", optimize=True)
+    if chosen.run is not None:
+        video.write(out / "gait.gif", gait_video(chosen.run))
 
 
 def hand_picture() -> Image.Image:
@@ -83,20 +84,34 @@ def _held(grip: str) -> FloatArray:
 
 
 def _photograph(qpos: FloatArray) -> Image.Image:
-    width, height = PANEL[0] * _SMOOTH, PANEL[1] * _SMOOTH
-    files = {name: assets.path(name).read_bytes() for name in ("hand.xml", "finger_gait.xml")}
-    files["object.xml"] = assets.path("objects/bar.xml").read_bytes()
-    model = mujoco.MjModel.from_xml_string(_LIGHT, assets=files)
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = (0.025, 0.009, -0.006)
-    camera.distance, camera.azimuth, camera.elevation = 0.4, 158.0, -12.0
-    with mujoco.Renderer(model, height, width) as renderer:
-        renderer.update_scene(data, camera)
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = 0
-        return Image.fromarray(renderer.render()).resize(PANEL, Image.Resampling.LANCZOS)
+    still = Frames(qpos[None], np.zeros((1, 3, CONTACTS)), np.zeros((1, 3, CONTACTS, 3)))
+    (picture,) = rendering.pictures("bar", still, PANEL, distance=0.4, glow=False)
+    return Image.fromarray(picture)
+
+
+def gait_video(run: Path) -> Iterator[rendering.Picture]:
+    """The run's first and last policy beside each other, a third of real time."""
+    shown = {
+        "before learning": again(RunFolder.open(run), generation=0),
+        "after learning": again(RunFolder.open(run)),
+    }
+    longest = max((part.trajectory.times for part in shown.values()), key=len)
+    chosen = video.moments(longest.tolist(), speed=1 / 3, rest=1.5)
+    sides = []
+    for name, part in shown.items():
+        rows = [min(moment, len(part.trajectory.times) - 1) for moment in chosen]
+        moments = sorted(set(rows))
+        drawn = dict(zip(moments, rendering.pictures("bar", part.frames.at(moments), SIDE), strict=True))
+        sides.append([_named(drawn[row], name) for row in rows])
+    return (np.concatenate(pair, axis=1) for pair in zip(*sides, strict=True))
+
+
+def _named(picture: rendering.Picture, name: str) -> rendering.Picture:
+    """A caption below the hand."""
+    image = Image.fromarray(picture)
+    at = SIDE[0] // 2, SIDE[1] - 20
+    ImageDraw.Draw(image).text(at, name, (40, 44, 52), ImageFont.load_default(18), anchor="mm")
+    return np.asarray(image)
 
 
 def tactile_picture() -> str:

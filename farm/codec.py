@@ -10,7 +10,7 @@ import functools
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sized
 from typing import Any, Final, TypeVar
 
 import msgpack
@@ -27,14 +27,16 @@ MAX_BYTES: Final = 64 * 1024 * 1024
 
 _ARRAY: Final = 1  # msgpack's extension code
 _DTYPES: Final = ("<f8", "<f4", "<i8", "|b1")
-_LISTS: Final = 100_000
+_LENGTH: Final = 10_000  # items of one list or map
+_ITEMS: Final = 500_000  # of all lists and maps of a message: outside of arrays there is little to say
 
 M = TypeVar("M")
+C = TypeVar("C", bound=Sized)
 
 
 def array(dtype: str, ndim: int) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
     """A dataclass field for an array of that dtype and number of dimensions; floats must be finite."""
-    return dataclasses.field(metadata={"dtype": dtype, "ndim": ndim})
+    return dataclasses.field(metadata={"dtype": np.dtype(dtype), "ndim": ndim})
 
 
 def encode(message: object) -> bytes:
@@ -56,7 +58,11 @@ def decode(payload: bytes, kind: type[M]) -> M:
         structure = msgpack.Unpacker(max_buffer_size=max(len(payload), 1))
         structure.feed(payload)
         structure.skip()  # every length it announces is there: nothing is allocated for a promise
-        body = msgpack.unpackb(payload, ext_hook=_unpack, strict_map_key=True, max_array_len=_LISTS, max_map_len=_LISTS)
+        items = _Items()
+        body = msgpack.unpackb(
+            payload, ext_hook=_unpack, list_hook=items.count, object_hook=items.count, strict_map_key=True,
+            max_array_len=_LENGTH, max_map_len=_LENGTH,
+        )  # fmt: skip
     except MessageError:
         raise
     except Exception as error:  # msgpack and its hooks raise many kinds
@@ -82,25 +88,56 @@ def _plain(value: Any) -> dict[str, Any]:  # noqa: ANN401
 
 def _pack(value: object) -> object:
     if isinstance(value, np.ndarray):
-        head = bytes(msgpack.packb([value.dtype.str, list(value.shape)]) or b"")
-        return msgpack.ExtType(_ARRAY, head + np.ascontiguousarray(value).tobytes())
+        return msgpack.ExtType(_ARRAY, _head(value.dtype.str, value.shape) + value.tobytes())
     if dataclasses.is_dataclass(value):
         return _plain(value)
     raise TypeError(f"cannot send a {type(value).__name__}")
 
 
+class _Items:
+    """Keeps an unpacked message's memory within its bytes: a list of empty lists takes 60 times its own."""
+
+    def __init__(self) -> None:
+        self._left = _ITEMS
+
+    def count(self, container: C) -> C:
+        """A list or map that is complete.
+
+        Raises:
+          MessageError: too much in all.
+        """
+        self._left -= 1 + len(container)
+        if self._left < 0:
+            raise MessageError(f"more than {_ITEMS} items", "large")
+        return container
+
+
+@functools.lru_cache(1000)
+def _head(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """What stands before an array's bytes: its own length in a byte, dtype and shape."""
+    head = bytes(msgpack.packb([dtype, shape]) or b"")
+    return bytes([len(head)]) + head
+
+
 def _unpack(code: int, payload: bytes) -> AnyArray:
     if code != _ARRAY:
         raise MessageError(f"unknown extension {code}")
-    unpacker = msgpack.Unpacker(max_array_len=16, max_buffer_size=200)
-    unpacker.feed(payload[:200])
-    dtype, shape = unpacker.unpack()
+    end = 1 + (payload[0] if payload else 0)
+    dtype, shape, size = _announced(payload[1:end])
+    raw = memoryview(payload)[end:]
+    if size != len(raw):
+        raise MessageError(f"an array of shape {shape} in {len(raw)} bytes")
+    return np.frombuffer(raw, dtype=dtype).reshape(shape)
+
+
+@functools.lru_cache(1000)
+def _announced(head: bytes) -> tuple["np.dtype[Any]", tuple[int, ...], int]:
+    """What an array's head promises: dtype, shape, and size [bytes]."""
+    dtype, shape = msgpack.unpackb(head, max_array_len=16)
     if dtype not in _DTYPES or not all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape) or len(shape) > 4:
         raise MessageError("an array of an unknown kind")
-    raw = memoryview(payload)[unpacker.tell() :]
-    if math.prod(shape) * np.dtype(dtype).itemsize != len(raw):
-        raise MessageError(f"an array of shape {tuple(shape)} in {len(raw)} bytes")
-    return np.frombuffer(raw, dtype=dtype).reshape(shape)
+    kind = np.dtype(dtype)
+    return kind, tuple(shape), math.prod(shape) * kind.itemsize
 
 
 def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
@@ -113,39 +150,64 @@ def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
     if unknown or missing:
         names = ", ".join(sorted(str(name)[:40] for name in unknown | missing))
         raise MessageError(f"{kind.__name__}: unknown or missing {names}")
-    made = {name: _value(f"{kind.__name__}.{name}", *field, value[name]) for name, field in fields.items()}
+    made = {name: check(value[name]) for name, check in fields.items()}
     try:
         return kind(**made)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise MessageError(f"{kind.__name__}: {error}") from None
 
 
+Check = Callable[[Any], Any]
+"""Gives back what a field shall hold, or raises MessageError."""
+
+
 @functools.cache
-def _fields(kind: type) -> dict[str, tuple[Any, Mapping[str, Any]]]:
-    """Annotation and metadata of each field: working them out takes longer than reading a message."""
+def _fields(kind: type) -> dict[str, Check]:
+    """What each field may hold: working that out takes longer than reading a message."""
     hints = typing.get_type_hints(kind)
-    return {field.name: (hints[field.name], field.metadata) for field in dataclasses.fields(kind)}
+    return {
+        field.name: _check(f"{kind.__name__}.{field.name}", hints[field.name], field.metadata)
+        for field in dataclasses.fields(kind)
+    }
 
 
-def _value(name: str, hint: Any, metadata: Any, value: Any) -> Any:  # noqa: ANN401, PLR0911
+def _check(name: str, hint: Any, metadata: Mapping[str, Any]) -> Check:  # noqa: ANN401
+    """How to check a field of that annotation."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if "dtype" in metadata:
-        return _array(name, metadata, value)
+        return functools.partial(_array, name, metadata["dtype"], metadata["ndim"])
     if origin is types.UnionType:
-        if value is None:
-            return None
-        return _value(name, next(h for h in inner if h is not type(None)), metadata, value)
-    if origin is tuple and isinstance(value, list):
-        return tuple(_value(name, inner[0], metadata, item) for item in value)
+        some = _check(name, next(h for h in inner if h is not type(None)), metadata)
+        return lambda value: None if value is None else some(value)
+    if origin is tuple:
+        return functools.partial(_tuple, name, hint, _check(name, inner[0], metadata))
     if dataclasses.is_dataclass(hint):
-        return _build(typing.cast("type", hint), value)
-    if hint is float and type(value) in (int, float) and math.isfinite(value):
+        return functools.partial(_build, hint)
+    if hint is float:
+        return functools.partial(_float, name)
+    return functools.partial(_exactly, name, hint, dict if origin is dict else hint)
+
+
+def _exactly(name: str, hint: Any, kind: type, value: object) -> object:  # noqa: ANN401
+    if type(value) is kind:
+        return value
+    raise _mismatch(name, hint, value)
+
+
+def _float(name: str, value: Any) -> float:  # noqa: ANN401
+    if type(value) in (int, float) and math.isfinite(value):
         return float(value)
-    if origin is dict and isinstance(value, dict):
-        return value
-    if hint in (int, bool, str) and type(value) is hint:
-        return value
-    raise MessageError(f"{name}: {_brief(value)!r} is not a {hint}")
+    raise _mismatch(name, float, value)
+
+
+def _tuple(name: str, hint: Any, item: Check, value: object) -> tuple[Any, ...]:  # noqa: ANN401
+    if type(value) is list:
+        return tuple(item(one) for one in value)
+    raise _mismatch(name, hint, value)
+
+
+def _mismatch(name: str, hint: Any, value: object) -> MessageError:  # noqa: ANN401
+    return MessageError(f"{name}: {_brief(value)!r} is not a {hint}")
 
 
 def _brief(value: object) -> str:
@@ -153,11 +215,11 @@ def _brief(value: object) -> str:
     return str(value)[:40] if value is None or isinstance(value, (str, int, float)) else type(value).__name__
 
 
-def _array(name: str, metadata: Any, value: object) -> AnyArray:  # noqa: ANN401
-    if not isinstance(value, np.ndarray) or value.dtype.str != metadata["dtype"] or value.ndim != metadata["ndim"]:
-        raise MessageError(f"{name}: expected an array {metadata['dtype']} of {metadata['ndim']} dimensions")
-    if value.dtype.kind == "f" and not np.isfinite(value).all():
+def _array(name: str, dtype: "np.dtype[Any]", ndim: int, value: object) -> AnyArray:
+    if not isinstance(value, np.ndarray) or value.dtype != dtype or value.ndim != ndim:
+        raise MessageError(f"{name}: expected an array {dtype.str} of {ndim} dimensions")
+    if dtype.kind == "f" and not np.isfinite(value).all():
         raise MessageError(f"{name}: not finite")
-    if value.dtype.kind == "b" and (value.view(np.uint8) > 1).any():
+    if dtype.kind == "b" and value.view(np.uint8).max(initial=0) > 1:
         raise MessageError(f"{name}: not true or false")
     return value

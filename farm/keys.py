@@ -8,6 +8,8 @@
 <farm>/run/<run>/generation        published and queryable: the round that is on
 <farm>/run/<run>/result/<worker>   results
 <farm>/run/<run>/status            queryable: how it is doing
+<farm>/run/<run>/report            published: a generation that is over
+<farm>/run/<run>/history           queryable, ?from=<generation>: reports so far; published, empty, when the run is over
 <farm>/refused/<worker>            why a learner gives a worker no jobs
 """
 
@@ -16,7 +18,7 @@ from typing import Final
 
 from farm.errors import ConfigError
 
-_NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,100}")
+_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,100}")  # dots alone would be a folder above
 
 
 def checked(kind: str, name: str) -> str:
@@ -68,6 +70,16 @@ def result(farm: str, run: str, worker: str) -> str:
 def status(farm: str, run: str) -> str:
     """Where a learner answers how its run is doing; run `*` for all."""
     return f"{farm}/run/{run}/status"
+
+
+def report(farm: str, run: str) -> str:
+    """Where a learner publishes each generation that is over."""
+    return f"{farm}/run/{run}/report"
+
+
+def history(farm: str, run: str) -> str:
+    """Where a learner answers what it reported so far; something is published there when the run is over."""
+    return f"{farm}/run/{run}/history"
 
 
 def refused(farm: str, worker: str) -> str:

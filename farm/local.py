@@ -13,16 +13,16 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import assets
-from farm import keys, session
-from farm import scene as scenes
+from farm import keys, session, tasks
 from farm.errors import CheckpointError, ConfigError, RunError
 from farm.messages import Job, Result
+from farm.reports import WorkerStatus
 from farm.scene import Scene
 from farm.session import Session
 from farm.tls import Bundle
@@ -31,13 +31,16 @@ from learner import config as configs
 from learner.admission import Admission
 from learner.algorithms import Diverged
 from learner.beginning import specification, start
+from learner.broadcast import Broadcast
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.dispatcher import Dispatcher, Stopped
 from learner.evaluation import Evaluation
 from learner.folder import RunFolder
-from learner.learner import Learner, Report
+from learner.learner import Learner
 from learner.ledger.ledger import LedgerConfig
+from learner.report import Report
+from workers.backends import BACKENDS
 from workers.backends.cpu import CpuBackend
 from workers.pool import Pool
 
@@ -59,6 +62,8 @@ class Place:
 
     workers: int = 0
     """Local worker processes."""
+    backend: str = "cpu"
+    """What they simulate with."""
     listen: str = LISTEN
     """Where workers dial."""
     connect: tuple[str, ...] = ()
@@ -82,9 +87,17 @@ class Place:
 class Run:
     """A run that is open: iterate over `learn`, then `finish`."""
 
-    def __init__(self, learner: Learner, farm: Dispatcher, recording: "Recording | None", pool: Pool | None) -> None:
+    def __init__(
+        self,
+        learner: Learner,
+        farm: Dispatcher,
+        broadcast: Broadcast,
+        recording: "Recording | None",
+        pool: Pool | None,
+    ) -> None:
         """Made by `open_run`."""
         self.learner, self._farm, self._recording, self._pool = learner, farm, recording, pool
+        self._broadcast = broadcast
         self.summary: dict[str, Any] = {}
         """What summary.json says, once it is over."""
 
@@ -92,6 +105,16 @@ class Run:
     def worker_pids(self) -> list[int]:
         """Process ids of the local workers."""
         return self._pool.pids if self._pool else []
+
+    @property
+    def workers(self) -> tuple[WorkerStatus, ...]:
+        """Workers that take part, with what they did lately."""
+        return self._farm.census()
+
+    @property
+    def dropped(self) -> int:
+        """Generations that were recorded without their rollout, because the recorder could not keep up."""
+        return self._recording.dropped if self._recording else 0
 
     @property
     def live(self) -> str | None:
@@ -107,12 +130,19 @@ class Run:
         state, evaluation = "failed", None
         try:
             for report in self.learner.learn(self._farm):
+                self._broadcast.generation(report)
                 if self._recording:
                     self._recording.generation(report)
                 yield report
             evaluation = self.learner.evaluate(self._farm)
             if self._recording:
-                self._recording.end(evaluation)
+                mean = evaluation.mean.trajectory
+                self._recording.end(
+                    self.learner.state.generation,
+                    None if mean is None else mean.trajectory(),
+                    evaluation.replay,
+                    self.learner.best_generation,
+                )
             state = "finished"
         except (Stopped, GeneratorExit):
             state = "interrupted"
@@ -134,6 +164,9 @@ class Run:
         except OSError as error:
             if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
                 raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
+        finally:
+            if state in ("finished", "diverged"):  # otherwise the run may go on
+                self._broadcast.end(self.summary, evaluation, self.learner.best_generation)
 
 
 def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False) -> Iterator[Report]:
@@ -158,7 +191,7 @@ def open_run(
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Run]:
     """Everything a run needs, opened in an order that leaves nothing behind when a part fails."""
-    scene = scenes.load(config.task.object)
+    sizes, scene = tasks.sizes(config.task), tasks.scene(config.task)
     folder = RunFolder(path)
     keys.checked("run", folder.name)
     if place.record or place.serve:
@@ -168,7 +201,7 @@ def open_run(
             stack.enter_context(folder.held())
         at = _resumed(folder, config) if resume else start(config, folder.name)
         if place.workers:
-            CpuBackend(specification(config, at))  # says in time what no worker could simulate
+            BACKENDS[place.backend](specification(config, at))  # says in time what no worker could simulate
         link = stack.enter_context(_session(place, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:
@@ -193,15 +226,23 @@ def open_run(
             place.farm,
             learner.spec,
             config.generations,
-            how_to_join(place),
+            None if place.workers else how_to_join(place, config),
             tend,
             Admission(assets.digest(), learner.canary, mixed=place.mixed),
+            sizes.shapes(len(scene.bodies)),
             place.ledger,
         )
         if place.workers:
-            flags = [*_worker_flags(place), "--log-level", "WARNING"]  # what they do, the learner says
+            flags = [
+                *_worker_flags(place, config),
+                "--backend",
+                place.backend,
+                "--log-level",
+                "WARNING",
+            ]  # what they do, the learner says
             tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
-        yield Run(learner, farm, recording, tend.pool)
+        broadcast = stack.enter_context(closing(Broadcast(link, place.farm, farm.incarnation, learner)))
+        yield Run(learner, farm, broadcast, recording, tend.pool)
 
 
 def _resumed(folder: RunFolder, config: RunConfig) -> Checkpoint:
@@ -260,17 +301,21 @@ def _session(place: Place, stopped: Callable[[], bool]) -> AbstractContextManage
     return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted)
 
 
-def _worker_flags(place: Place) -> list[str]:
+def _worker_flags(place: Place, config: RunConfig) -> list[str]:
     endpoints = place.connect or (place.listen,)
-    return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), "--farm", place.farm]
+    farm = ["--farm", place.farm] if place.farm != "farm" else []
+    gym = ["--allow-gym"] if config.task.kind == "gym" else []
+    return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), *farm, *gym]
 
 
-def how_to_join(place: Place) -> str:
+def how_to_join(place: Place, config: RunConfig) -> str:
     """The command by which workers join."""
     host = socket.gethostname()  # of an address that means all of them, others need the name
-    flags = [flag.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:") for flag in _worker_flags(place)]
+    flags = [
+        flag.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:") for flag in _worker_flags(place, config)
+    ]
     tls = ["--tls", "worker-NAME"] if place.tls else []
-    return " ".join(["farm worker", *(flags if place.farm != "farm" else flags[:-2]), *tls])
+    return " ".join(["farm worker", *flags, *tls])
 
 
 class _LogFile(logging.FileHandler):
@@ -297,7 +342,10 @@ def _log_file(folder: RunFolder) -> Iterator[None]:
 def _recording(place: Place, learner: Learner, scene: Scene) -> "Iterator[Recording]":
     from learner.recording.run import Recording
 
-    recording = Recording(learner, scene, place.serve, to_file=place.record)
+    recording = Recording(
+        learner.folder.recording if place.record else None, replay=learner.folder.replay, run=learner.run,
+        config=learner.config, scene=scene, done=learner.state.generation, serve=place.serve,
+    )  # fmt: skip
     try:
         yield recording
     finally:

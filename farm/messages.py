@@ -4,6 +4,7 @@ Everything is soft state: any message may be lost, doubled or late. Whatever bel
 carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -12,6 +13,8 @@ import numpy as np
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.codec import array
 from farm.trajectory import Trajectory
+
+_SHORT: Final = 250  # characters; names have up to 100, a worker's is two of them
 
 RATES: Final = ("none", "control", "physics")
 """How much of a rollout a job wants to see, besides its figures: nothing, or a trajectory at that rate."""
@@ -25,17 +28,22 @@ class Want:
     """<name>/<instance>"""
     credits: int
     """Jobs of one run it is willing to hold at a time."""
-    idle: bool
-    """It has had nothing to do for a while: what a learner believes it holds is lost."""
+    idle: tuple[str, ...]
+    """Runs that it holds nothing of, and has not for a while: what their learners believe it holds is lost."""
     version: str
     """Release of the worker's software."""
     assets: str
     """Digest of its hand and objects."""
     canary: str
     """Digest of the numbers its machine gives."""
+    host: str
+    cores: int
+    """That its machine has."""
 
     def __post_init__(self) -> None:
-        """Check the number."""
+        """Check the number, and that what is remembered of a worker is short."""
+        if max(map(len, (self.worker, self.version, self.assets, self.canary, self.host))) > _SHORT:
+            raise ValueError(f"a name of more than {_SHORT} characters")
         if not 0 <= self.credits <= 100_000:
             raise ValueError(f"{self.credits} credits")
 
@@ -46,9 +54,13 @@ class Spec:
 
     run: str
     task: str
-    """A name in TASKS."""
+    """finger-gait, or gym:NAME."""
     task_config: dict[str, Any]
     policy_config: dict[str, Any]
+    traces: bool
+    """Whether results bring tactile traces."""
+    release: str = ""
+    """Of the package that the task comes from, empty for the farm's own."""
     frequencies: FloatArray = array("<f8", 2)
     """Random features W, (D, d)"""
     phases: FloatArray = array("<f8", 1)
@@ -81,7 +93,7 @@ class Job:
     signs: tuple[int, ...]
     """(1, -1) for a pair, (1,) for one rollout."""
     perturbation: tuple[int, ...] | None
-    """Seed of the perturbation that all these rollouts share, None for nominal conditions."""
+    """Seed of the perturbation that all these rollouts share, four 32-bit words; None for nominal conditions."""
     rate: str
     """One of RATES."""
     eps: FloatArray = array("<f8", 1)
@@ -91,59 +103,204 @@ class Job:
         """Check names and signs."""
         if self.origin not in ("mu", "zero"):
             raise ValueError(f"a job around {self.origin!r}")
-        if self.rate not in RATES or not 1 <= len(self.signs) <= 2 or not set(self.signs) <= {1, -1}:
+        if self.rate not in RATES or self.signs not in _SIGNS:
             raise ValueError(f"a job of signs {self.signs} and rate {self.rate!r}")
-        if not 0 <= self.index < 2**31 or any(not 0 <= s < 2**64 for s in self.perturbation or ()):
+        seed = (0, 0, 0, 0) if self.perturbation is None else self.perturbation
+        if not 0 <= self.index < 2**31 or len(seed) != 4 or min(seed) < 0 or max(seed) >= 2**32:
             raise ValueError(f"a job of index {self.index} and perturbation {self.perturbation}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """Jobs for one worker."""
+    """Jobs for one worker: one array of each kind over all of them, as a map for each would take ten times as long."""
 
     run: str
     incarnation: str
     round: int
-    jobs: tuple[Job, ...]
+    jobs: IntArray = array("<i8", 1)
+    """Indices, (J,)"""
+    around: BoolArray = array("|b1", 1)
+    """Whether the origin is the generation's mean, (J,)"""
+    signs: IntArray = array("<i8", 2)
+    """(J, 2), the second 0 for a single rollout"""
+    seeds: IntArray = array("<i8", 2)
+    """Of the perturbations, (J, 4), -1 for nominal conditions"""
+    rates: IntArray = array("<i8", 1)
+    """Positions in RATES, (J,)"""
+    explores: BoolArray = array("|b1", 1)
+    """Which jobs have eps, (J,)"""
+    eps: FloatArray = array("<f8", 2)
+    """Of those that have, one after the other (K, P)"""
+
+    def __post_init__(self) -> None:
+        """Check that all speak of as many jobs, and of such that there are."""
+        count = len(self.jobs)
+        if self.signs.shape != (count, 2) or self.seeds.shape != (count, 4):
+            raise ValueError(f"signs of shape {self.signs.shape}, seeds of shape {self.seeds.shape} of {count} jobs")
+        if not len(self.around) == len(self.rates) == len(self.explores) == count:
+            raise ValueError("arrays over different jobs")
+        if len(self.eps) != np.count_nonzero(self.explores):
+            raise ValueError(f"{len(self.eps)} rows of eps of {np.count_nonzero(self.explores)} jobs")
+        if not _within(self.jobs, 0, 2**31) or not _within(self.rates, 0, len(RATES)):
+            raise ValueError("indices or rates out of range")
+        if not _within(self.signs, -1, 2) or np.count_nonzero(self.signs[:, 0]) < count:
+            raise ValueError("signs other than 1 and -1")
+        if not _within(self.seeds, 0, 2**32):  # then some jobs' conditions are nominal
+            nominal = (self.seeds == -1).all(axis=1)
+            if not _within(self.seeds[~nominal], 0, 2**32):
+                raise ValueError("seeds out of range")
+
+    @classmethod
+    def of(cls, jobs: Sequence[Job], *, run: str, incarnation: str, round: int) -> "Chunk":
+        """Make at least one job ready to send."""
+        eps = [job.eps for job in jobs if job.eps.size]
+        return cls(
+            run=run, incarnation=incarnation, round=round,
+            jobs=np.array([job.index for job in jobs]),
+            around=np.array([job.origin == "mu" for job in jobs]),
+            signs=np.array([(*job.signs, 0)[:2] for job in jobs]),
+            seeds=np.array([_NOMINAL if job.perturbation is None else job.perturbation for job in jobs]),
+            rates=np.array([RATES.index(job.rate) for job in jobs]),
+            explores=np.array([job.eps.size > 0 for job in jobs]),
+            eps=np.stack(eps) if eps else np.empty((0, 0)),
+        )  # fmt: skip
+
+    def take(self, chosen: Sequence[int]) -> "Chunk":
+        """Some of these jobs, by their places here."""
+        at = np.array(chosen)
+        explores = self.explores[at]
+        rows = at[explores] if len(self.eps) == len(self.jobs) else (np.cumsum(self.explores) - 1)[at[explores]]
+        return Chunk(
+            run=self.run, incarnation=self.incarnation, round=self.round,
+            jobs=self.jobs[at], around=self.around[at], signs=self.signs[at], seeds=self.seeds[at],
+            rates=self.rates[at], explores=explores, eps=self.eps[rows],
+        )  # fmt: skip
+
+    def split(self) -> list[Job]:
+        """Job by job again; the arrays are views."""
+        eps, around, explores = iter(self.eps), self.around.tolist(), self.explores.tolist()
+        signs, seeds, rates = self.signs.tolist(), self.seeds.tolist(), self.rates.tolist()
+        return [
+            Job(
+                index=index,
+                origin="mu" if around[i] else "zero",
+                signs=tuple(sign for sign in signs[i] if sign),
+                perturbation=None if seeds[i][0] < 0 else tuple(seeds[i]),
+                rate=RATES[rates[i]],
+                eps=next(eps) if explores[i] else _NO_EPS,
+            )
+            for i, index in enumerate(self.jobs.tolist())
+        ]
+
+
+_SIGNS: Final = ((1, -1), (1,), (-1,), (-1, 1), (1, 1), (-1, -1))
+_NOMINAL: Final = (-1, -1, -1, -1)
+_NO_EPS: Final = np.empty(0)
+
+
+def _within(values: IntArray, least: int, end: int) -> bool:
+    return values.size == 0 or bool(values.min() >= least and values.max() < end)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What a job gave; R rollouts, one a sign."""
+    """What a job gave; R rollouts, one a sign. `Results` carries them."""
 
     index: int
     trajectory: "WireTrajectory | None"
-    returns: FloatArray = array("<f8", 1)
+    returns: FloatArray
     """(R,)"""
-    success: BoolArray = array("|b1", 1)
+    success: BoolArray
     """(R,)"""
-    steps: IntArray = array("<i8", 1)
+    steps: IntArray
     """Control steps until the end, (R,)"""
-    dropped: BoolArray = array("|b1", 1)
+    dropped: BoolArray
     """(R,)"""
-    failed: BoolArray = array("|b1", 1)
+    failed: BoolArray
     """(R,)"""
-    clamped: BoolArray = array("|b1", 1)
+    clamped: BoolArray
     """(R,)"""
-    traces: AnyArray = array("<f4", 3)
-    """Tactile traces [N], (R, T, 54), zero after the end."""
-
-    def __post_init__(self) -> None:
-        """Check that all speak of as many rollouts."""
-        sizes = {len(a) for a in (self.returns, self.success, self.steps, self.dropped, self.failed, self.clamped)}
-        if sizes != {len(self.traces)} or not 1 <= len(self.traces) <= 2:
-            raise ValueError("arrays of different lengths")
+    traces: AnyArray
+    """Tactile traces [N], (R, T, 54) float32, zero after the end; (R, 0, 54) where the run wants none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What a chunk gave, worker to learner."""
+    """What a chunk gave, worker to learner: one array of each kind over the rollouts of all its jobs.
+
+    A map for each job would take the learner ten times as long to read.
+    """
 
     run: str
     incarnation: str
     round: int
     worker: str
-    results: tuple[Result, ...]
+    trajectories: "tuple[WireTrajectory, ...]"
+    """Of the jobs that are seen, in their order."""
+    jobs: IntArray = array("<i8", 1)
+    """Indices, (J,)"""
+    rollouts: IntArray = array("<i8", 1)
+    """Of each job, (J,), S in all"""
+    seen: BoolArray = array("|b1", 1)
+    """Which jobs have a trajectory, (J,)"""
+    returns: FloatArray = array("<f8", 1)
+    """(S,)"""
+    steps: IntArray = array("<i8", 1)
+    """(S,)"""
+    flags: BoolArray = array("|b1", 2)
+    """success, dropped, failed, clamped, (S, 4)"""
+    traces: AnyArray = array("<f4", 3)
+    """(S, T, 54)"""
+
+    def __post_init__(self) -> None:
+        """Check that all speak of as many jobs and rollouts."""
+        if not len(self.jobs) == len(self.rollouts) == len(self.seen) >= 1:
+            raise ValueError("no jobs, or arrays over different ones")
+        if not _within(self.rollouts, 1, 3):
+            raise ValueError("jobs of other than one or two rollouts")
+        count = self.rollouts.sum()
+        if not len(self.returns) == len(self.steps) == len(self.traces) == count or self.flags.shape != (count, 4):
+            raise ValueError("arrays over different rollouts")
+        if len(self.trajectories) != np.count_nonzero(self.seen):
+            raise ValueError(f"{len(self.trajectories)} trajectories of {np.count_nonzero(self.seen)} jobs")
+
+    @classmethod
+    def of(cls, results: Sequence[Result], *, run: str, incarnation: str, round: int, worker: str) -> "Results":
+        """Make at least one result ready to send."""
+        flags = [np.stack([r.success, r.dropped, r.failed, r.clamped], axis=1) for r in results]
+        return cls(
+            run=run, incarnation=incarnation, round=round, worker=worker,
+            trajectories=tuple(r.trajectory for r in results if r.trajectory),
+            jobs=np.array([r.index for r in results]),
+            rollouts=np.array([len(r.returns) for r in results]),
+            seen=np.array([r.trajectory is not None for r in results]),
+            returns=np.concatenate([r.returns for r in results]),
+            steps=np.concatenate([r.steps for r in results]),
+            flags=np.concatenate(flags),
+            traces=np.concatenate([r.traces for r in results]),
+        )  # fmt: skip
+
+    def split(self) -> list[Result]:
+        """Job by job again; the arrays are views."""
+        trajectories, found, start = iter(self.trajectories), [], 0
+        success, dropped, failed, clamped = self.flags.T
+        for index, count, seen in zip(self.jobs.tolist(), self.rollouts.tolist(), self.seen.tolist(), strict=True):
+            rows = slice(start, start + count)
+            start += count
+            found.append(
+                Result(
+                    index=index,
+                    trajectory=next(trajectories) if seen else None,
+                    returns=self.returns[rows],
+                    success=success[rows],
+                    steps=self.steps[rows],
+                    dropped=dropped[rows],
+                    failed=failed[rows],
+                    clamped=clamped[rows],
+                    traces=self.traces[rows],
+                )
+            )
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,45 +324,11 @@ class Refusal:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkerStatus:
-    """How a worker is doing, as a learner sees it."""
-
-    worker: str
-    version: str
-    canary: str
-    rollouts: int
-    """It has brought so many."""
-    rate: float
-    """Rollouts a second, over the last ten."""
-    seen: float
-    """Since it was last heard of [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunStatus:
-    """How a run is doing, answered by its learner."""
-
-    run: str
-    generation: int
-    generations: int
-    return_mean: float | None
-    mean_policy_return: float | None
-    open: int
-    """Jobs of this round that are not done."""
-    reissued: int
-    refused: int
-    """Workers that were refused."""
-    ignored: dict[str, Any]
-    """Messages that did not count, by kind."""
-    workers: tuple[WorkerStatus, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class WireTrajectory:
     """A Trajectory on its way; float32 but for times and figures."""
 
     value: float
-    success: bool
+    success: bool | None
     times: FloatArray = array("<f8", 1)
     bodies: AnyArray = array("<f4", 3)
     joints: AnyArray = array("<f4", 2)
@@ -215,13 +338,15 @@ class WireTrajectory:
     terms: AnyArray = array("<f4", 2)
 
     def __post_init__(self) -> None:
-        """Check that all have as many frames, and each its width."""
-        frames = len(self.times)
-        widths = (("bodies", (7,)), ("joints", (8,)), ("targets", (8,)), ("images", (3, 18)), ("points", (3, 3)))
-        for name, width in (*widths, ("terms", (5,))):
+        """Check that all have as many frames; how wide each is, the run's task says."""
+        for name in ("bodies", "joints", "targets", "images", "points", "terms"):
             shape = getattr(self, name).shape
-            if shape[0] != frames or shape[-len(width) :] != width:
-                raise ValueError(f"{name} of shape {shape} in {frames} frames")
+            if shape[0] != len(self.times):
+                raise ValueError(f"{name} of shape {shape} in {len(self.times)} frames")
+
+    def fits(self, shapes: Mapping[str, tuple[int, ...]]) -> bool:
+        """Whether a frame of each array has the shape that the run's task says."""
+        return all(getattr(self, name).shape[1:] == shape for name, shape in shapes.items())
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> "WireTrajectory":

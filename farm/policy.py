@@ -1,6 +1,6 @@
 """Controllers on random Fourier features (thesis 3.2 and 3.5.4), and what an action means.
 
-Pure, batched. One action a_i for each controlled joint:
+Pure, batched. One action a_i for each of A controlled joints, the hand's eight or an environment's:
 
     direct     a_i = theta_i . z(x)                      D parameters a joint (thesis 3.7)
     projected  a_i = z(theta_i) . z(x)                   d parameters a joint (thesis 3.8)
@@ -20,7 +20,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.hand import JOINTS, LOWER, UPPER
+from farm.hand import LOWER, UPPER
 
 CONTROLLERS: Final = ("direct", "projected", "kernel", "cosine")
 _TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target a number that MuJoCo takes
@@ -73,9 +73,16 @@ class Features:
 class Policy:
     """Deterministic controllers for a batch of parameter vectors."""
 
-    def __init__(self, config: PolicyConfig, state_size: int, features: Features) -> None:
-        """Keep the feature map ready to use."""
+    def __init__(
+        self,
+        config: PolicyConfig,
+        state_size: int,
+        features: Features,
+        limits: tuple[FloatArray, FloatArray] = (LOWER, UPPER),
+    ) -> None:
+        """Keep the feature map ready to use; limits are the least and greatest action, (A,) each."""
         self.config = config
+        self._lower, self._upper = limits
         self.state_size = state_size
         # One contiguous row a state component: W x is then d multiply-adds of (D,) vectors, in order.
         self._rows = np.ascontiguousarray((features.frequencies / config.bandwidth).T)
@@ -90,11 +97,11 @@ class Policy:
     @property
     def size(self) -> int:
         """Length P of a parameter vector."""
-        return len(JOINTS) * self.joint_parameters
+        return len(self._lower) * self.joint_parameters
 
     def weights(self, theta: FloatArray) -> FloatArray:
-        """What of the parameters does not change during a rollout, (B, P) -> (B, 8, D or d)."""
-        theta = np.ascontiguousarray(theta).reshape(len(theta), len(JOINTS), -1)
+        """What of the parameters does not change during a rollout, (B, P) -> (B, A, D or d)."""
+        theta = np.ascontiguousarray(theta).reshape(len(theta), len(self._lower), -1)
         with np.errstate(over="ignore", invalid="ignore"):
             if self.config.controller == "projected":
                 return np.stack([[self.features(joint) for joint in rollout] for rollout in theta])
@@ -106,11 +113,11 @@ class Policy:
         """Raw actions.
 
         Args:
-          weights: (B, 8, D or d) from `weights`.
+          weights: (B, A, D or d) from `weights`.
           x: (B, d) states.
 
         Returns:
-          (B, 8) [rad]; may be huge or not finite with the direct controller.
+          (B, A), of the hand [rad]; may be huge or not finite with the direct controller.
         """
         weights, x = np.ascontiguousarray(weights), np.ascontiguousarray(x)  # numpy sums in the order of the memory
         with np.errstate(over="ignore", invalid="ignore"):
@@ -145,5 +152,11 @@ class Policy:
         targets = base + actions
         targets[np.isnan(targets)] = 0.0
         if self.config.clip:
-            return np.minimum(np.maximum(targets, LOWER), UPPER)
+            return np.minimum(np.maximum(targets, self._lower), self._upper)
         return np.minimum(np.maximum(targets, -_TARGET_LIMIT), _TARGET_LIMIT)
+
+    def rescaled(self, actions: FloatArray) -> FloatArray:
+        """Raw actions (B, A) between the limits: -1 is the least action, 1 the greatest, beyond is clipped."""
+        part = np.minimum(np.maximum(actions, -1.0), 1.0)
+        part[np.isnan(part)] = 0.0
+        return self._lower + (self._upper - self._lower) * (0.5 * (part + 1.0))

@@ -98,7 +98,23 @@ def full(
     return terms
 
 
-REWARDS: Final[dict[str, Reward]] = {"basic": basic, "full": full}
+def limited(
+    joints: FloatArray,
+    images: FloatArray,
+    points: FloatArray,
+    action: FloatArray,
+    goal: Demonstration,
+    weights: Weights,
+) -> FloatArray:
+    """Terms of (3.5) with no action punished for more than a joint's range ("limit the action punishment", 4.1.1)."""
+    return full(joints, images, points, np.minimum(np.abs(action), _RANGE), goal, weights)
+
+
+REWARDS: Final[dict[str, Reward]] = {
+    "basic": basic,
+    "full": full,
+    "limited": limited,
+}
 """Rewards by name: joints (..., 8), images (..., 3, 18), points (..., 3, 3), action (..., 8) -> terms (..., 5)."""
 
 
@@ -124,12 +140,13 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
     return out
 
 
-def discounted(terms: FloatArray, gamma: float) -> tuple[FloatArray, BoolArray]:
+def discounted(terms: FloatArray, gamma: float, scale: float = RETURN_SCALE) -> tuple[FloatArray, BoolArray]:
     """Return (3.4): R = 0.1 sum_t gamma^t r_t, t from 0.
 
     Args:
       terms: (B, T, K) reward terms of every step, zero after the end.
       gamma: discount factor.
+      scale: the 0.1.
 
     Returns:
       returns (B,), and (B,) where the sum overflowed and was clamped to RETURN_FLOOR.
@@ -139,6 +156,6 @@ def discounted(terms: FloatArray, gamma: float) -> tuple[FloatArray, BoolArray]:
         reward = terms.sum(axis=-1)
         for t in range(terms.shape[1]):
             total += gamma**t * reward[:, t]
-        total *= RETURN_SCALE
+        total *= scale
         clamped = ~(total >= RETURN_FLOOR)  # catches nan as well
     return np.where(clamped, RETURN_FLOOR, total), clamped

@@ -1,20 +1,22 @@
 """Zenoh sessions as the farm uses them; the only door to zenoh.
 
-What is set here was measured: see docs/protocol.md. Every subscription has a thread of its own
-that moves samples into the application's queue, so that the link is always drained; whoever
-reads the queue owns all state and does all the publishing.
+What is set here was measured: see docs/protocol.md. Every subscription has a callback, on a thread
+of its own, that moves samples into the application's queue, so that the link is always drained;
+whoever reads the queue owns all state and does all the publishing. (Zenoh's channels would do as
+well, but who waits for one wakes up ten times a second.)
 """
 
 import ipaddress
 import json
 import logging
 import queue
+import resource
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import zenoh
 
@@ -23,8 +25,12 @@ from farm.tls import Bundle, access_control
 
 log = logging.getLogger(__name__)
 
-_CHANNEL: Final = 10_000  # samples a subscription holds before its thread moves them
+_T = TypeVar("_T")
+_AT_ONCE: Final = 10_000  # events that are taken in before anything else is done
+_BACKLOG: Final = 256 * 1024 * 1024  # [bytes] of events that wait; what comes on top is lost, as on a bad network
+_OVERHEAD: Final = 500  # [bytes] that an event takes besides its payload
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
+_DESCRIPTORS: Final = 65_536
 _OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
 _REMIND: Final = 60.0  # [s] between two lines about the same trouble
@@ -43,11 +49,8 @@ _ROUTER: Final = {
     "transport/unicast/max_sessions": 4096,
     "transport/unicast/accept_pending": 1024,
 }
-_CLIENT: Final = {
-    "mode": "client",
-    "connect/timeout_ms": int(_OPEN_S * 1000),
-    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
-}
+_RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
+_CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
 
 @dataclass(frozen=True)
@@ -92,17 +95,58 @@ def _reachable(host: str) -> bool:
         return host != "localhost"
 
 
+class Events:
+    """What came in, first come first served; a flood is dropped rather than kept."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._lock, self._bytes, self.dropped = threading.Lock(), 0, 0
+
+    def put(self, event: Event) -> None:
+        """Append an event, unless those that wait take up too much."""
+        size = len(event.payload) + _OVERHEAD
+        with self._lock:
+            if self._bytes + size > _BACKLOG:
+                self.dropped += 1
+                return
+            self._bytes += size
+        self._queue.put(event)
+
+    def get(self, timeout: float = 0.0) -> Event:
+        """The next event.
+
+        Raises:
+          queue.Empty: none came in time [s].
+        """
+        event = self._queue.get(timeout=timeout) if timeout > 0.0 else self._queue.get_nowait()
+        with self._lock:
+            self._bytes -= len(event.payload) + _OVERHEAD
+        return event
+
+    def waiting(self, timeout: float) -> list[Event]:
+        """What waits, after waiting for the first [s]."""
+        events = []
+        with suppress(queue.Empty):
+            events.append(self.get(timeout))
+            while len(events) < _AT_ONCE:
+                events.append(self.get())
+        return events
+
+    def __len__(self) -> int:
+        """How many wait."""
+        return self._queue.qsize()
+
+
 class Session:
     """An open session; use `listen` or `connect`."""
 
-    def __init__(self, session: zenoh.Session, events: "queue.SimpleQueue[Event]") -> None:
-        """Take an open zenoh session and the queue that everything goes into."""
+    def __init__(self, session: zenoh.Session) -> None:
+        """Take an open zenoh session."""
         self._session = session
-        self.events = events
-        self._threads: list[threading.Thread] = []
-        self._declared: list[
-            zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.Queryable[zenoh.Handler[zenoh.Query]]
-        ] = []
+        self.events = Events()
+        """Whatever subscriptions bring."""
+        self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+        self._over: list[threading.Event] = []  # of their callbacks
         self._tokens: list[zenoh.LivelinessToken] = []
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
@@ -116,35 +160,43 @@ class Session:
 
     def subscribe(self, topic: str, key: str) -> None:
         """Everything published on the key goes into `events` under the topic's name."""
-        subscriber = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(_CHANNEL))
-        self._drain(topic, subscriber)
+        self._declared.append(self._session.declare_subscriber(key, self._callback(self._put(topic))))
 
     def watch(self, topic: str, key: str) -> None:
         """Liveliness tokens that are there, come or go, into `events`."""
-        subscriber = self._session.liveliness().declare_subscriber(
-            key, zenoh.handlers.FifoChannel(_CHANNEL), history=True
-        )
-        self._drain(topic, subscriber)
+        callback = self._callback(self._put(topic))
+        self._declared.append(self._session.liveliness().declare_subscriber(key, callback, history=True))
 
     def token(self, key: str) -> None:
         """Show that we are here, until the session closes. Declare it after everything else."""
         self._tokens.append(self._session.liveliness().declare_token(key))
 
+    def outlet(self, key: str) -> "Outlet":
+        """A key that is published on again and again, and may have nobody listening."""
+        publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+        return Outlet(publisher)
+
     def answer(self, key: str, reply: Callable[[], bytes]) -> None:
         """Answer every query on the key with what `reply` gives (called on another thread)."""
-        queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(_CHANNEL))
-        self._declared.append(queryable)
+        self.answer_asked(key, lambda _: reply())
 
-        def serve() -> None:
-            for query in queryable:
-                with query, suppress(zenoh.ZError):
-                    query.reply(key, reply())
+    def answer_asked(self, key: str, reply: Callable[[str], bytes]) -> None:
+        """The same, where `reply` takes what the asker wrote behind the key and a question mark."""
 
-        self._start(serve, f"answer {key}")
+        def serve(query: zenoh.Query) -> None:
+            with query, suppress(zenoh.ZError):
+                query.reply(key, reply(str(query.parameters)))
+
+        self._declared.append(self._session.declare_queryable(key, self._callback(serve)))
 
     def present(self, key: str, timeout: float) -> bool:
         """Whether a liveliness token of the key is there, as far as is known in time [s]."""
-        return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=timeout))
+        return bool(self.tokens(key, timeout))
+
+    def tokens(self, key: str, timeout: float) -> list[str]:
+        """The liveliness tokens of the key that are there, as far as is known in time [s]."""
+        replies = self._session.liveliness().get(key, timeout=timeout)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def ask(self, key: str, timeout: float) -> bytes | None:
         """One answer to a query on the key, None when there is none in time [s]."""
@@ -158,31 +210,48 @@ class Session:
                     yield reply.ok.payload.to_bytes()
 
     def close(self) -> None:
-        """Take everything back and wait for the threads: one that is left in Rust aborts the interpreter's exit."""
+        """Take everything back and wait for the callbacks: one that is left in Rust aborts the interpreter's exit."""
         for token in self._tokens:
             token.undeclare()
         for declared in self._declared:
             declared.undeclare()
-        for thread in self._threads:
-            thread.join(_JOIN_S)
+        for over in self._over:
+            over.wait(_JOIN_S)
 
-    def _drain(self, topic: str, subscriber: "zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]") -> None:
-        self._declared.append(subscriber)
+    def _put(self, topic: str) -> Callable[[zenoh.Sample], None]:
+        def put(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            self.events.put(Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive))
 
-        def move() -> None:
-            for sample in subscriber:
-                alive = sample.kind == zenoh.SampleKind.PUT
-                self.events.put(Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive))
+        return put
 
-        self._start(move, f"drain {topic}")
-
-    def _start(self, run: Callable[[], None], name: str) -> None:
-        thread = threading.Thread(target=run, name=name, daemon=True)
-        thread.start()
-        self._threads.append(thread)
+    def _callback(self, call: Callable[[_T], None]) -> "zenoh.handlers.Callback[_T]":
+        over = threading.Event()
+        self._over.append(over)
+        return zenoh.handlers.Callback(call, over.set)
 
 
-def router_settings(endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False) -> dict[str, object]:
+class Outlet:
+    """A key to publish on; a receiver that is stuck loses what is said."""
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        """Made by `Session.outlet`."""
+        self._publisher = publisher
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody subscribed; asking costs 2 us."""
+        status: Any = self._publisher.matching_status  # its stub says bool, which the object always is
+        return bool(status.matching)
+
+    def publish(self, payload: bytes) -> None:
+        """Send bytes to whoever subscribed."""
+        self._publisher.put(payload)
+
+
+def router_settings(
+    endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False, dial: tuple[str, ...] = ()
+) -> dict[str, object]:
     """Zenoh's settings for a session that others dial, by the paths of its configuration.
 
     Args:
@@ -190,28 +259,35 @@ def router_settings(endpoint: str, farm: str, bundle: Bundle | None, *, trusted:
       farm: name of the farm, for access control.
       bundle: the learner's certificates; with them only those on its roster get in.
       trusted: listen to other machines without certificates.
+      dial: other routers that it joins, as soon and as often as they are there.
 
     Raises:
-      ConfigError: the endpoint is malformed, or open to other machines without certificates.
+      ConfigError: an endpoint is malformed, or open to other machines without certificates.
     """
-    host = check_endpoint(endpoint, encrypted=bundle is not None)
+    host, *_ = (check_endpoint(each, encrypted=bundle is not None) for each in (endpoint, *dial))
     if bundle is None and _reachable(host) and not trusted:
         raise ConfigError(
             f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
             "--trust-network if everybody on that network may read everything and pose as a worker"
         )
     secured = {} if bundle is None else {**bundle.listening(), "access_control": access_control(farm, bundle.roster())}
-    return {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
+    settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
+    if dial:
+        settings |= {"connect/endpoints": list(dial), **_RETRY, **({} if bundle is None else bundle.dialling())}
+    return settings
 
 
 @contextmanager
-def listen(endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False) -> Iterator[Session]:
+def listen(
+    endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, dial: tuple[str, ...] = ()
+) -> Iterator[Session]:
     """A session that is the farm's rendezvous itself; for the arguments see `router_settings`.
 
     Raises:
-      ConfigError: the endpoint is malformed, open to other machines without certificates, or its port in use.
+      ConfigError: an endpoint is malformed, open to other machines without certificates, or its port in use.
     """
-    settings = router_settings(endpoint, farm, bundle, trusted=trusted)
+    _raise_descriptors()
+    settings = router_settings(endpoint, farm, bundle, trusted=trusted, dial=dial)
     try:
         session = _open(settings)
     except zenoh.ZError as error:
@@ -220,6 +296,14 @@ def listen(endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: b
         ) from None
     with _closing(session) as opened:
         yield opened
+
+
+def _raise_descriptors() -> None:
+    """Let this process have as many connections as the system allows it: the usual 1024 end at 1000 workers."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 @contextmanager
@@ -283,7 +367,7 @@ def _open(settings: Mapping[str, object]) -> zenoh.Session:
 @contextmanager
 def _closing(session: zenoh.Session) -> Iterator[Session]:
     with session:
-        opened = Session(session, queue.SimpleQueue())
+        opened = Session(session)
         try:
             yield opened
         finally:

@@ -164,9 +164,9 @@ def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
 
 
 def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
-    """A viewer sees which learners and workers there are, and what runs are about."""
-    told = [keys.generation(farm, "*")]
-    asked = [keys.spec(farm, "*"), keys.generation(farm, "*"), keys.status(farm, "*")]
+    """A viewer sees which learners and workers there are, what runs are about, and what they report."""
+    told = [keys.generation(farm, "*"), keys.report(farm, "*"), keys.history(farm, "*")]
+    asked = [keys.spec(farm, "*"), keys.generation(farm, "*"), keys.status(farm, "*"), keys.history(farm, "*")]
     tokens = [keys.learner_token(farm, "*"), keys.worker_token(farm, "**")]
     return [
         ("ingress", ["declare_subscriber"], told),

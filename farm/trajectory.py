@@ -7,9 +7,11 @@ from farm.arrays import FloatArray
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """A rollout at control rate or at physics rate; frame 0 is the moment of release.
+    """A rollout at control rate or at physics rate; frame 0 is the moment of release, or of a reset.
 
-    F frames, B drawn bodies (in the order of `Scene.bodies`); a rollout that ended early has fewer frames.
+    F frames, B drawn bodies (in the order of `Scene.bodies`); a rollout that ended early has fewer frames. Shapes
+    are the finger gait's: an environment of Gymnasium has no joints (F, 0), no fingers (F, 0, ...), its actions as
+    targets (F, A), and one term (F, 1).
     """
 
     times: FloatArray
@@ -28,5 +30,5 @@ class Trajectory:
     """Reward terms of the control step that led there, (F, 5); zero at the release"""
     value: float
     """The rollout's return"""
-    success: bool
-    """Whether the gait succeeded"""
+    success: bool | None
+    """Whether the gait succeeded; None where the task knows no success"""

@@ -3,14 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
-from farm import randomness
+from farm import randomness, tasks
 from farm.errors import ConfigError
 from farm.messages import Spec
 from farm.policy import Features, Policy
-from farm.states import STATES
 from learner import checkpoint as checkpoints
 from learner import config as configs
-from learner.algorithms import PGPEState
+from learner.algorithms import SearchState
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.folder import RunFolder
@@ -20,11 +19,12 @@ def start(config: RunConfig, run: str) -> Checkpoint:
     """A run before its first generation.
 
     Raises:
-      ConfigError: the run to start from cannot be used.
+      ConfigError: the task is not to be had here, or the run to start from cannot be used.
     """
-    size = STATES[config.task.state].size
-    features = Features.draw(config.policy, size, randomness.features(config.seed))
-    state = config.algorithm.init(_policy(config, features).size)
+    sizes = tasks.sizes(config.task)
+    features = Features.draw(config.policy, sizes.observation, randomness.features(config.seed))
+    policy = Policy(config.policy, sizes.observation, features, (sizes.lower, sizes.upper))
+    state = config.algorithm.init(policy.size)
     if config.init_from is not None:
         state, features = _taken_over(config, state)
     return Checkpoint(
@@ -36,18 +36,24 @@ def start(config: RunConfig, run: str) -> Checkpoint:
 
 def specification(config: RunConfig, at: Checkpoint) -> Spec:
     """What a run simulates, for workers."""
-    settings = configs.to_dict(config)
+    settings, sizes = configs.to_dict(config), tasks.sizes(config.task)
     return Spec(
-        run=at.run, task="finger-gait", task_config=settings["task"], policy_config=settings["policy"],
+        run=at.run, task=config.task.task, release=sizes.release, task_config=settings["task"],
+        policy_config=settings["policy"], traces=config.traces != "none" and sizes.fingers > 0,
         frequencies=at.frequencies, phases=at.phases,
     )  # fmt: skip
 
 
-def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Features]:
+def _taken_over(config: RunConfig, fresh: SearchState) -> tuple[SearchState, Features]:
     """Start from another run: its mean, perhaps its sigma, and the features that its parameters belong to."""
     other = RunFolder.open(Path(str(config.init_from)))
     theirs = other.read_config()
-    for there, here in ((theirs.policy, config.policy), (theirs.task.state, config.task.state)):
+    same = (
+        (theirs.task.task, config.task.task),
+        (theirs.policy, config.policy),
+        (theirs.task.state, config.task.state),
+    )
+    for there, here in same:
         if there != here:
             raise ConfigError(
                 f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"
@@ -57,7 +63,3 @@ def _taken_over(config: RunConfig, fresh: PGPEState) -> tuple[PGPEState, Feature
     if config.init_sigma == "run":
         state = replace(state, sigma=at.state["sigma"])
     return state, Features(at.frequencies, at.phases)
-
-
-def _policy(config: RunConfig, features: Features) -> Policy:
-    return Policy(config.policy, STATES[config.task.state].size, features)

@@ -4,7 +4,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from farm.messages import Want, WorkerStatus
+from farm.messages import Want
+from farm.reports import WorkerStatus
 
 _WINDOW: Final = 10.0  # [s] over which a worker's rate is taken
 
@@ -47,6 +48,8 @@ class Census:
         return tuple(
             WorkerStatus(
                 worker=name,
+                host=known.want.host,
+                cores=known.want.cores,
                 version=known.want.version,
                 canary=known.want.canary,
                 rollouts=known.rollouts,

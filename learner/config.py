@@ -5,13 +5,14 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, get_args, get_type_hints
 
+from farm import tasks
 from farm.errors import ConfigError
 from farm.policy import PolicyConfig
 from farm.randomness import SEEDS
 from farm.tasks.finger_gait import TaskConfig
-from learner.algorithms import PGPE
+from learner.algorithms import ALGORITHMS, PGPE, Algorithm, name_of
 
 VERSION: Final = 1
 """Version of config.json."""
@@ -25,7 +26,9 @@ class RunConfig:
     """The task."""
     policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(controller="kernel"))
     """The controller."""
-    algorithm: PGPE = field(default_factory=lambda: PGPE(initial_mu=1.75, initial_sigma=0.8, sigma_rule="capped"))
+    algorithm: Algorithm[Any] = field(
+        default_factory=lambda: PGPE(initial_mu=1.75, initial_sigma=0.8, sigma_rule="capped")
+    )
     """The learning rule."""
     seed: int = 0
     """Seed of everything random in the run."""
@@ -46,6 +49,7 @@ class RunConfig:
             raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
         if not 0 <= self.generations <= 10_000_000:
             raise ConfigError(f"generations is {self.generations}; expected 0 to 10000000")
+        self._check_task()
         if self.stop_when_solved is not None and self.stop_when_solved < 1:
             raise ConfigError(f"stop-when-solved is {self.stop_when_solved}; expected 1 or more")
         kinds = {f.name: f.type for f in dataclasses.fields(self)}
@@ -54,14 +58,37 @@ class RunConfig:
             if value not in known:
                 raise ConfigError(f"{name.replace('_', '-')} is {value!r}; known are {', '.join(known)}")
 
+    def _check_task(self) -> None:
+        """See that nothing is asked of a task that it does not have."""
+        if self.stop_when_solved is not None and not tasks.sizes(self.task).success:
+            raise ConfigError(f"--stop-when-solved: {self.task.task} knows returns, but no success")
+        plain = PolicyConfig()
+        if self.task.kind != "finger-gait" and (self.policy.action, self.policy.clip) != (plain.action, plain.clip):
+            raise ConfigError(
+                f"--action and --clip are settings of finger-gait; actions of {self.task.task} are rescaled"
+            )
+
 
 PRESETS: Final[dict[str, RunConfig]] = {
     "default": RunConfig(),
     "thesis": RunConfig(
         task=TaskConfig(), policy=PolicyConfig(), algorithm=PGPE(normaliser="thesis", sigma_rule="bare")
     ),
-}
-"""Configurations by name: what learns most surely, and the thesis' own set-up."""
+    "gym": RunConfig(
+        task=TaskConfig(task="gym:Swimmer-v5", gamma=1.0, perturb=True),
+        policy=PolicyConfig(controller="direct", features=50, bandwidth=3.0),
+        algorithm=PGPE(
+            initial_mu=0.0, initial_sigma=0.1, shaping="ranks", optimiser="clipup", learning_rate_mu=0.1,
+            learning_rate_sigma=0.1, sigma_rule="capped", max_speed=0.2,
+        ),
+    ),
+}  # fmt: skip
+"""Configurations by name: what learns most surely, the thesis' own set-up, and Gymnasium's environments."""
+
+
+def preset_for(kind: str) -> str:
+    """The preset that runs of a kind of task begin with: the one of its name, or `default`."""
+    return kind if kind in PRESETS else "default"
 
 
 def preset(name: str) -> RunConfig:
@@ -75,9 +102,40 @@ def preset(name: str) -> RunConfig:
     return PRESETS[name]
 
 
+def algorithm(name: str) -> type[Algorithm[Any]]:
+    """The algorithm of that name.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    if name not in list(ALGORITHMS):
+        raise ConfigError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]
+
+
+_APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved"}
+
+
+def preset_of(config: RunConfig) -> str:
+    """The preset that a configuration is but for its task's name, seed and length, "own" where it is none."""
+    for name, known in PRESETS.items():
+        if {change[0] for change in changes(known, config)} <= _APART:
+            return name
+    return "own"
+
+
+def properties(config: RunConfig) -> dict[str, str | int]:
+    """What tells a run from others at a glance."""
+    task = {"state": config.task.state, "object": config.task.object}
+    if config.task.kind != "finger-gait":
+        task = {"task": config.task.task}
+    return {"preset": preset_of(config), "controller": config.policy.controller, **task, "seed": config.seed}
+
+
 def to_dict(config: RunConfig) -> dict[str, Any]:
     """As it stands in config.json and in a checkpoint."""
-    return {"version": VERSION, **dataclasses.asdict(config)}
+    named = {"name": name_of(config.algorithm), **dataclasses.asdict(config.algorithm)}
+    return {"version": VERSION, **dataclasses.asdict(config), "algorithm": named}
 
 
 def from_dict(values: object, where: str) -> RunConfig:
@@ -113,16 +171,19 @@ def read(path: Path) -> RunConfig:
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Settings that differ: name, old and new value."""
-    yield from _changes(dataclasses.asdict(old), dataclasses.asdict(new))
+    """Settings that differ: name, old and new value; of another algorithm only those that both have."""
+    before, after = settings(old), settings(new)
+    for name, value in before.items():
+        if name in after and value != after[name]:
+            yield name, value, after[name]
 
 
-def _changes(old: dict[str, Any], new: dict[str, Any]) -> Iterator[tuple[str, object, object]]:
-    for name, value in old.items():
-        if isinstance(value, dict):
-            yield from _changes(value, new[name])
-        elif value != new[name]:
-            yield name.replace("_", "-"), value, new[name]
+def settings(config: RunConfig) -> dict[str, object]:
+    """Every setting by its flag's name; `algorithm` is the algorithm's name."""
+    tables: dict[str, Any] = dataclasses.asdict(config)
+    task, policy, rule = tables.pop("task"), tables.pop("policy"), tables.pop("algorithm")
+    flat = {**task, **policy, "algorithm": name_of(config.algorithm), **rule, **tables}
+    return {name.replace("_", "-"): value for name, value in flat.items()}
 
 
 def _build(kind: type[Any], values: dict[str, Any], prefix: str) -> Any:  # noqa: ANN401  a dataclass of that kind
@@ -130,16 +191,18 @@ def _build(kind: type[Any], values: dict[str, Any], prefix: str) -> Any:  # noqa
     unknown = [prefix + name for name in values if name not in fields]
     if unknown:
         raise ConfigError(f"unknown setting {', '.join(unknown)}")
-    default = kind()
+    default, hints = kind(), get_type_hints(kind)
     made = {}
     for name, value in values.items():
         nested = getattr(default, name)
         if dataclasses.is_dataclass(nested):
             if not isinstance(value, dict):
                 raise ConfigError(f"{prefix}{name} is {value!r}; expected a table of settings")
-            made[name] = _build(type(nested), value, f"{prefix}{name}.")
+            nested_kind = algorithm(value.get("name", "pgpe")) if name == "algorithm" else type(nested)
+            table = {k: v for k, v in value.items() if (name, k) != ("algorithm", "name")}
+            made[name] = _build(nested_kind, table, f"{prefix}{name}.")
         else:
-            made[name] = _scalar(f"{prefix}{name}", nested, value, fields[name].type)
+            made[name] = _scalar(f"{prefix}{name}", nested, value, hints[name])
     return kind(**made)
 
 

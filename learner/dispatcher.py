@@ -5,11 +5,10 @@ One thread, the caller's, owns the ledger and does all publishing; subscriptions
 
 import hashlib
 import logging
-import queue
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -19,18 +18,23 @@ from farm.arrays import FloatArray
 from farm.codec import M
 from farm.errors import MessageError, RunError
 from farm.hand import FINGERS
-from farm.messages import Chunk, Failure, Generation, Job, Refusal, Result, Results, RunStatus, Spec, Want
+from farm.messages import Chunk, Failure, Generation, Job, Refusal, Results, Spec, Want
+from farm.reports import RunStatus, WorkerStatus
 from farm.session import Event, Session
 from farm.tactile import TAXELS
 from learner.admission import Admission
+from learner.attendance import Attendance
 from learner.census import Census
 from learner.ledger.ledger import Ledger, LedgerConfig
 from learner.progress import Progress
+from learner.round import Round
 
 log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] between two looks at whether to stop
 _STATUS: Final = 0.5  # [s] between two refreshments of the status
+_ASK: Final = 0.5  # [s] for the tokens that are there
+_REFUSED: Final = 10_000  # workers that are remembered to be refused
 _PATIENCE: Final = 3.0  # [s] without workers before the user is told
 
 
@@ -47,30 +51,43 @@ class Dispatcher:
         farm: str,
         spec: Spec,
         generations: int,
-        how_to_join: str,
+        how_to_join: str | None,
         stopped: Callable[[], bool],
         admission: Admission,
+        shapes: Mapping[str, tuple[int, ...]],
         ledger: LedgerConfig | None = None,
     ) -> None:
-        """Show the run on the network: subscriptions first, the liveliness token last."""
+        """Show the run on the network: subscriptions first, the liveliness token last.
+
+        Args:
+          session: an open session; this dispatcher reads its events.
+          farm: name of the farm.
+          spec: what the run simulates.
+          generations: until its end, for people who ask.
+          how_to_join: the command by which workers join, for when there are none; None where they join by themselves.
+          stopped: asked now and then, true ends the collecting.
+          admission: who may take part.
+          shapes: of a trajectory's frames.
+          ledger: how jobs are cut into chunks, and when they are given out again.
+        """
         self.run = spec.run
         self.ignored: Counter[str] = Counter()
-        """Messages that were not counted, by kind: stale, doubled, foreign, refused, bad, large, version."""
+        """Messages not counted, by kind: stale, doubled, foreign, absent, refused, bad, large, version, flood."""
         self.admission = admission
         self._session, self._farm, self._stopped = session, farm, stopped
         self._ledger = Ledger(ledger or LedgerConfig())
         self._how_to_join = how_to_join
-        self._trace = (spec.task_config["steps"], len(FINGERS) * TAXELS)
+        self._trace = (spec.task_config["steps"] if spec.traces else 0, len(FINGERS) * TAXELS)
+        self._shapes = shapes
         self._incarnation = secrets.token_hex(8)
         self._spec = codec.encode(spec)
         self._header = Generation(
             run=self.run, incarnation=self._incarnation, round=0, generation=0,
             spec=hashlib.sha256(self._spec).hexdigest(), mu=_NOTHING, sigma=_NOTHING,
         )  # fmt: skip
-        self._jobs: Sequence[Job] = ()
-        self._results: dict[int, Result] = {}
+        self._round: Round | None = None
         self._told: set[str] = set()
-        self._gone: set[str] = set()  # whose last words may still be on the way
+        self._attendance = Attendance()
         self._refused: dict[str, str] = {}
         self._census = Census()
         self._progress: Progress | None = None
@@ -86,14 +103,18 @@ class Dispatcher:
         session.token(keys.learner_token(farm, self.run))
 
     @property
-    def jobs(self) -> Sequence[Job]:
-        """The round's jobs."""
-        return self._jobs
+    def incarnation(self) -> str:
+        """Which start of the run's learner this is."""
+        return self._incarnation
 
     @property
     def workers(self) -> tuple[str, ...]:
         """Workers that take part."""
         return self._ledger.workers
+
+    def census(self) -> tuple[WorkerStatus, ...]:
+        """Workers that take part, with what they did lately."""
+        return self._census.status(time.monotonic())
 
     @property
     def reissued(self) -> int:
@@ -102,22 +123,24 @@ class Dispatcher:
 
     def begin(self, generation: int, mu: FloatArray, sigma: FloatArray, jobs: Sequence[Job]) -> None:
         """Announce a round and hand out its first jobs."""
-        self._jobs, self._results = jobs, {}
         self._header = Generation(
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
             generation=generation, spec=self._header.spec, mu=mu, sigma=sigma,
         )  # fmt: skip
+        chunk = Chunk.of(jobs, run=self.run, incarnation=self._incarnation, round=self._header.round)
+        self._round = Round(chunk, self._trace, self._shapes)
         self._ledger.begin(len(jobs))
         self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
         self._hand_out()
 
-    def collect(self) -> list[Result]:
-        """Wait for the round's results, in the jobs' order.
+    def collect(self) -> Round:
+        """Wait for the results of the round that has begun.
 
         Raises:
           RunError: a job failed on several workers.
           Stopped: the user asked to end.
         """
+        assert self._round is not None
         while not self._ledger.complete:
             for event in self._events():
                 self._take(event)
@@ -126,18 +149,12 @@ class Dispatcher:
             self._tell_status()
             if self._stopped():
                 raise Stopped
-        return [self._results[index] for index in range(len(self._jobs))]
+        return self._round
 
     def _events(self) -> list[Event]:
         """What came, after waiting for it until the next deadline."""
         due = self._ledger.next_deadline(time.monotonic())
-        events = []
-        try:
-            events.append(self._session.events.get(timeout=_WAIT if due is None else max(0.001, min(due, _WAIT))))
-            while True:
-                events.append(self._session.events.get_nowait())
-        except queue.Empty:
-            return events
+        return self._session.events.waiting(_WAIT if due is None else max(0.001, min(due, _WAIT)))
 
     def _take(self, event: Event) -> None:
         try:
@@ -154,8 +171,10 @@ class Dispatcher:
         if want.worker != sender:
             self._ignore("foreign", f"of {want.worker} from {sender}")
             return
-        if want.worker in self._gone:
-            return
+        if self._attendance.asked(want, time.monotonic()):
+            self._admit(want)
+
+    def _admit(self, want: Want) -> None:
         refusal = self.admission.refusal(want)
         if refusal is not None:
             self._refuse(want.worker, refusal)
@@ -163,28 +182,46 @@ class Dispatcher:
         if want.worker not in self._ledger.workers:
             log.info("worker %s joined (release %s)", want.worker, want.version)
         now = time.monotonic()
-        self._ledger.want(want.worker, want.credits, now, idle=want.idle)
+        self._ledger.want(want.worker, want.credits, now, idle=self.run in want.idle)
         self._census.asked(want, now)
 
     def _refuse(self, worker: str, reason: str) -> None:
         """Tell both sides; the worker every time it asks, or it may never hear it."""
         if worker not in self._refused:
             log.warning("worker %s is refused: %s", worker, reason)
-        self._refused[worker] = reason
+        if len(self._refused) < _REFUSED:
+            self._refused[worker] = reason
         message = codec.encode(Refusal(run=self.run, reason=reason))
         self._session.publish(keys.refused(self._farm, worker), message, block=False)
 
     def _liveliness(self, event: Event) -> None:
         worker = keys.tail(event.key, keys.worker_token(self._farm, ""))
         if event.alive:
-            self._gone.discard(worker)
+            self._came(worker)
             return
-        self._gone.add(worker)
+        self._attendance.left(worker)
         self._refused.pop(worker, None)
         self._census.left(worker)
         if worker in self._ledger.workers:
             again = self._ledger.lost(worker)
             log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
+
+    def _came(self, worker: str) -> None:
+        early = self._attendance.came(worker)
+        if early is not None:
+            self._admit(early)
+
+    def _look_who_is_there(self, now: float) -> None:
+        """Of who asks without a token, ask Zenoh: its word that a token came is now and then missed."""
+        if not self._attendance.waiting:
+            return
+        for token in self._session.tokens(keys.worker_token(self._farm, "**"), _ASK):
+            try:
+                self._came(keys.tail(token, keys.worker_token(self._farm, "")))
+            except MessageError as error:
+                self._ignore(error.kind, f"on {token}: {error}")
+        for worker in self._attendance.absent(now):
+            self._ignore("absent", f"of {worker}, whose liveliness token is not there")
 
     def _result(self, event: Event) -> None:
         sender = keys.tail(event.key, keys.result(self._farm, self.run, ""))
@@ -209,44 +246,38 @@ class Dispatcher:
             self._count(message)
 
     def _count(self, message: Results) -> None:
-        good = [result for result in message.results if self._fits(result)]
-        if len(good) < len(message.results):
+        assert self._round is not None
+        good = self._round.fitting(message)
+        indices = message.jobs[good].tolist()
+        if len(indices) < len(good):
             self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
-        verdicts = self._ledger.results(message.worker, [result.index for result in good], time.monotonic())
-        for result, verdict in zip(good, verdicts, strict=True):
-            if verdict == "new":
-                self._results[result.index] = result
-            else:
-                self.ignored[verdict] += 1
-        self._census.did(message.worker, sum(len(result.returns) for result in good), time.monotonic())
-
-    def _fits(self, result: Result) -> bool:
-        if not 0 <= result.index < len(self._jobs):
-            return False
-        job = self._jobs[result.index]
-        rollouts, seen = len(job.signs), job.rate != "none"
-        return result.traces.shape == (rollouts, *self._trace) and (result.trajectory is not None) == seen
+        if not indices:
+            return
+        verdicts = self._ledger.results(message.worker, indices, time.monotonic())
+        new = good.copy()
+        new[good] = [verdict == "new" for verdict in verdicts]
+        self._round.put(message, new)
+        self.ignored.update(verdict for verdict in verdicts if verdict != "new")
+        self._census.did(message.worker, int(message.rollouts[good].sum()), time.monotonic())
 
     def _failed(self, failure: Failure) -> None:
-        if not 0 <= failure.index < len(self._jobs):
+        if self._round is None or not 0 <= failure.index < len(self._round):
             self.ignored["bad"] += 1
             return
         log.warning("job %d failed on worker %s: %s", failure.index, failure.worker, failure.error)
         if self._ledger.error(failure.worker, failure.index, time.monotonic()):
-            seed = self._jobs[failure.index].perturbation
+            [job] = self._round.jobs.take([failure.index]).split()
             raise RunError(
-                f"pair {failure.index} of generation {self._header.generation} (perturbation seed {seed}) failed "
-                f"wherever it was tried, last with {failure.error}"
+                f"pair {failure.index} of generation {self._header.generation} (perturbation seed {job.perturbation}) "
+                f"failed wherever it was tried, last with {failure.error}"
             )
 
     def _hand_out(self) -> None:
+        assert self._round is not None
         for worker, indices in self._ledger.assign(time.monotonic()):
-            chunk = Chunk(
-                run=self.run, incarnation=self._incarnation, round=self._header.round,
-                jobs=tuple(self._jobs[index] for index in indices),
-            )  # fmt: skip
             # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
-            self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)
+            chunk = codec.encode(self._round.jobs.take(indices))
+            self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
     def report(self, progress: Progress) -> None:
         """Take in how the last generation went, for people who ask."""
@@ -258,7 +289,10 @@ class Dispatcher:
         if now < self._status_due:
             return
         self._status_due = now + _STATUS
-        last = self._progress
+        self._look_who_is_there(now)
+        last, flood = self._progress, self._session.events.dropped
+        if flood:
+            self.ignored["flood"] = flood
         status = RunStatus(
             run=self.run,
             generation=self._header.generation,
@@ -269,13 +303,13 @@ class Dispatcher:
             reissued=self._ledger.reissued,
             refused=len(self._refused),
             ignored=dict(self.ignored),
-            workers=self._census.status(now),
+            workers=self.census(),
         )
         self._status = codec.encode(status)
 
     def _tell_when_alone(self) -> None:
         now = time.monotonic()
-        if self._ledger.workers:
+        if self._ledger.workers or self._how_to_join is None:
             self._alone = now
         elif now - self._alone > _PATIENCE:
             log.warning("no workers; start some with: %s", self._how_to_join)

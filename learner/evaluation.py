@@ -24,8 +24,10 @@ class Evaluation:
 
     mean: Result
     """One rollout under nominal conditions, at physics rate."""
-    robust_success_rate: float
-    """Part of the perturbed rollouts that succeeded."""
+    robust_success_rate: float | None
+    """Part of the perturbed rollouts that succeeded; None where the task knows no success."""
+    robust_return: float
+    """Mean return of the perturbed rollouts."""
     replay: Trajectory | None
     """The best rollout of the run at physics rate, if it has not been shown yet."""
 

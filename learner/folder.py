@@ -25,7 +25,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm.arrays import FloatArray, IntArray
 from farm.errors import CheckpointError, ConfigError
 from learner import checkpoint as checkpoints
 from learner import config as configs
@@ -189,6 +189,20 @@ class RunFolder:
         kind = _row_type(head["parameters"])
         return np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
 
+    def mean(self, generation: int) -> FloatArray:
+        """The mean mu after a generation, (P,).
+
+        Raises:
+          ConfigError: it is not in `parameters`; says what is.
+        """
+        rows = self.parameters()
+        kept = rows["generation"]
+        found = np.flatnonzero(kept == generation)
+        if not len(found):
+            raise ConfigError(f"generation {generation} is not stored in {self.path}: {_offer(kept, generation)}")
+        mu: FloatArray = rows["mu"][found[0]]
+        return mu
+
     def save(self, checkpoint: Checkpoint) -> None:
         """Replace the checkpoint."""
         checkpoints.save(self.checkpoint, checkpoint)
@@ -218,6 +232,14 @@ def every(parameters: int, generations: int) -> int:
     """Every how many generations are kept, so that the file stays below PARAMETERS_LIMIT."""
     size = _row_type(parameters).itemsize * max(generations, 1)
     return max(1, math.ceil(size / PARAMETERS_LIMIT))
+
+
+def _offer(kept: IntArray, wanted: int) -> str:
+    """Which generations there are instead of the wanted one."""
+    if not len(kept):
+        return "none is"
+    nearest = kept[np.abs(kept - wanted).argmin()]
+    return f"{len(kept)} from {kept[0]} to {kept[-1]} are, the nearest is {nearest}"
 
 
 def _row_type(parameters: int) -> "np.dtype[Any]":

@@ -3,19 +3,19 @@
 import hashlib
 import logging
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from farm import randomness
-from farm.arrays import AnyArray, FloatArray
+from farm import randomness, tasks
+from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import CheckpointError, RunError
 from farm.messages import Job, Result, Spec
 from farm.trajectory import Trajectory
 from learner import config as configs
-from learner.algorithms import PGPEState
+from learner.algorithms import SearchState
 from learner.beginning import specification
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
@@ -23,28 +23,13 @@ from learner.dispatcher import Dispatcher
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, evaluation_jobs, mean_job
 from learner.folder import RunFolder
 from learner.progress import Progress
+from learner.report import Report
+from learner.round import Round
 
 log = logging.getLogger(__name__)
 
 REPLAY_EVERY: Final = 10
 """Generations between two recordings of the best rollout at physics rate: near its end, most bring a new best."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """A generation that is over."""
-
-    progress: Progress
-    rate: float
-    """Rollouts a second over this generation."""
-    sample: Trajectory | None
-    """The mean policy's rollout."""
-    traces: Mapping[str, AnyArray]
-    """Tactile traces: `best` and `worst` (T, 54), and `all` (2N, T, 54) if the run keeps them."""
-    replay: Trajectory | None
-    """The best rollout so far at physics rate, once there is a new one."""
-    replay_generation: int
-    """The generation the replayed rollout came from."""
 
 
 class Learner:
@@ -59,10 +44,13 @@ class Learner:
         # The replay of the best is shown again: replay.rrd is written anew by whoever ends the run.
         self.config, self.folder, self._at = config, folder, replace(at, replayed=at.best is None)
         try:
-            self.state: PGPEState = config.algorithm.restore(at.state)
+            self.state: SearchState = config.algorithm.restore(at.state)
         except ValueError as error:
             raise CheckpointError(f"{folder.checkpoint}: {error}") from None
         self._before = at.reissued
+        sizes = tasks.sizes(config.task)
+        self._signs = config.algorithm.signs()
+        self._judged, self._keep = sizes.success, config.traces if sizes.fingers else "none"
         folder.save(self._at)
 
     @property
@@ -99,9 +87,9 @@ class Learner:
             return
         eps = self._explore(farm)
         while not self.over:
-            results, jobs, last = farm.collect(), farm.jobs, self._at
-            rows = results[: len(eps)]
-            returns = np.stack([result.returns for result in rows])
+            results, last = farm.collect(), self._at
+            rollouts = len(eps) * len(self._signs)  # the jobs behind them are the mean policy's, and perhaps the best's
+            returns = results.returns[:rollouts].reshape(len(eps), len(self._signs))
             before = self.state
             self.state = self.config.algorithm.tell(before, eps, returns)
             self._note(before, eps, results, returns, time.monotonic() - begun, farm)
@@ -121,8 +109,8 @@ class Learner:
                 progress=progress,
                 rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
                 sample=_trajectory(results[len(eps)]),
-                traces=_traces(rows, returns, self.config.traces),
-                replay=_trajectory(results[-1]) if len(jobs) > len(rows) + 1 else None,
+                traces=_traces(results.traces[:rollouts], returns, self._keep),
+                replay=_trajectory(results[-1]) if len(results) > len(eps) + 1 else None,
                 replay_generation=last.best_generation,
             )
 
@@ -132,10 +120,10 @@ class Learner:
         best = self._replay_job(len(jobs))
         farm.begin(self.state.generation, self.state.mu, self.state.sigma, [*jobs, *best])
         results = farm.collect()
-        trials = results[:EVALUATION_ROLLOUTS]
         return Evaluation(
             mean=results[EVALUATION_ROLLOUTS],
-            robust_success_rate=float(np.mean([result.success[0] for result in trials])),
+            robust_success_rate=self._success(results.flags[:EVALUATION_ROLLOUTS]),
+            robust_return=float(np.mean(results.returns[:EVALUATION_ROLLOUTS])),
             replay=_trajectory(results[-1]) if best else None,
         )
 
@@ -152,9 +140,10 @@ class Learner:
             "rollouts": self._at.rollouts,
             "best_return": self.state.best,
             "mean_policy_return": float(mean.returns[0]) if mean else None,
-            "mean_policy_success": bool(mean.success[0]) if mean else None,
+            "mean_policy_success": bool(mean.success[0]) if mean and self._judged else None,
             "success_rate": rates[-1] if rates else None,
             "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
+            "robust_return": evaluation.robust_return if evaluation else None,
             "parameters_sha256": hashlib.sha256(numbers).hexdigest(),
             "seconds": round(self._at.seconds, 3),
             "rollouts_per_second": round(self._at.rollouts / self._at.seconds, 1) if self._at.seconds else None,
@@ -172,12 +161,11 @@ class Learner:
         """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
         config, state = self.config, self.state
         eps = config.algorithm.ask(state, randomness.exploration(config.seed, state.generation))
-        signs = (1, -1) if config.algorithm.estimator == "symmetric" else (1,)
         jobs = [
             Job(
                 index=i,
                 origin="mu",
-                signs=signs,
+                signs=self._signs,
                 perturbation=self._perturbation(state.generation, i),
                 rate="none",
                 eps=row,
@@ -200,9 +188,9 @@ class Learner:
 
     def _note(
         self,
-        before: PGPEState,
+        before: SearchState,
         eps: FloatArray,
-        results: list[Result],
+        results: Round,
         returns: FloatArray,
         seconds: float,
         farm: Dispatcher,
@@ -212,7 +200,7 @@ class Learner:
         replayed = self._at.replayed or len(results) > len(eps) + 1
         if before.best is None or returns.max() > before.best:
             row, column = np.unravel_index(int(returns.argmax()), returns.shape)
-            theta = before.mu + (1, -1)[column] * eps[row]
+            theta = before.mu + self.config.algorithm.signs()[column] * eps[row]
             seed = self._perturbation(before.generation, int(row))
             best = Job(index=0, origin="zero", signs=(1,), perturbation=seed, rate="none", eps=theta)
             generation, replayed = self.state.generation, False
@@ -230,8 +218,9 @@ class Learner:
             replayed=replayed,
         )
 
-    def _progress(self, results: list[Result], returns: FloatArray, farm: Dispatcher) -> Progress:
-        state, rows, mean = self.state, results[: len(returns)], results[len(returns)]
+    def _progress(self, results: Round, returns: FloatArray, farm: Dispatcher) -> Progress:
+        state, flags, mean = self.state, results.flags[: returns.size], results[len(returns)]
+        _, dropped, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
         return Progress(
             generation=state.generation,
             rollouts=self._at.rollouts,
@@ -242,19 +231,23 @@ class Learner:
             best=float(returns.max()) if state.best is None else state.best,
             baseline=state.baseline,
             mean_policy_return=float(mean.returns[0]),
-            mean_policy_success=bool(mean.success[0]),
-            success_rate=float(np.mean([result.success for result in rows])),
+            mean_policy_success=bool(mean.success[0]) if self._judged else None,
+            success_rate=self._success(flags),
             sigma_mean=float(state.sigma.mean()),
             sigma_min=float(state.sigma.min()),
             sigma_max=float(state.sigma.max()),
             mean_norm=float(np.linalg.norm(state.mu)),
-            dropped=int(sum(result.dropped.sum() for result in rows)),
-            failed=int(sum(result.failed.sum() for result in rows)),
-            clamped=int(sum(result.clamped.sum() for result in rows)),
+            dropped=dropped,
+            failed=failed,
+            clamped=clamped,
             reissued=self._at.reissued,
             workers=len(farm.workers),
             seconds=round(self._at.seconds, 3),
         )
+
+    def _success(self, flags: BoolArray) -> float | None:
+        """Part of the rollouts (S, 4) that succeeded, if the task knows success."""
+        return float(np.mean(flags[:, 0])) if self._judged else None
 
     def _save(self, progress: Progress) -> None:
         self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
@@ -265,11 +258,10 @@ def _trajectory(result: Result) -> Trajectory | None:
     return result.trajectory.trajectory() if result.trajectory else None
 
 
-def _traces(rows: list[Result], returns: FloatArray, keep: str) -> dict[str, AnyArray]:
-    """The traces that are kept, by name."""
+def _traces(traces: AnyArray, returns: FloatArray, keep: str) -> dict[str, AnyArray]:
+    """Those of the rollouts' traces (S, T, 54) that are kept, by name."""
     if keep == "none":
         return {}
-    traces = np.concatenate([result.traces for result in rows])
     flat = returns.reshape(-1)
     kept = {"best": traces[int(flat.argmax())], "worst": traces[int(flat.argmin())]}
     return {**kept, "all": traces} if keep == "all" else kept

@@ -1,7 +1,7 @@
 """What is known of a generation that is over; one line of progress.jsonl. Pure."""
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Final
+from typing import Any, Final, cast
 
 VERSION: Final = 1
 """Version of a line of progress.jsonl."""
@@ -29,10 +29,10 @@ class Progress:
     """Baseline after the update, None where the algorithm has none."""
     mean_policy_return: float
     """Return of the mean policy that the generation explored around, unperturbed."""
-    mean_policy_success: bool
-    """Whether that rollout succeeded."""
-    success_rate: float
-    """Part of the rollouts that succeeded."""
+    mean_policy_success: bool | None
+    """Whether that rollout succeeded, None where the task knows no success."""
+    success_rate: float | None
+    """Part of the rollouts that succeeded, None where the task knows no success."""
     sigma_mean: float
     """Mean of sigma after the update."""
     sigma_min: float
@@ -63,11 +63,14 @@ class Progress:
         """Read a line back.
 
         Raises:
-          ValueError: another version, or a field is missing.
+          ValueError: another version, or a field is missing or of another type.
         """
         if not isinstance(values, dict) or values.get("version") != VERSION:
             raise ValueError(f"not a line of progress.jsonl, version {VERSION}: {str(values)[:80]}")
         missing = [f.name for f in fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f"progress line without {', '.join(missing)}")
+        for f in fields(cls):
+            if not isinstance(values[f.name], cast("type", f.type)):
+                raise ValueError(f"progress line whose {f.name} is {str(values[f.name])[:40]!r}")
         return cls(**{f.name: values[f.name] for f in fields(cls)})

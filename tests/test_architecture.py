@@ -12,24 +12,36 @@ PACKAGES = ("farm", "workers", "learner", "assets")
 MAY_IMPORT = {"assets": set(), "farm": {"assets"}, "workers": {"farm"}, "learner": {"farm"}}
 """Of the project's own packages."""
 
-KNOWS_BOTH_SIDES = ("farm/__main__.py", "farm/local.py", "farm/commands/")
+KNOWS_BOTH_SIDES = (
+    *("farm/__main__.py", "farm/commands/", "farm/local.py", "farm/finished.py", "farm/export.py"),
+    *("farm/experiments.py", "farm/measuring.py", "farm/chaining.py"),
+)
 """The front door."""
 
 DOORS = {
     "zenoh": ("farm/session.py",),
     "msgpack": ("farm/codec.py",),
     "tyro": ("farm/arguments.py", "farm/commands/"),
-    "mujoco": ("farm/scene.py", "workers/grip.py", "workers/simulation.py"),
+    "mujoco": (
+        *("farm/gym.py", "farm/scene.py", "farm/rendering.py", "farm/playing.py"),
+        "workers/",
+    ),
+    "gymnasium": ("farm/gym.py", "workers/environment.py"),
     "rerun": ("learner/recording/",),
+    "matplotlib": ("learner/experiments/figures.py",),
+    "rerun_cli": ("learner/recording/",),
     "rich": ("farm/commands/",),
     "cryptography": ("farm/commands/certificates.py",),
+    "PIL": ("farm/video.py",),
+    "imageio_ffmpeg": ("farm/video.py",),
 }
 """The only modules that may import a package from outside."""
 
 PURE = (
     *("farm/arrays.py", "farm/errors.py", "farm/hand.py", "farm/keys.py", "farm/policy.py", "farm/rewards.py"),
     *("farm/states.py", "farm/tactile.py", "farm/trajectory.py", "farm/tasks/", "learner/algorithms/"),
-    *("learner/ledger/", "learner/progress.py"),
+    *("learner/ledger/", "learner/progress.py", "workers/jobs.py"),
+    *(f"learner/experiments/{name}.py" for name in ("experiment", "catalogue", "claims", "findings", "shapes")),
 )
 """Modules without network, simulator, clock or file."""
 

@@ -27,3 +27,10 @@ def test_learn_overwrites_nothing(tmp_path: Path) -> None:
     assert ended.returncode == 1
     assert "never overwritten" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_random_actions_play_episodes(tmp_path: Path) -> None:
+    command = [sys.executable, LEARN.parent / "gymnasium_random.py", "--episodes", "2"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert [line.split(":")[0] for line in said.splitlines()] == ["episode 0", "episode 1"]
+    assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())

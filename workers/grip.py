@@ -14,7 +14,7 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.hand import FINGER_JOINTS, FINGERS, LOWER, UPPER
-from farm.scene import Scene
+from farm.scene import HandScene
 
 PRESS: Final = {"index": 4.0, "middle": 3.0, "thumb": 6.5}
 """Force with which a finger is told to press [N]; the object's weight and friction share it out."""
@@ -35,7 +35,7 @@ _REACH: Final = 0.06
 class Grasping:
     """Inverse kinematics and touch for one scene."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: HandScene) -> None:
         """Look at the scene in its start configuration, hand bent and object in place."""
         self.scene = scene
         self.data = mujoco.MjData(scene.model)

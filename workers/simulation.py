@@ -21,7 +21,7 @@ from farm.errors import ConfigError
 from farm.hand import FINGERS, GRIPS, JOINTS
 from farm.policy import Policy
 from farm.rewards import Demonstration
-from farm.scene import CONTACT_WIDTH, CONTACTS, Scene
+from farm.scene import CONTACT_WIDTH, CONTACTS, HandScene
 from farm.tasks.finger_gait import SUBSTEPS, FingerGait, Frames, Outcome, Perturbation, TaskConfig, touching
 from workers.grip import Grasping
 
@@ -40,7 +40,8 @@ SETTLE: Final = 50
 HOLD: Final = 200
 """Physics steps from the release for which a grip must hold the object by itself to be taken."""
 
-_LIMIT: Final = 1e8  # a state beyond it has blown up, finite or not
+LIMIT: Final = 1e8
+"""A state beyond it has blown up, finite or not."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Rollouts:
 class Stepper:
     """A mujoco.batch of simulations of one scene, with what is measured bound."""
 
-    def __init__(self, scene: Scene, capacity: int, *, perturbed: bool, threads: int = 1) -> None:
+    def __init__(self, scene: HandScene, capacity: int, *, perturbed: bool, threads: int = 1) -> None:
         """Perturbed simulations have friction and mass of their own."""
         self.scene = scene
         self.batch = mujoco.batch.Batch(scene.model, capacity, threads)
@@ -121,7 +122,7 @@ class Stepper:
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Whose state is no longer a reasonable number, (n,)."""
-        return np.asarray(~(np.abs(self.state[ids]) < _LIMIT).all(axis=1))
+        return np.asarray(~(np.abs(self.state[ids]) < LIMIT).all(axis=1))
 
     def set_conditions(self, perturbations: Sequence[Perturbation]) -> None:
         """Give the first simulations the friction and mass of these perturbations."""
@@ -184,9 +185,9 @@ class Simulation:
 
     def _run(self, theta: FloatArray, perturbations: list[Perturbation | None], substeps: int) -> Rollouts:
         count, steps = len(theta), self.task.config.steps
-        stepper, start, noise = self._begin(perturbations)
+        stepper, start, noise = self.begin(perturbations)
         weights = self.policy.weights(theta)
-        record = _Recording(count, steps, SUBSTEPS // substeps, start.frames)
+        record = Recording(count, steps, SUBSTEPS // substeps, start.frames)
         last = np.broadcast_to(self._commands, (count, len(JOINTS)))
         now = start.frames
         active = np.arange(count)
@@ -210,12 +211,12 @@ class Simulation:
                     break
         return record.rollouts(self.task)
 
-    def _begin(self, perturbations: list[Perturbation | None]) -> tuple[Stepper, Start, FloatArray | None]:
+    def begin(self, perturbations: list[Perturbation | None]) -> tuple[Stepper, Start, FloatArray | None]:
         """Put as many simulations as there are perturbations at their moment of release."""
         count = len(perturbations)
         real = [p for p in perturbations if p is not None]
         if not real:
-            start = Start(np.repeat(self.start.rows, count, axis=0), _take(self.start.frames, [0] * count))
+            start = Start(np.repeat(self.start.rows, count, axis=0), self.start.frames.at([0] * count))
             self._nominal.state[:count] = start.rows
             return self._nominal, start, None
         if self._perturbed is None:
@@ -226,7 +227,7 @@ class Simulation:
         displaced = np.stack([real[i].displacement for i in own])
         start = self._close(self._perturbed, self._commands, displaced, np.array(own))
         copies = [own.index(first[id(p)]) for p in real]
-        start = Start(start.rows[copies], _take(start.frames, copies))
+        start = Start(start.rows[copies], start.frames.at(copies))
         self._perturbed.state[:count] = start.rows
         return self._perturbed, start, np.stack([p.noise for p in real])
 
@@ -265,10 +266,11 @@ class Simulation:
         return Demonstration(joints=frames.joints[0], images=images[0], points=tactile.contact_points(images)[0])
 
 
-class _Recording:
-    """Arrays that a chunk of rollouts is written into."""
+class Recording:
+    """Arrays that rollouts are written into as they go on."""
 
     def __init__(self, count: int, steps: int, parts: int, start: Frames) -> None:
+        """Make room for rollouts that start like this (B,), a frame each part of a control step."""
         self.parts = parts
         self.start = start
         shape = (count, steps * parts)
@@ -283,15 +285,18 @@ class _Recording:
         self.failed = np.zeros(count, dtype=bool)
 
     def act(self, t: int, active: IntArray, actions: FloatArray, targets: FloatArray) -> None:
+        """Note what rollouts (n,) do in a control step, (n, 8) each."""
         self.actions[active, t], self.targets[active, t] = actions, targets
 
     def measure(self, t: int, part: int, active: IntArray, now: Frames) -> None:
+        """Note what is measured of them after a part of it."""
         frame = t * self.parts + part
         self.frames.qpos[active, frame] = now.qpos
         self.frames.force[active, frame] = now.force
         self.frames.place[active, frame] = now.place
 
     def end(self, t: int, ended: IntArray, failed: IntArray) -> None:
+        """Note which rollouts this step ended, and in which of them the physics blew up."""
         self.steps[ended] = t + 1
         self.failed[failed] = True
         frames = slice(t * self.parts, (t + 1) * self.parts)
@@ -299,14 +304,11 @@ class _Recording:
             values[failed, frames] = 0.0  # no number of a blown-up state goes any further
 
     def rollouts(self, task: FingerGait) -> Rollouts:
+        """Judge them, when all are over."""
         at = slice(self.parts - 1, None, self.parts)
         control = Frames(self.frames.qpos[:, at], self.frames.force[:, at], self.frames.place[:, at])
         outcome = task.judge(control, self.actions, self.start.pose, self.steps, self.failed)
         return Rollouts(outcome, self.start, self.frames, self.targets, self.actions)
-
-
-def _take(frames: Frames, rows: Sequence[int] | IntArray) -> Frames:
-    return Frames(frames.qpos[rows], frames.force[rows], frames.place[rows])
 
 
 def _reorder(parts: list[Rollouts], order: IntArray) -> Rollouts:

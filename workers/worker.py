@@ -7,7 +7,6 @@ not to a run: it builds each run's task from its specification and serves runs i
 import hashlib
 import logging
 import os
-import queue
 import secrets
 import socket
 import time
@@ -28,10 +27,12 @@ from workers.backends import BACKENDS, Backend
 log = logging.getLogger(__name__)
 
 IDLE: Final = 1.0
-"""A worker without work for so long says so, and again every time [s]."""
+"""A worker without work of a run for so long says so, and again every time [s]."""
 
 _ASK: Final = 1.0  # [s] for an answer to a query
-_KEEP: Final = 8  # runs whose tasks are kept built
+_KEEP: Final = 32  # runs whose tasks are kept built: as many learners may share us
+_RUNS: Final = 1000  # that are served side by side
+_HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below
 _TELL: Final = 1000  # different lines that are said once
 
 
@@ -51,6 +52,8 @@ class WorkerConfig:
     """Give up when nobody answers for so long at the start [s]; None: keep trying."""
     backend: str = "cpu"
     """What simulates: cpu."""
+    allow_gym: bool = False
+    """Serve runs of Gymnasium's environments as well (--task gym:NAME), of those that are installed here."""
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""
@@ -83,6 +86,8 @@ class _Served:
 
     header: Generation | None = None
     chunks: deque[Chunk] = field(default_factory=deque)
+    busy: float = field(default_factory=time.monotonic)
+    """When it last had work, or we said that it has none [s]."""
 
 
 def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
@@ -97,6 +102,7 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
         log.info("joined farm %s as %s", config.farm, worker.id)
         while not stopped():
             worker.turn()
+        worker.leave()
 
 
 class Worker:
@@ -110,7 +116,7 @@ class Worker:
         self._runs: OrderedDict[str, _Served] = OrderedDict()
         self._backends: OrderedDict[str, Backend | Exception] = OrderedDict()
         self._assets, self._canary = scene.digest(), canary.digest()
-        self._busy = time.monotonic()
+        self._spoke = time.monotonic()
         self._told: set[str] = set()
 
     def join(self) -> None:
@@ -129,24 +135,20 @@ class Worker:
                 self._take(event)
             except MessageError as error:
                 self._tell(logging.WARNING, f"ignored a message on {event.key}: {error}")
+        self._tell_idle()
         chunk = self._next()
         if chunk is not None:
             self._run(chunk)
-            self._busy = time.monotonic()
-        elif time.monotonic() - self._busy >= IDLE:
-            self._want(idle=True)
-            self._busy = time.monotonic()
+
+    def leave(self) -> None:
+        """Hand back everything that is not done; what is done arrives before."""
+        self._want(idle=tuple(self._runs), credits=0)
 
     def _events(self) -> list[Event]:
         """What is waiting, headers first; waits a little when there is nothing to do."""
-        waiting = any(run.chunks for run in self._runs.values())
-        events = []
-        try:
-            events.append(self._session.events.get(timeout=0.0 if waiting else 0.2))
-            while True:
-                events.append(self._session.events.get_nowait())
-        except queue.Empty:
-            return sorted(events, key=lambda event: event.topic == "inbox")
+        working = any(run.chunks for run in self._runs.values())
+        events = self._session.events.waiting(0.0 if working else 0.2)
+        return sorted(events, key=lambda event: event.topic == "inbox")
 
     def _take(self, event: Event) -> None:
         if event.topic == "generation":
@@ -156,10 +158,28 @@ class Worker:
         elif event.topic == "refused":
             refusal = codec.decode(event.payload, Refusal)
             self._tell(logging.ERROR, f"run {refusal.run} does not take this worker: {refusal.reason}")
-        elif event.alive:
-            self._want(idle=False)
         else:
-            self._runs.pop(keys.tail(event.key, keys.learner_token(self._config.farm, "")), None)
+            self._learner(keys.tail(event.key, keys.learner_token(self._config.farm, "")), there=event.alive)
+
+    def _learner(self, run: str, *, there: bool) -> None:
+        """A run's learner came or went."""
+        if not there:
+            self._runs.pop(run, None)
+            return
+        self._served(run)
+        self._want(idle=())
+
+    def _tell_idle(self) -> None:
+        """Say of which runs we have nothing: other runs' work does not make up for what got lost on the way.
+
+        Without any work say that we are here: a learner whose token was missed hears it as well.
+        """
+        now, working = time.monotonic(), any(run.chunks for run in self._runs.values())
+        idle = [name for name, run in self._runs.items() if not run.chunks and now - run.busy >= IDLE]
+        for name in idle:
+            self._runs[name].busy = now
+        if idle or (not working and now - self._spoke >= IDLE):
+            self._want(idle=tuple(idle))
 
     def _tell(self, level: int, text: str) -> None:
         """Say something once."""
@@ -169,23 +189,33 @@ class Worker:
 
     def _begin(self, header: Generation) -> None:
         """A new round: work of older ones is void."""
-        run = self._runs.setdefault(header.run, _Served())
+        run = self._served(header.run)
         old = run.header
         if old and (old.incarnation, old.round) == (header.incarnation, header.round):
             return
-        run.header = header
+        run.header, run.busy = header, time.monotonic()
         run.chunks.clear()
 
     def _accept(self, chunk: Chunk) -> None:
-        run = self._runs.setdefault(chunk.run, _Served())
+        run = self._served(chunk.run)
         if not _belongs(chunk, run.header):
             payload = self._session.ask(keys.generation(self._config.farm, chunk.run), _ASK)
             if payload is not None:
                 self._begin(codec.decode(payload, Generation))
-        if _belongs(chunk, run.header):
+        if _belongs(chunk, run.header) and len(run.chunks) < _HELD:
             run.chunks.append(chunk)
         else:
             log.debug("dropped a chunk of round %s of run %s", chunk.round, chunk.run)
+
+    def _served(self, run: str) -> _Served:
+        """What we know of a run.
+
+        Raises:
+          MessageError: there are more runs than anybody honest has.
+        """
+        if run not in self._runs and len(self._runs) >= _RUNS:
+            raise MessageError(f"run {run[:40]}: {_RUNS} runs are served already", "large")
+        return self._runs.setdefault(run, _Served())
 
     def _next(self) -> Chunk | None:
         """A chunk of the run that has waited longest."""
@@ -199,14 +229,15 @@ class Worker:
         header = self._runs[chunk.run].header
         assert header is not None
         backend = self._backend(header)
+        self._runs[chunk.run].busy = time.monotonic()
         if backend is None:
             return
         if isinstance(backend, Exception):
-            for job in chunk.jobs:
-                self._fail(chunk, job.index, backend)
+            for index in chunk.jobs.tolist():
+                self._fail(chunk, index, backend)
             return
-        jobs = list(chunk.jobs)
-        if len(header.mu) != backend.parameters or any(j.eps.size not in (0, backend.parameters) for j in jobs):
+        jobs = chunk.split()
+        if len(header.mu) != backend.parameters or (len(chunk.eps) and chunk.eps.shape[1] != backend.parameters):
             log.warning("ignored jobs of run %s: not %d parameters", chunk.run, backend.parameters)
             return
         try:
@@ -219,12 +250,10 @@ class Worker:
                     results += backend.run(header.mu, [job])
                 except Exception as error:
                     self._fail(chunk, job.index, error)
-        self._answer(
-            chunk,
-            Results(
-                run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.id, results=tuple(results)
-            ),
-        )
+        self._runs[chunk.run].busy = time.monotonic()
+        if results:
+            head = {"incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
+            self._answer(chunk, Results.of(results, run=chunk.run, **head))
 
     def _backend(self, header: Generation) -> Backend | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
@@ -235,6 +264,8 @@ class Worker:
                 return None
             try:
                 spec = codec.decode(payload, Spec)
+                if spec.task.startswith("gym") and not self._config.allow_gym:
+                    raise ConfigError(f"this worker serves no {spec.task[:80]}: start it with --allow-gym")
                 self._backends[header.spec] = BACKENDS[self._config.backend](spec)
                 log.info("serving run %s", header.run)
             except Exception as error:  # the learner is told, and decides
@@ -259,17 +290,19 @@ class Worker:
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
         self._session.publish(keys.result(self._config.farm, chunk.run, self.id), codec.encode(message))
 
-    def _want(self, *, idle: bool) -> None:
-        capacity = BACKENDS[self._config.backend].capacity
+    def _want(self, *, idle: tuple[str, ...], credits: int | None = None) -> None:
+        capacity, self._spoke = BACKENDS[self._config.backend].capacity, time.monotonic()
         message = Want(
             worker=self.id,
-            credits=2 * capacity,
+            credits=2 * capacity if credits is None else credits,
             idle=idle,
             version=__version__,
             assets=self._assets,
             canary=self._canary,
+            host=socket.gethostname(),
+            cores=os.cpu_count() or 1,
         )
-        self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=True)
+        self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=not idle)
 
 
 def _belongs(chunk: Chunk, header: Generation | None) -> bool:

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from farm import arguments
+from farm import arguments, tasks
 from farm.errors import ConfigError
 from farm.local import simulate
 from farm.randomness import SEEDS
@@ -53,8 +53,9 @@ def main(words: Sequence[str]) -> int:
         table.add_column(column, justify="left" if column == "conditions" else "right")
     for name in ("nominal", "perturbed"):
         row = figures[name]
+        success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
         returns = [f"{row[key]:.3f}" for key in ("return_mean", "return_min", "return_max")]
-        table.add_row(name, str(row["rollouts"]), f"{row['success_rate']:.0%}", *returns, str(row["dropped"]))
+        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["dropped"]))
     Console().print(table)
     return 0
 
@@ -62,13 +63,14 @@ def main(words: Sequence[str]) -> int:
 def evaluate(folder: RunFolder, rollouts: int, seed: int) -> dict[str, Any]:
     """The figures, as the JSON shows them."""
     generation, results = simulate(folder, evaluation_jobs(rollouts, seed))
+    judged = tasks.sizes(folder.read_config().task).success
     parts = {"nominal": results[rollouts:], "perturbed": results[:rollouts]}
     figures: dict[str, Any] = {"run": folder.name, "generation": generation, "seed": seed}
     for name, part in parts.items():
         returns = np.array([result.returns[0] for result in part])
         figures[name] = {
             "rollouts": len(part),
-            "success_rate": float(np.mean([result.success[0] for result in part])),
+            "success_rate": float(np.mean([result.success[0] for result in part])) if judged else None,
             "return_mean": float(returns.mean()),
             "return_min": float(returns.min()),
             "return_max": float(returns.max()),

@@ -6,10 +6,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from farm import arguments, keys
+from farm.commands.display import Style
 from farm.errors import ConfigError
 from farm.session import check_endpoint
+from farm.tasks import TASKS
 from learner import config as configs
-from learner.config import RunConfig, changes
+from learner.algorithms import name_of
+from learner.config import RunConfig, changes, preset_for
 from learner.folder import RunFolder
 
 
@@ -18,11 +21,15 @@ class LearnerOptions:
     """Where a run comes from, where it goes, and who may watch."""
 
     preset: str = "default"
-    """Settings to begin with: default | thesis."""
+    """Settings to begin with: default | thesis; gym with gym: tasks."""
+    algorithm: str | None = None
+    """Learning algorithm, by name: pgpe. Another than the one to begin with has its own settings, at its defaults."""
     config: Path | None = None
     """Settings to begin with: a config.json (other flags override it)."""
     resume: Path | None = None
     """Go on with the run in this folder; --generations may extend it."""
+    resume_existing: bool = False
+    """Go on with the run of that --name if there is one, begin it otherwise: for learners that others start again."""
     out: Path = Path("runs")
     """Folder that run folders are made in."""
     name: str = ""
@@ -43,14 +50,27 @@ class LearnerOptions:
     """Admit workers whose machines round differently: faster than waiting for equal ones, but not repeatable."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
+    quiet: bool = False
+    """Say only warnings and, in the end, what came out."""
+    json: bool = False
+    """Write a JSON object a line: the run, each generation, the summary."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
+
+    @property
+    def style(self) -> Style:
+        """How the run is shown."""
+        return "json" if self.json else "quiet" if self.quiet else "auto"
 
     def __post_init__(self) -> None:
         """Check every value."""
         keys.checked("farm", self.farm)
         if self.name:
             keys.checked("run", self.name)
+        elif self.resume_existing:
+            raise ConfigError("--resume-existing needs --name: the run that is begun once and gone on with later")
+        if self.quiet and self.json:
+            raise ConfigError("--quiet and --json exclude each other")
         if self.listen is not None and self.connect:
             raise ConfigError("--listen and --connect exclude each other: a learner listens, or dials a router")
         for endpoint in (*self.connect, *([self.listen] if self.listen else [])):
@@ -75,8 +95,23 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     """The configuration that other flags change, and the run to resume.
 
     Raises:
-      ConfigError: two of --preset, --config and --resume, or one that cannot be used.
+      ConfigError: two of --preset, --config and --resume, or one that cannot be used, or is for another task.
     """
+    task = _value(words, "--task") or ""
+    kind = task.partition(":")[0]
+    fitting = preset_for(kind)
+    begin, folder = _origin(words, fitting)
+    if kind in TASKS and fitting != preset_for(begin.task.kind):
+        raise ConfigError(f"--task {task} over settings for {begin.task.task}: begin with --preset {fitting}")
+    if kind in TASKS and kind != begin.task.kind:  # its steps are the other task's
+        begin = replace(begin, task=replace(begin.task, task=task, steps=0))
+    chosen = _value(words, "--algorithm")
+    if chosen is not None and chosen != name_of(begin.algorithm):
+        begin = replace(begin, algorithm=configs.algorithm(chosen)())
+    return begin, folder
+
+
+def _origin(words: Sequence[str], preset: str) -> tuple[RunConfig, RunFolder | None]:
     chosen = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
     given = [f"--{name}" for name, value in chosen.items() if value is not None]
     if len(given) > 1:
@@ -86,7 +121,7 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
         return folder.read_config(), folder
     if chosen["config"] is not None:
         return configs.read(Path(chosen["config"])), None
-    return configs.preset(chosen["preset"] or "default"), None
+    return configs.preset(chosen["preset"] or preset), None
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
@@ -117,9 +152,11 @@ def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None
 
 def run_name(options: LearnerOptions, config: RunConfig) -> str:
     """The new run's name."""
-    what = options.config.stem if options.config else options.preset
+    fitting = preset_for(config.task.kind)
+    what = options.config.stem if options.config else options.preset if fitting == "default" else fitting
+    task = config.task.task.replace(":", "-").replace("/", "-")
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-    return keys.checked("run", options.name or f"finger-gait-{what}-s{config.seed}-{stamp}")
+    return keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
 
 
 def parse(

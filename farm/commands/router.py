@@ -21,6 +21,8 @@ class RouterCommand:
 
     listen: str | None = None
     """Where it can be reached; None: tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447."""
+    connect: tuple[str, ...] = ()
+    """Join another router, repeatable: for a site with a router of its own."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it): the learner's bundle serves the router."""
     trust_network: bool = False
@@ -41,13 +43,14 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(RouterCommand, words, "farm router")
     logs.set_up(command.log_level)
-    bundle = None if command.tls is None else find(command.tls, "learner")
+    bundle = None if command.tls is None else find(command.tls.absolute(), "learner")
     endpoint = command.listen or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"))
+    trusted, dial = command.trust_network, command.connect
     if command.print_config:
-        settings = router_settings(endpoint, command.farm, bundle, trusted=command.trust_network)
+        settings = router_settings(endpoint, command.farm, bundle, trusted=trusted, dial=dial)
         sys.stdout.write(json.dumps(_nested(settings), indent=2) + "\n")
         return 0
-    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=command.trust_network):
+    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, dial=dial):
         sys.stdout.write(f"router at {endpoint}; learners and workers dial it with --connect\n")
         sys.stdout.flush()
         stop.wait()

@@ -8,6 +8,7 @@ from farm.commands.options import LearnerOptions, parse
 from farm.errors import ConfigError
 from farm.local import Place, free_endpoint
 from learner.config import RunConfig
+from workers.backends import BACKENDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +19,8 @@ class RunCommand:
     """Where the run comes from and where it goes."""
     workers: int = 2
     """Worker processes on this machine."""
+    backend: str = "cpu"
+    """What they simulate with: cpu."""
     run: RunConfig = field(default_factory=RunConfig)
     """The run."""
 
@@ -25,6 +28,8 @@ class RunCommand:
         """Check the number."""
         if not 0 <= self.workers <= 1024:
             raise ConfigError(f"workers is {self.workers}; expected 0 to 1024")
+        if self.backend not in BACKENDS:
+            raise ConfigError(f"unknown backend {self.backend!r}; known are {', '.join(BACKENDS)}")
 
 
 def main(words: Sequence[str]) -> int:
@@ -32,5 +37,5 @@ def main(words: Sequence[str]) -> int:
     command, resumed, begin = parse(RunCommand, words, "farm run")
     if command.learner.tls is not None:
         raise ConfigError("farm run is for one machine; with --tls start farm learner and farm worker")
-    place = Place(workers=command.workers, listen=free_endpoint())
+    place = Place(workers=command.workers, backend=command.backend, listen=free_endpoint())
     return learn(command.learner, command.run, place, resumed, begin)

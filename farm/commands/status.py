@@ -15,9 +15,9 @@ from rich.table import Table
 from farm import arguments, codec, keys
 from farm.commands import logs
 from farm.commands.signals import stop_flag
-from farm.errors import MessageError
+from farm.errors import FarmError, MessageError
 from farm.local import LISTEN
-from farm.messages import RunStatus
+from farm.reports import RunStatus
 from farm.session import Session, connect
 from farm.tls import find
 
@@ -36,6 +36,10 @@ class StatusCommand:
     """Folder with certificates: a viewer's bundle."""
     name: str = ""
     """Which viewer's, where the folder holds several."""
+    run: str = ""
+    """Only this run; exit status 1 if its learner does not answer."""
+    worker: str = ""
+    """Exit status 1 if no worker of this name is there."""
     json: bool = False
     """Print JSON once instead of a table."""
     timeout: float = 5.0
@@ -49,8 +53,12 @@ def main(words: Sequence[str]) -> int:
     logs.set_up("ERROR")
     bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
     endpoints = command.connect or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"),)
+    if command.worker:
+        keys.checked("worker", command.worker)
+    run = keys.checked("run", command.run) if command.run else "*"
     with stop_flag() as stop, connect(endpoints, command.timeout, stop.is_set, bundle) as session:
-        runs = ask(session, command.farm)
+        runs = ask(session, command.farm, run)
+        _check(command, session, runs)
         if command.json:
             sys.stdout.write(json.dumps([dataclasses.asdict(run) for run in runs], indent=2) + "\n")
             return 0
@@ -58,14 +66,27 @@ def main(words: Sequence[str]) -> int:
         if not console.is_terminal:
             console.print(_tables(runs))
             return 0
-        _watch(console, lambda: ask(session, command.farm), runs, stop.wait)
+        _watch(console, lambda: ask(session, command.farm, run), runs, stop.wait)
     return 0
 
 
-def ask(session: Session, farm: str) -> list[RunStatus]:
-    """What the farm's learners say, by run."""
+def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> None:
+    """See that who was named is there: what a health check wants to know.
+
+    Raises:
+      FarmError: the run's learner, or every worker of the name, is not.
+    """
+    if command.run and not runs:
+        raise FarmError(f"no learner of run {command.run} answers on farm {command.farm}")
+    token = keys.worker_token(command.farm, f"{command.worker}/*")
+    if command.worker and not session.present(token, _ANSWER):
+        raise FarmError(f"no worker {command.worker} is on farm {command.farm}")
+
+
+def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
+    """What the farm's learners say, by run; or one run's learner."""
     runs = []
-    for payload in session.ask_all(keys.status(farm, "*"), _ANSWER):
+    for payload in session.ask_all(keys.status(farm, run), _ANSWER):
         try:
             runs.append(codec.decode(payload, RunStatus))
         except MessageError:
@@ -88,14 +109,15 @@ def _tables(runs: list[RunStatus]) -> Group:
     for name in ("run", "generation", "return", "mean policy", "jobs open", "re-issued", "ignored", "refused"):
         table.add_column(name, justify="left" if name in ("run", "ignored") else "right")
     workers = Table(title="workers")
-    for name in ("worker", "release", "numbers", "run", "rollouts", "rollouts/s", "last seen"):
-        workers.add_column(name, justify="right" if name.startswith(("rollouts", "last")) else "left")
+    for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "rollouts/s", "last seen"):
+        workers.add_column(name, justify="right" if name.startswith(("cores", "rollouts", "last")) else "left")
     for run in runs:
         ignored = ", ".join(f"{kind} {count}" for kind, count in sorted(run.ignored.items())) or "-"
         figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
         table.add_row(run.run, generation, *figures, str(run.open), str(run.reissued), ignored, str(run.refused))
         for worker in run.workers:
-            seen, done = f"{worker.seen:.0f} s", str(worker.rollouts)
-            workers.add_row(worker.worker, worker.version, worker.canary[:8], run.run, done, f"{worker.rate:.0f}", seen)
+            machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
+            did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
+            workers.add_row(worker.worker, *machine, run.run, *did)
     return Group(table, workers)

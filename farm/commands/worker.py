@@ -51,6 +51,8 @@ def _flags(command: WorkerCommand) -> list[str]:
     flags += ["--farm", config.farm, "--name", config.name, "--backend", config.backend]
     if config.tls is not None:
         flags += ["--tls", str(config.tls)]
+    if config.allow_gym:
+        flags.append("--allow-gym")
     if config.timeout is not None:
         flags += ["--timeout", str(config.timeout)]
     return [*flags, "--log-level", command.log_level.upper()]

@@ -5,7 +5,9 @@ released object with the start grip; for `steps` control steps of SUBSTEPS x TIM
 controller sets joint targets; a demonstration of the goal grip defines the reward.
 """
 
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -13,9 +15,10 @@ import numpy as np
 from farm import rewards, tactile
 from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
-from farm.hand import FINGERS, GRIPS, JOINTS
-from farm.rewards import REWARDS, WEIGHTS, Demonstration
+from farm.hand import FINGERS, GRIPS, JOINTS, LOWER, UPPER
+from farm.rewards import REWARDS, TERMS, WEIGHTS, Demonstration
 from farm.states import STATES
+from farm.tasks.sizes import Sizes
 
 TIMESTEP: Final = 0.01
 """A physics step [s]."""
@@ -25,6 +28,12 @@ SUBSTEPS: Final = 10
 
 CONTROL_PERIOD: Final = TIMESTEP * SUBSTEPS
 """A control step [s]."""
+
+STEPS: Final = 15
+"""Control steps of a rollout, unless told otherwise."""
+
+STEPS_LIMIT: Final = 10_000
+"""Control steps of a rollout of an environment, at most."""
 
 PRESSES: Final = 0.1
 """Force from which a fingertip counts as pressing [N]."""
@@ -47,6 +56,9 @@ DISPLACEMENT: Final = 0.002
 JOINT_NOISE: Final = 0.01
 """Perturbation: standard deviation of the joint readings [rad]."""
 
+_ENVIRONMENT: Final = re.compile(r"([\w.-]{1,60}/)?[\w.-]{1,60}-v\d{1,4}", re.ASCII)
+_SHARED: Final = ("task", "steps", "gamma", "perturb")  # settings that other tasks have as well
+
 
 def _known(kind: str, name: str, known: object) -> None:
     if name not in known:  # type: ignore[operator]
@@ -57,6 +69,8 @@ def _known(kind: str, name: str, known: object) -> None:
 class TaskConfig:
     """The task."""
 
+    task: str = "finger-gait"
+    """One of TASKS: finger-gait, or gym:NAME for a MuJoCo environment of Gymnasium, for example gym:Swimmer-v5."""
     object: str = "bar"
     """Object to be held: the name of a file in assets/objects."""
     start_grip: str = "index+thumb"
@@ -66,15 +80,19 @@ class TaskConfig:
     state: str = "joints"
     """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile."""
     reward: str = "full"
-    """Reward: basic (thesis 3.3: joints, action) | full (3.5: tactile image and contact points as well)."""
+    """Reward: basic (thesis 3.3: joints, action) | full (3.5: tactile image and contact points as well) |
+    limited (full, no action punished for more than its joint's range)."""
     weights: str = "projected"
     """Row of the thesis' Table 3.1 with the reward's weights: direct | projected."""
-    steps: int = 15
-    """Control steps a rollout [of 0.1 s]."""
+    steps: int = 0
+    """Control steps a rollout; 0: the task's own, 15 (of 0.1 s) or a gym: environment's, which this may shorten."""
     gamma: float = 0.95
     """Discount factor of the return, a control step."""
+    return_scale: float = rewards.RETURN_SCALE
+    """Factor of the return (thesis 3.4: 0.1, introduced to keep returns small)."""
     perturb: bool = False
-    """Train on perturbed friction, mass, object position and joint readings (both rollouts of a pair alike)."""
+    """Train on perturbed friction, mass, object position and joint readings (both rollouts of a pair alike);
+    with gym: tasks on starts of many seeds."""
     joints_scale: float = 1.0
     """Factor of the joint positions [rad] in the state."""
     contacts_scale: float = 1.0
@@ -84,19 +102,60 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         """Check every value."""
+        self._check_task()
+        if self.kind == "finger-gait" and self.steps == 0:
+            object.__setattr__(self, "steps", STEPS)
         _known("grip", self.start_grip, GRIPS)
         _known("grip", self.goal_grip, GRIPS)
         _known("state base", self.state, STATES)
         _known("reward", self.reward, REWARDS)
         _known("weights", self.weights, WEIGHTS)
-        if not isinstance(self.steps, int) or not SUCCESS_STEPS <= self.steps <= 1000:
-            raise ConfigError(f"steps is {self.steps}; expected {SUCCESS_STEPS} to 1000")
+        least, most = (SUCCESS_STEPS, 1000) if self.kind == "finger-gait" else (0, STEPS_LIMIT)
+        if not isinstance(self.steps, int) or not least <= self.steps <= most:
+            raise ConfigError(f"steps is {self.steps}; expected {least} to {most}")
         if not 0 < self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}; expected a number in (0, 1]")
-        for name in ("joints_scale", "contacts_scale", "tactile_scale"):
+        for name in ("joints_scale", "contacts_scale", "tactile_scale", "return_scale"):
             value = getattr(self, name)
             if not 0 < value < np.inf:
                 raise ConfigError(f"{name} is {value}; expected a positive number")
+
+    @property
+    def kind(self) -> str:
+        """The part of the task's name before a colon, by which TASKS knows it."""
+        return self.task.partition(":")[0]
+
+    @property
+    def environment(self) -> str:
+        """The environment's name in Gymnasium's registry."""
+        return self.task.partition(":")[2]
+
+    def _check_task(self) -> None:
+        """See that the name is one, and that no setting is another task's."""
+        from farm.tasks import TASKS  # each of them is told a TaskConfig
+
+        if self.kind == "gym":
+            self._check_environment()
+        elif self.task not in TASKS:
+            known = ", ".join("gym:NAME" if kind == "gym" else kind for kind in TASKS)
+            raise ConfigError(f"unknown task {self.task[:80]!r}; known are {known}")
+        if self.kind == "finger-gait":
+            return
+        for f in fields(self):
+            if f.name not in _SHARED and getattr(self, f.name) != f.default:
+                flag, what = f.name.replace("_", "-"), self.kind + ":" * (self.kind == "gym")
+                raise ConfigError(
+                    f"--{flag} is a setting of finger-gait; {what} tasks have --steps, --gamma, --perturb"
+                )
+
+    def _check_environment(self) -> None:
+        """See that the name is one, and nothing that would be imported."""
+        if ":" in self.environment:
+            raise ConfigError(
+                f"task {self.task[:80]!r} names a module to import, which is refused; expected gym:NAME-vN"
+            )
+        if not _ENVIRONMENT.fullmatch(self.environment):
+            raise ConfigError(f"task {self.task[:80]!r} is no environment's name; expected gym:NAME-vN")
 
 
 @dataclass(frozen=True)
@@ -135,6 +194,10 @@ class Frames:
     place: FloatArray
     """(..., 3, C, 3) where it acts, in the fingertip's frame [m]."""
 
+    def at(self, rows: Sequence[int] | IntArray) -> "Frames":
+        """Some of them, by their first axis."""
+        return Frames(self.qpos[rows], self.force[rows], self.place[rows])
+
     @property
     def joints(self) -> FloatArray:
         """(..., 8) [rad]."""
@@ -168,6 +231,14 @@ class Outcome:
     """(B, T, 3, 3) [radii], zero after the end."""
     terms: FloatArray
     """(B, T, 5), zero after the end."""
+
+
+def sizes(config: TaskConfig) -> Sizes:
+    """How large the task's numbers are."""
+    return Sizes(
+        observation=STATES[config.state].size, lower=LOWER, upper=UPPER, steps=config.steps, period=CONTROL_PERIOD,
+        terms=TERMS, joints=len(JOINTS), fingers=len(FINGERS), success=True,
+    )  # fmt: skip
 
 
 class FingerGait:
@@ -218,7 +289,7 @@ class FingerGait:
         with np.errstate(over="ignore", invalid="ignore"):
             reward = REWARDS[self.config.reward](frames.joints, images, points, actions, self.goal, weights)
         terms = rewards.end(reward, steps, dropped, failed, weights)
-        returns, clamped = rewards.discounted(terms, self.config.gamma)
+        returns, clamped = rewards.discounted(terms, self.config.gamma, self.config.return_scale)
         ended = dropped | failed
         return Outcome(
             returns=returns,
@@ -233,12 +304,12 @@ class FingerGait:
         )
 
     def _success(self, frames: Frames, start: FloatArray) -> BoolArray:
-        """Whether the goal grip's fingers press at the last steps and the object stayed where it was."""
-        fingers = [FINGERS.index(name) for name in GRIPS[self.config.goal_grip]]
+        """Whether the goal grip's fingers, no others, press at the last steps and the object stayed where it was."""
+        wanted = np.array([finger in GRIPS[self.config.goal_grip] for finger in FINGERS])
         last = slice(-SUCCESS_STEPS, None)
-        press = frames.force[:, last].sum(axis=-1)[..., fingers] >= PRESSES
+        grips = (frames.force[:, last].sum(axis=-1) >= PRESSES) == wanted
         shift, turn = moved(frames.pose[:, last], start[:, None])
-        return np.asarray(press.all(axis=(1, 2)) & (shift <= MAX_SHIFT).all(axis=1) & (turn <= MAX_TURN).all(axis=1))
+        return np.asarray(grips.all(axis=(1, 2)) & (shift <= MAX_SHIFT).all(axis=1) & (turn <= MAX_TURN).all(axis=1))
 
 
 def touching(force: FloatArray) -> BoolArray:

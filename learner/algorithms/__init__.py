@@ -1,70 +1,37 @@
 """Learning algorithms: pure ask and tell on frozen states, by name.
 
-A new one is a module beside `pgpe` and one line in ALGORITHMS. Its configuration is a frozen
-dataclass with `init`, `ask`, `tell` and `restore`; everything that changes is in the state.
+A new one is a module beside `pgpe` and one line in ALGORITHMS (docs/extending.md has one).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeVar
+from dataclasses import Field
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from farm.arrays import FloatArray
 from learner.algorithms.pgpe import PGPE, PGPEState
-from learner.algorithms.pgpe_state import Diverged, StateValue
+from learner.algorithms.state import Diverged, SearchState, StateValue
 
-__all__ = ["ALGORITHMS", "PGPE", "Algorithm", "AlgorithmState", "Diverged", "PGPEState"]
+__all__ = ["ALGORITHMS", "PGPE", "Algorithm", "Diverged", "PGPEState", "SearchState", "name_of"]
 
-
-class AlgorithmState(Protocol):
-    """What learner, recorder and checkpoint may know of any algorithm's state."""
-
-    @property
-    def mu(self) -> FloatArray:
-        """Mean of the search distribution, (P,)."""
-        ...
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations of the search distribution, (P,)."""
-        ...
-
-    @property
-    def best(self) -> float | None:
-        """Best return so far, None before the first generation."""
-        ...
-
-    @property
-    def baseline(self) -> float | None:
-        """Return that counts as neither good nor bad, None where there is none."""
-        ...
-
-    @property
-    def generation(self) -> int:
-        """Number of updates done."""
-        ...
-
-    def to_dict(self) -> dict[str, StateValue]:
-        """Give every field by its name, for a checkpoint."""
-        ...
+State = TypeVar("State", bound=SearchState)
 
 
-State = TypeVar("State", bound=AlgorithmState)
-
-
+@runtime_checkable
 class Algorithm(Protocol[State]):
-    """A configuration that learns; it holds no state of its own."""
+    """A configuration that learns: a frozen, keyword-only dataclass; everything that changes is in the state.
 
-    @property
-    def pairs(self) -> int:
-        """Pairs of rollouts a generation."""
-        ...
+    Its fields become flags and a table of config.json, so their names must be no other setting's, nor `name`.
+    """
 
-    @property
-    def returns_shape(self) -> tuple[int, int]:
-        """Shape of the returns that `tell` takes: (rows of eps, rollouts a row)."""
+    if TYPE_CHECKING:  # `dataclasses.replace` asks for it; at run time a protocol of methods alone can be checked
+        __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def signs(self) -> tuple[int, ...]:
+        """Rollouts of a row of eps: (1, -1) for mu + eps and mu - eps, (1,) for mu + eps alone."""
         ...
 
     def init(self, size: int) -> State:
@@ -80,8 +47,16 @@ class Algorithm(Protocol[State]):
         ...
 
     def tell(self, state: State, eps: FloatArray, returns: FloatArray) -> State:
-        """Return the state after one update; Diverged when it would not be finite."""
+        """Return the state after one update, from returns (rows, signs); Diverged when it would not be finite."""
         ...
 
 
-ALGORITHMS: dict[str, type[Algorithm[Any]]] = {"pgpe": PGPE}
+ALGORITHMS: Final[dict[str, type[Algorithm[Any]]]] = {
+    "pgpe": PGPE,
+}
+"""Algorithms by the name that --algorithm and config.json give them."""
+
+
+def name_of(algorithm: Algorithm[Any]) -> str:
+    """The name of an algorithm that is in ALGORITHMS."""
+    return next(name for name, kind in ALGORITHMS.items() if type(algorithm) is kind)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args, get_type_hints
 
 import numpy as np
@@ -29,9 +29,7 @@ from learner.algorithms.gradients import (
     weighted_sum,
 )
 from learner.algorithms.optimisers import SigmaRule, adam, clipup, step_sigma
-from learner.algorithms.pgpe_state import Diverged, PGPEState, StateValue
-
-__all__ = ["PGPE", "Diverged", "PGPEState"]
+from learner.algorithms.state import Diverged, SearchState, StateValue
 
 # The authors' code: b = 0.9 b + 0.1 mean return.
 _BASELINE_MEMORY = 0.9
@@ -49,6 +47,22 @@ _RANGES = (
     ("sigma_cap", (_TINY, 1.0), "above 0 and at most 1"),
 )
 _CHOICES = ("estimator", "normaliser", "baseline", "sigma_rule", "shaping", "optimiser")
+
+
+def _empty() -> FloatArray:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PGPEState(SearchState):
+    """The search distribution, and what the optimiser of mu remembers."""
+
+    velocity: FloatArray = field(default_factory=_empty)
+    """ClipUp's velocity, (P,), or empty where it is not used."""
+    first_moment: FloatArray = field(default_factory=_empty)
+    """Adam's running mean of the gradient, (P,), or empty."""
+    second_moment: FloatArray = field(default_factory=_empty)
+    """Adam's running mean of the squared gradient, (P,), or empty."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +116,10 @@ class PGPE:
             raise ValueError(
                 f"initial_sigma is {self.initial_sigma}, expected sigma_floor ({self.sigma_floor}) or more"
             )
+
+    def signs(self) -> tuple[int, ...]:
+        """Rollouts of a row of eps: mu + eps and mu - eps, or mu + eps alone."""
+        return (1, -1) if self.estimator == "symmetric" else (1,)
 
     @property
     def returns_shape(self) -> tuple[int, int]:

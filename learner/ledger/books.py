@@ -54,6 +54,11 @@ class Books:
         for worker in self.workers.values():
             worker.held.clear()
 
+    @property
+    def waiting(self) -> int:
+        """Pending jobs."""
+        return len(self.open) - len(self.out) - len(self.full) - len(self.failed)
+
     def any_pending(self) -> bool:
         """Say whether there is a job to take."""
         while self._pending and self._pending[0] not in self.open:
@@ -63,9 +68,12 @@ class Books:
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
         taken: list[int] = []
+        held, queue = self.workers[worker].held, self.full if self.copies == 1 else self.out
         while len(taken) < count and self.any_pending():
-            taken.append(heapq.heappop(self._pending))
-            self.give(taken[-1], worker, now)
+            index = heapq.heappop(self._pending)
+            taken.append(index)
+            self.open[index].holders.append(worker)  # the first: who is pending has none, and is in no queue
+            held[index] = queue[index] = now
         return tuple(taken)
 
     def give(self, index: int, worker: str, now: float) -> None:

@@ -59,11 +59,6 @@ class Ledger:
         return len(self._books.open)
 
     @property
-    def outstanding(self) -> int:
-        """Jobs of this round that are out at one worker or more."""
-        return len(self._books.out) + len(self._books.full)
-
-    @property
     def workers(self) -> tuple[str, ...]:
         """Names of the known workers, sorted."""
         return tuple(sorted(self._books.workers))
@@ -144,7 +139,7 @@ class Ledger:
         one to work on and one to go on with; the rest waits here, so that all end together.
         """
         self._tick(now)
-        size = self._pace.chunk(self.remaining, len(self._books.workers))
+        size = self._pace.chunk(self._books.waiting, len(self._books.workers))
         chunks = self._again(self._books.failed, size)
         chunks += self._first_time(size)
         if not self._books.any_pending():

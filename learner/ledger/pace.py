@@ -70,16 +70,16 @@ class Pace:
         factor = self._config.straggler_factor
         return max(self._config.straggler_seconds, factor * (self._median or 0.0))
 
-    def chunk(self, remaining: int, workers: int) -> int:
+    def chunk(self, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.
 
-        Some `chunk_seconds` of work, but at most half a worker's share of what remains, so that
+        Some `chunk_seconds` of work, but at most half a worker's share of what waits, so that
         chunks shrink towards the end and all workers end together; never below `least_seconds`,
         unless a worker's whole share is less. One job as long as nothing is known about its duration.
         """
         if self._median is None:
             return 1
         seconds = max(self._median, 1e-9)  # a median of 0 (a coarse clock) only says that the share decides
-        share, half = (-(-remaining // (parts * max(workers, 1))) for parts in (1, 2))
+        share, half = (-(-waiting // (parts * max(workers, 1))) for parts in (1, 2))
         least = min(share, math.floor(self._config.least_seconds / seconds))
         return max(1, least, min(half, math.floor(self._config.chunk_seconds / seconds + 0.5)))

@@ -74,6 +74,9 @@ def statistics(progress: Progress, rate: float) -> list[tuple[str, Any]]:
     """A generation's values; rate is of exploring rollouts [1/s]."""
     p = progress
     baseline = np.nan if p.baseline is None else p.baseline
+    success = []
+    if p.success_rate is not None and p.mean_policy_success is not None:
+        success.append(("/learning/success", rr.Scalars([p.success_rate, float(p.mean_policy_success)])))
     mean, spread = p.return_mean, (p.return_min, p.return_max)
     return [
         ("/learning/return", rr.Scalars([mean, *spread, p.best, baseline, p.mean_policy_return])),
@@ -83,7 +86,7 @@ def statistics(progress: Progress, rate: float) -> list[tuple[str, Any]]:
         ),
         ("/learning/sigma", rr.Scalars([p.sigma_mean, p.sigma_min, p.sigma_max])),
         ("/learning/mean_norm", rr.Scalars([p.mean_norm])),
-        ("/learning/success", rr.Scalars([p.success_rate, float(p.mean_policy_success)])),
+        *success,
         ("/learning/lost", rr.Scalars([p.dropped, p.failed, p.clamped])),
         ("/farm/workers", rr.Scalars([p.workers])),
         ("/farm/rollouts_per_s", rr.Scalars([rate])),

@@ -19,7 +19,7 @@ from farm import tactile
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.hand import FINGERS, JOINTS, TIP_RADIUS
 from farm.rewards import TERMS
-from farm.scene import Geometry, Scene
+from farm.scene import Geometry, HandScene, Scene
 from farm.trajectory import Trajectory
 from learner.recording.curves import (
     BLUE,
@@ -48,6 +48,10 @@ ARROW: Final = 0.012
 LONGEST: Final = 0.1
 """Arrows are cut here: one hard blow must not fill the scene [m]."""
 
+ENDLESS: Final = 50.0
+"""Half a side of a plane without end, as it is drawn [m]."""
+
+_THIN: Final = 0.001  # [m]
 _SHADES: Final = (1.25, 0.95, 0.65)
 _TAXEL_RADIUS: Final = 0.0014
 _GLASS: Final = 120  # fingertips are see-through: taxels and arrows start where they touch
@@ -64,6 +68,18 @@ class Columns:
     """Which frames the rows belong to; all of them where None."""
 
 
+@dataclass(frozen=True)
+class Mover:
+    """What moves in a scene, as it stands before anything has moved."""
+
+    centre: tuple[float, ...]
+    """Middle of all that moves [m]."""
+    radius: float
+    """How far it reaches from there [m]."""
+    entity: str
+    """The first body of it: the others hang on it, mostly."""
+
+
 class Drawing:
     """How a scene is drawn."""
 
@@ -71,9 +87,28 @@ class Drawing:
         self._bodies = scene.bodies
         self._geometries = scene.geometries()
         self._rest = scene.poses(scene.model.qpos0[None])[0]
-        self._fixed = {n for n in self._bodies if scene.model.body_weldid[scene.model.body(n).id] == 0}
+        self._fixed = scene.fixed
+        self.touch = isinstance(scene, HandScene)
+        """Whether there are fingertips that feel."""
+        self.left_out = scene.model.ngeom - len(self._geometries)
+        """Geometries that are not drawn: meshes."""
         tips = {g.name: g for g in self._geometries}
-        self._tips = [tips[f"{finger}_tip"] for finger in FINGERS]
+        self._tips = [tips[f"{finger}_tip"] for finger in FINGERS] if self.touch else []
+
+    def mover(self) -> Mover | None:
+        """What moves, None where nothing does."""
+        poses, low, high = dict(zip(self._bodies, self._rest, strict=True)), [], []
+        moving = [g for g in self._geometries if g.body not in self._fixed]
+        for geometry in moving:
+            pose = poses[geometry.body]
+            centre, reach = pose[:3] + rotate(pose[3:], np.array(geometry.position)), max(geometry.size)
+            low.append(centre - reach)
+            high.append(centre + reach)
+        if not moving:
+            return None
+        least, most = np.min(low, axis=0), np.max(high, axis=0)
+        middle = tuple((0.5 * (least + most)).tolist())
+        return Mover(middle, 0.5 * float(np.linalg.norm(most - least)), f"/world/{moving[0].body}")
 
     def static(self) -> Iterator[tuple[str, Any]]:
         """Entities and archetypes that are logged once."""
@@ -86,6 +121,9 @@ class Drawing:
                     f"/world/{name}",
                     rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=_xyzw(pose[3:]))),
                 )
+        if not self.touch:
+            yield "/reward/terms", lines(("reward",), (YELLOW,))
+            return
         for finger, tip in zip(FINGERS, self._tips, strict=True):
             yield (
                 _taxels(tip),
@@ -114,14 +152,19 @@ class Drawing:
         if rollout.bodies.shape != (count, len(self._bodies), 7):
             expected = (count, len(self._bodies), 7)
             raise ValueError(f"poses of shape {rollout.bodies.shape}, expected {expected}: another scene?")
+        if self.touch != (rollout.images.shape[1:] == (len(FINGERS), tactile.TAXELS)):
+            raise ValueError(f"images of shape {rollout.images.shape}: another task?")
         for name, poses in zip(self._bodies, np.moveaxis(rollout.bodies, 1, 0), strict=True):
             if name not in self._fixed:
                 yield Columns(
                     f"/world/{name}",
                     rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:])),
                 )
-        yield from self._touch(rollout)
         yield Columns("/reward/terms", _scalars(rollout.terms))
+        if not self.touch:
+            yield Columns("/actions", _scalars(rollout.targets))
+            return
+        yield from self._touch(rollout)
         yield Columns("/joints/position", _scalars(rollout.joints))
         yield Columns("/joints/target", _scalars(rollout.targets))
 
@@ -201,7 +244,7 @@ def rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     return np.asarray(vector + 2.0 * (scalar * cross + np.cross(axis, cross)))
 
 
-def solid(geometry: Geometry, colour: list[int]) -> Any:  # noqa: ANN401  (one of four archetypes without a common base)
+def solid(geometry: Geometry, colour: list[int]) -> Any:  # noqa: ANN401  (archetypes without a common base)
     """A MuJoCo primitive as a Rerun one, in its body's frame."""
     style = {
         "quaternions": [_xyzw(np.array(geometry.quaternion))],
@@ -211,6 +254,12 @@ def solid(geometry: Geometry, colour: list[int]) -> Any:  # noqa: ANN401  (one o
     centre, size = np.array(geometry.position), geometry.size
     if geometry.shape == "box":
         return rr.Boxes3D(half_sizes=[size[:3]], centers=[centre], **style)
+    if geometry.shape == "plane":  # Rerun has none: a thin box below it
+        sides = [side or ENDLESS for side in size[:2]]
+        below = centre - rotate(np.array(geometry.quaternion), np.array([0.0, 0.0, _THIN]))
+        return rr.Boxes3D(half_sizes=[[*sides, _THIN]], centers=[below], **style)
+    if geometry.shape == "ellipsoid":
+        return rr.Ellipsoids3D(half_sizes=[size], centers=[centre], **style)
     if geometry.shape == "sphere":
         return rr.Ellipsoids3D(radii=[size[0]], centers=[centre], **style)
     if geometry.shape == "cylinder":

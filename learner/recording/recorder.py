@@ -11,6 +11,7 @@ into run.rrd and compacts it. All parts opened together are one recording as wel
 """
 
 import errno
+import logging
 import shutil
 import socket
 import time
@@ -29,7 +30,9 @@ from learner.progress import Progress
 from learner.recording import blueprint, curves
 from learner.recording.drawing import Drawing, trace
 from learner.recording.files import compact, next_part, parts
-from learner.recording.rows import begin, log_static, row, rows, send, times
+from learner.recording.rows import begin, log_static, row, rows, send, send_properties, times
+
+log = logging.getLogger(__name__)
 
 __all__ = ["Recorder", "parts", "record_replay"]
 
@@ -57,6 +60,7 @@ class Recorder:
         horizon: float,
         serve: tuple[str, int] | None = None,
         done: int = 0,
+        properties: Mapping[str, object] | None = None,
     ) -> None:
         """Open the file and the server.
 
@@ -68,6 +72,7 @@ class Recorder:
           horizon: nominal length of a rollout [s].
           serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
+          properties: what tells the run from others.
 
         Raises:
           ConfigError: neither path nor address, or the address is taken.
@@ -80,11 +85,16 @@ class Recorder:
         self._broken = False
         self._run, self._scene, self._config = run, scene, config
         self._drawing = Drawing(scene)
+        if self._drawing.left_out:
+            log.info("%d meshes or height fields of the scene are not drawn", self._drawing.left_out)
         self._server = None if serve is None else (serve[0], _free_port(*serve))
         sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
         if path is not None:
             sinks.append(_file(path))
-        self._stream = begin(run, sinks, blueprint.learning(horizon))
+        self._stream = begin(
+            run, sinks, blueprint.learning(horizon, touch=self._drawing.touch, mover=self._drawing.mover())
+        )
+        send_properties(self._stream, "run", properties or {})
         log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
 
     @property
@@ -136,6 +146,10 @@ class Recorder:
         """Record a line; levels are those of the standard library."""
         at = times("generation", self._generation, np.array([self._start]), np.array([time.time()]))
         self._stream.send_columns("/log", at, row(rr.TextLog(text, level=_LEVELS.get(level, level))))
+
+    def result(self, values: Mapping[str, object]) -> None:
+        """Record what came out, as properties of the recording."""
+        send_properties(self._stream, "result", values)
 
     def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
         """Record named rollouts at physics rate into a file of their own; see `record_replay`."""
@@ -200,7 +214,9 @@ def record_replay(
     drawing = Drawing(scene)
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
     path.unlink(missing_ok=True)
-    stream = begin(f"{run}-replay", [_file(path)], blueprint.replay(longest))
+    stream = begin(
+        f"{run}-replay", [_file(path)], blueprint.replay(longest, touch=drawing.touch, mover=drawing.mover())
+    )
     log_static(stream, [*drawing.static(), _config(config)])
     start = 0.0
     for number, (name, rollout) in enumerate(rollouts, 1):
@@ -245,7 +261,7 @@ def _file(path: Path) -> rr.FileSink:
 
 
 def _caption(name: str, rollout: Trajectory) -> rr.TextDocument:
-    success = "success" if rollout.success else "no success"
+    success = {True: "success", False: "no success", None: ""}[rollout.success]
     return _markdown(f"### {name}\n\nreturn {rollout.value:.4g}\n\n{success}")
 
 

@@ -1,6 +1,6 @@
 """A Rerun recording, and how rows get into it: several at once, on timelines of our own."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -14,14 +14,23 @@ APPLICATION: Final = "rolloutfarm"
 Times = list[rr.TimeColumn]
 
 
-def begin(recording: str, sinks: list[Any], layout: rrb.Blueprint) -> rr.RecordingStream:
-    """A recording of that id into these sinks, its layout first."""
+def begin(
+    recording: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION
+) -> rr.RecordingStream:
+    """A recording of that id into these sinks, its layout first; the viewer keeps one layout an application."""
     rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording)
+    stream = rr.RecordingStream(application, recording_id=recording)
     stream.set_sinks(*sinks)
     stream.send_blueprint(layout)
     stream.send_recording_name(recording)
     return stream
+
+
+def send_properties(stream: rr.RecordingStream, name: str, values: Mapping[str, object]) -> None:
+    """What a table of recordings shows of this one; sent again, they replace what was said before."""
+    said: dict[str, Any] = {key: value for key, value in values.items() if value is not None}
+    if said:
+        stream.send_property(name, rr.AnyValues(**said))
 
 
 def log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:

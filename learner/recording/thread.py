@@ -40,6 +40,10 @@ class Recording(Protocol):
         """Record a line."""
         ...
 
+    def result(self, values: Mapping[str, object]) -> None:
+        """Record what came out."""
+        ...
+
     def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
         """Record rollouts into a file of their own."""
         ...
@@ -97,9 +101,21 @@ class RecorderThread:
         """Have a line recorded."""
         self._put(lambda: self._recorder.log(text, level))
 
+    def result(self, values: Mapping[str, object]) -> None:
+        """Have it recorded what came out."""
+        self._put(lambda: self._recorder.result(values))
+
     def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
         """Have rollouts recorded into a file of their own."""
         self._put(lambda: self._recorder.replay(path, rollouts))
+
+    def settled(self) -> bool:
+        """Wait until what was handed over is recorded; false when the recording ended before its time."""
+        reached = threading.Event()
+        self._put(reached.set)
+        while not (reached.wait(0.1) or self.failed):
+            pass
+        return not self.failed
 
     def close(self, timeout: float | None = None, *, merge: bool = True) -> bool:
         """Record what waits and end the recording.

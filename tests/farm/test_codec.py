@@ -80,7 +80,8 @@ def pack(value):
 
 
 def ext(dtype, shape, raw, code=1):
-    return msgpack.ExtType(code, msgpack.packb([dtype, shape]) + raw)
+    head = msgpack.packb([dtype, shape])
+    return msgpack.ExtType(code, bytes([len(head)]) + head + raw)
 
 
 def refused(payload, match, kind="bad", message=Sample):

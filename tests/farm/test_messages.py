@@ -11,21 +11,8 @@ from hypothesis import strategies as st
 
 from farm import codec
 from farm.errors import MessageError
-from farm.messages import (
-    RATES,
-    Chunk,
-    Failure,
-    Generation,
-    Job,
-    Refusal,
-    Result,
-    Results,
-    RunStatus,
-    Spec,
-    Want,
-    WireTrajectory,
-    WorkerStatus,
-)
+from farm.messages import RATES, Chunk, Failure, Generation, Job, Refusal, Result, Results, Spec, Want, WireTrajectory
+from farm.reports import Line, RunEnd, RunHistory, RunReport, RunStatus, Trace, WorkerStatus
 from farm.trajectory import Trajectory
 
 RNG = np.random.default_rng(0)
@@ -36,7 +23,7 @@ def job(**changes):
         "index": 4,
         "origin": "mu",
         "signs": (1, -1),
-        "perturbation": (7, 2**64 - 1, 0),
+        "perturbation": (7, 2**32 - 1, 0, 5),
         "rate": "none",
         "eps": RNG.normal(size=64),
     }
@@ -73,7 +60,33 @@ def result(rollouts=2, steps=15, **changes):
     return Result(**(values | changes))
 
 
+def results(*parts):
+    return Results.of(parts, **HEAD, worker="host/a1")
+
+
+def report(**changes):
+    trace = np.zeros((1, 15, 54), "<f4")
+    values = {
+        "run": "r",
+        "incarnation": "i",
+        "generation": 2,
+        "progress": {"generation": 2, "baseline": None, "best": -0.5},
+        "rate": 300.0,
+        "lines": (Line(level="INFO", text="worker w joined"),),
+        "traces": (Trace(name="best", values=trace), Trace(name="all", values=np.repeat(trace, 4, axis=0))),
+        "sample": WireTrajectory.of(trajectory()),
+    }
+    return RunReport(**(values | changes))
+
+
 HEAD = {"run": "run-1", "incarnation": "ab12", "round": 7}
+
+JOBS = [
+    job(),
+    job(index=5, signs=(-1,), origin="zero"),
+    job(index=0, signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),
+    job(index=2**31 - 1, rate="physics"),
+]
 
 MESSAGES = {
     "refusal": Refusal(run="first", reason="its hand is another"),
@@ -87,36 +100,58 @@ MESSAGES = {
         reissued=1,
         refused=0,
         ignored={"stale": 2},
-        workers=(WorkerStatus(worker="host/a1", version="0.1.0", canary="c", rollouts=9, rate=0.9, seen=0.1),),
+        workers=(
+            WorkerStatus(
+                worker="host/a1", host="h", cores=2, version="0.1.0", canary="c", rollouts=9, rate=0.9, seen=0.1
+            ),
+        ),
     ),  # fmt: skip
-    "want": Want(worker="host/a1", credits=64, idle=False, version="0.1.0", assets="a", canary="c"),
-    "want nothing": Want(worker="host/a1", credits=0, idle=True, version="", assets="a", canary="c"),
+    "want": Want(worker="host/a1", credits=64, idle=(), version="0.1.0", assets="a", canary="c", host="h", cores=2),
+    "want nothing": Want(
+        worker="host/a1", credits=0, idle=("run-1", "second"), version="", assets="a", canary="c", host="h", cores=2
+    ),
     "spec": Spec(
         run="run-1",
         task="finger-gait",
         task_config={"object": "bar", "steps": 15, "gamma": 0.95, "perturb": False},
         policy_config={"controller": "projected", "features": 50},
+        traces=True,
         frequencies=RNG.normal(size=(50, 8)),
         phases=RNG.uniform(size=50),
     ),
     "spec of a kernel": Spec(
-        run="r", task="t", task_config={}, policy_config={}, frequencies=np.zeros((0, 8)), phases=np.zeros(0)
+        run="r",
+        task="t",
+        task_config={},
+        policy_config={},
+        traces=False,
+        frequencies=np.zeros((0, 8)),
+        phases=np.zeros(0),
     ),
     "generation": Generation(**HEAD, generation=6, spec="0f" * 32, mu=RNG.normal(size=64), sigma=np.full(64, 2.0)),
     "job": job(),
     "job of one nominal rollout": job(signs=(1,), perturbation=None, rate="physics", origin="zero"),
-    "job of the mean": job(signs=(1,), eps=np.zeros(0), rate="control", perturbation=()),
-    "chunk": Chunk(**HEAD, jobs=(job(), job(index=5, signs=(-1,)))),
-    "empty chunk": Chunk(**HEAD, jobs=()),
-    "result": result(),
-    "result of one": result(rollouts=1),
-    "result without traces": result(steps=0),
-    "result with a trajectory": result(trajectory=WireTrajectory.of(trajectory())),
-    "results": Results(
-        **HEAD, worker="host/a1", results=(result(), result(1, trajectory=WireTrajectory.of(trajectory())))
-    ),
-    "empty results": Results(**HEAD, worker="host/a1", results=()),
+    "job of the mean": job(signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),
+    "chunk": Chunk.of(JOBS, **HEAD),
+    "chunk of means": Chunk.of(JOBS[2:3], **HEAD),
+    "results": results(result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)),
+    "results of one": results(result(rollouts=1)),
+    "results without traces": results(result(steps=0)),
     "failure": Failure(**HEAD, worker="host/a1", index=3, error="ValueError: so it went"),
+    "report": report(),
+    "report of statistics": report(traces=(), sample=None, lines=()),
+    "history": RunHistory(
+        run="r",
+        incarnation="i",
+        recording="first",
+        config={"seed": 0},
+        generation=2,
+        reports=(report(), report()),
+        end=RunEnd(summary={"state": "finished"}, lines=(), best=None, best_generation=2, mean=None),
+    ),
+    "history of nothing": RunHistory(
+        run="r", incarnation="i", recording="r", config={}, generation=0, reports=(), end=None
+    ),
     "trajectory": WireTrajectory.of(trajectory()),
     "trajectory of one frame": WireTrajectory.of(trajectory(frames=1)),
     "trajectory of none": WireTrajectory.of(trajectory(frames=0, bodies=0)),
@@ -190,29 +225,48 @@ REFUSED = {
         {"rate": "all"},
         {"index": -1},
         {"index": 2**31},
-        {"perturbation": (-1,)},
+        {"perturbation": ()},
+        {"perturbation": (1, 2, 3)},
+        {"perturbation": (1, 2, 3, -1)},
+        {"perturbation": (1, 2, 2**32, 3)},
     ],
-    "result": [
+    "chunk": [
+        {"jobs": np.zeros(3, dtype=np.int64)},
+        {"jobs": np.array([0, 1, 2, -1])},
+        {"jobs": np.array([0, 1, 2, 2**31])},
+        {"around": np.zeros(5, dtype=bool)},
+        {"signs": np.ones((4, 3), dtype=np.int64)},
+        {"signs": np.zeros((4, 2), dtype=np.int64)},
+        {"signs": np.full((4, 2), 2)},
+        {"signs": np.full((4, 2), -(2**63))},
+        {"seeds": np.zeros((4, 3), dtype=np.int64)},
+        {"seeds": np.full((4, 4), -2)},
+        {"seeds": np.full((4, 4), 2**32)},
+        {"seeds": np.tile([-1, 0, 0, 0], (4, 1))},
+        {"rates": np.full(4, 3)},
+        {"rates": np.full(4, -1)},
+        {"explores": np.ones(4, dtype=bool)},
+        {"explores": np.zeros(3, dtype=bool)},
+        {"eps": np.zeros((1, 64))},
+    ],
+    "results": [
+        {"jobs": np.zeros(2, dtype=np.int64)},
+        {"rollouts": np.array([2, 1])},
+        {"rollouts": np.array([2, 1, 3])},
+        {"rollouts": np.array([2, 1, 0])},
+        {"rollouts": np.array([2**62, 2**62, 2**62])},
+        {"rollouts": np.array([2, 2, 1])[::-1].copy() * 2},
+        {"seen": np.array([True, True, False])},
+        {"seen": np.zeros(3, dtype=bool)},
+        {"seen": np.zeros(2, dtype=bool)},
+        {"trajectories": ()},
         {"returns": np.zeros(1)},
-        {"success": np.zeros(3, dtype=bool)},
         {"steps": np.zeros(1, dtype=np.int64)},
-        {"dropped": np.zeros(0, dtype=bool)},
-        {"failed": np.zeros(1, dtype=bool)},
-        {"clamped": np.zeros(1, dtype=bool)},
+        {"flags": np.zeros((3, 4), dtype=bool)},
+        {"flags": np.zeros((5, 3), dtype=bool)},
         {"traces": np.zeros((3, 15, 54), dtype="<f4")},
     ],
     "trajectory": [
-        *(
-            {name: np.zeros((4, *shape[1:]), "<f4")}
-            for name, shape in {
-                "bodies": (4, 3, 6),
-                "joints": (4, 7),
-                "targets": (4, 9),
-                "images": (4, 3, 17),
-                "points": (4, 2, 3),
-                "terms": (4, 4),
-            }.items()
-        ),
         *(
             {name: np.zeros((3, *shape), "<f4")}
             for name, shape in {"bodies": (3, 7), "joints": (8,), "images": (3, 18), "terms": (5,)}.items()
@@ -235,16 +289,27 @@ def test_values_that_make_no_sense_are_refused(name, change):
         codec.decode(msgpack.packb(plain, default=codec._pack), type(message))
 
 
-def test_a_result_speaks_of_one_or_two_rollouts():
-    for count in (0, 3):
-        with pytest.raises(ValueError, match="lengths"):
-            dataclasses.replace(
-                result(),
-                returns=np.zeros(count),
-                steps=np.zeros(count, dtype=np.int64),
-                traces=np.zeros((count, 15, 54), "<f4"),
-                **{name: np.zeros(count, dtype=bool) for name in ("success", "dropped", "failed", "clamped")},
-            )
+def test_jobs_are_split_as_they_were_put_together():
+    back = codec.decode(codec.encode(Chunk.of(JOBS, **HEAD)), Chunk).split()
+    assert len(back) == len(JOBS)
+    for one, two in zip(JOBS, back, strict=True):
+        assert_same(one, two)
+
+
+def test_results_are_split_as_they_were_put_together():
+    parts = [result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)]
+    back = codec.decode(codec.encode(results(*parts)), Results).split()
+    assert len(back) == len(parts)
+    for one, two in zip(parts, back, strict=True):
+        assert_same(one, two)
+
+
+def test_results_of_nothing_are_refused():
+    shapes = {"traces": (0, 15, 54), "flags": (0, 4)}
+    arrays = [f for f in dataclasses.fields(Results) if "dtype" in f.metadata]
+    nothing = {f.name: np.zeros(shapes.get(f.name, 0), f.metadata["dtype"]) for f in arrays}
+    with pytest.raises(ValueError, match="no jobs"):
+        dataclasses.replace(results(result()), **nothing)
 
 
 def test_rates():
@@ -277,3 +342,27 @@ def test_a_trajectory_of_overflowing_terms_can_be_sent(bad):
     assert np.isfinite(back.terms).all()
     assert back.terms[2, 2] == np.float32(1e30 if bad > 0 else -1e30)
     assert not back.terms[:2].any()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("best", (2, 15, 54)), ("worst", (0, 15, 54)), ("all", (4, 15, 53)), ("../best", (1, 15, 54))]
+)
+def test_traces_that_make_no_sense_are_refused(name, shape):
+    with pytest.raises(ValueError, match="traces "):
+        Trace(name=name, values=np.zeros(shape, "<f4"))
+
+
+HAND = {"bodies": (3, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
+
+
+@pytest.mark.parametrize(
+    ("name", "width"),
+    [("bodies", (3, 6)), ("bodies", (2, 7)), ("joints", (7,)), ("targets", (9,)), ("images", (3, 17)),
+     ("images", (0, 18)), ("points", (2, 3)), ("terms", (4,))],
+)  # fmt: skip
+def test_a_trajectory_fits_its_runs_task_or_not(name, width):
+    good = WireTrajectory.of(trajectory())
+    assert good.fits(HAND)
+    other = dataclasses.replace(good, **{name: np.zeros((4, *width), "<f4")})
+    assert codec.decode(codec.encode(other), WireTrajectory).fits(HAND | {name: width})
+    assert not other.fits(HAND)

@@ -280,3 +280,13 @@ def test_a_wrong_setting_is_named(options, message):
 @pytest.mark.parametrize("features", [1, 10_000_000])
 def test_settings_at_the_edge_are_taken(features):
     assert PolicyConfig(features=features).features == features
+
+
+def test_actions_are_rescaled_to_the_limits_and_clipped():
+    low, high = np.array([-2.0, 0.0, 5.0]), np.array([2.0, 1.0, 6.0])
+    config = PolicyConfig(controller="kernel")
+    policy = Policy(config, 4, Features.draw(config, 4, np.random.default_rng(0)), (low, high))
+    assert policy.size == 12
+    raw = np.array([[-1.0, 0.0, 1.0], [-9.0, np.nan, np.inf], [0.5, -0.5, -np.inf]])
+    expected = [[-2.0, 0.5, 6.0], [-2.0, 0.5, 6.0], [1.0, 0.25, 5.0]]
+    assert policy.rescaled(raw).tolist() == expected

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from farm.hand import LOWER, UPPER
 from farm.rewards import RETURN_FLOOR, REWARDS, TERMS, WEIGHTS, Demonstration, discounted, end
 
 STEPS = 15
@@ -109,7 +110,7 @@ def rollouts(count, seed=0):
 
 
 @pytest.mark.parametrize("row", list(WEIGHTS))
-@pytest.mark.parametrize("name", list(REWARDS))
+@pytest.mark.parametrize("name", list(SLOW))
 def test_every_step_of_every_rollout_is_as_written(name, row):
     *values, goal = rollouts(4)
     terms = REWARDS[name](*values, goal, WEIGHTS[row])
@@ -249,3 +250,21 @@ def test_opposite_infinities_are_clamped():
     terms = np.zeros((1, STEPS, 5))
     terms[0, 0, 0], terms[0, 1, 0] = np.inf, -np.inf
     assert discounted(terms, 0.95)[0][0] == RETURN_FLOOR == -1e12
+
+
+def test_the_limited_reward_punishes_no_action_beyond_its_range() -> None:
+    joints, images, points = np.zeros(8), np.zeros((3, 18)), np.zeros((3, 3))
+    goal = Demonstration(np.ones(8), np.ones((3, 18)), np.ones((3, 3)))
+    ranges = UPPER - LOWER
+    for action in (0.5 * ranges, ranges, -ranges):
+        assert np.array_equal(
+            *(REWARDS[name](joints, images, points, action, goal, WEIGHTS["direct"]) for name in ("full", "limited"))
+        )
+    huge = REWARDS["limited"](joints, images, points, np.full(8, -1e200), goal, WEIGHTS["direct"])
+    assert huge[2] == pytest.approx(-WEIGHTS["direct"].action * ranges @ ranges) == -10.0
+
+
+def test_the_scale_of_the_return() -> None:
+    terms = np.random.default_rng(0).normal(size=(4, 15, 5))
+    returns, _ = discounted(terms, 0.95, 0.125)
+    assert np.array_equal(discounted(terms, 0.95, 8.0)[0], 64 * returns)

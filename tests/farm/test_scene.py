@@ -79,7 +79,6 @@ def test_the_object_comes_last_and_free(scene):
     assert scene.model.njnt == 9
     assert free.name == "object"
     assert free.type[0] == mujoco.mjtJoint.mjJNT_FREE
-    assert scene.object_qpos == slice(8, 15)
     assert (scene.model.nq, scene.model.nv) == (15, 14)
     assert free.qposadr[0] == 8
     assert scene.model.body_jntadr[scene.object_body] == free.id

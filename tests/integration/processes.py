@@ -2,13 +2,17 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 SMALL = ("--pairs", "6", "--no-record")
 """A run that is over soon."""
@@ -27,8 +31,23 @@ class Farm:
 
     def start_python(self, *words: str, host: str | None = None) -> "subprocess.Popen[str]":
         where = [] if host is None else ["ip", "netns", "exec", host]
+        return self.start_program(*where, sys.executable, *words)
+
+    def start_router(self, endpoint: str, *flags: str, zenohd: bool = False) -> "subprocess.Popen[str]":
+        """Start a router, `farm router` or a real zenohd with the configuration that it prints; it listens."""
+        if zenohd:
+            config = self.folder / f"router-{uuid.uuid4().hex}.json5"
+            config.write_text(self.call("router", "--print-config", "--listen", endpoint, *flags))
+            process = self.start_program(need_zenohd(), "-c", str(config))
+        else:
+            process = self.start("router", "--listen", endpoint, *flags)
+        assert process.stdout
+        assert any("reached at" in line or "router at" in line for line in process.stdout), "it does not listen"
+        return process
+
+    def start_program(self, *command: str) -> "subprocess.Popen[str]":
         process = subprocess.Popen(
-            [*where, sys.executable, *words],
+            command,
             cwd=self.folder,
             env={**os.environ, "COLUMNS": "120", "OPENBLAS_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,
@@ -45,7 +64,10 @@ class Farm:
         return said
 
     def summary(self, run: str) -> dict[str, Any]:
-        return json.loads((self.folder / "runs" / run / "summary.json").read_text())
+        return self.json(f"runs/{run}/summary.json")
+
+    def json(self, path: str) -> dict[str, Any]:
+        return json.loads((self.folder / path).read_text())
 
     def progress(self, run: str) -> list[dict[str, Any]]:
         path = self.folder / "runs" / run / "progress.jsonl"
@@ -70,6 +92,14 @@ class Farm:
                 process.wait()
             if process.stdout:
                 process.stdout.close()
+
+
+def need_zenohd() -> str:
+    """The program zenohd, as PATH or the variable ZENOHD names it; the test is skipped where there is none."""
+    program = shutil.which(os.environ.get("ZENOHD", "zenohd"))
+    if program is None:
+        pytest.skip("no zenohd: put it on PATH, or name it in the variable ZENOHD")
+    return program
 
 
 def children(pid: int) -> list[int]:

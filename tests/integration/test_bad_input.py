@@ -1,21 +1,43 @@
 """A user's mistake gets one line, the right exit status, and costs nothing."""
 
 import json
+import logging
 import shutil
 import socket
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from processes import SMALL, Farm
 
+from farm.__main__ import main
 from farm.local import free_endpoint
 
 MISTAKES = [
     (("fly",), "unknown command 'fly'; known are run, learner"),
     (("run", "--preset", "best"), "unknown preset 'best'; known are default, thesis"),
     (("run", "--state", "smell"), "unknown state base 'smell'; known are joints, joints+contacts, tactile"),
+    (("run", "--algorithm", "guess"), "unknown algorithm 'guess'; known are pgpe"),
+    (("run", "--backend", "gpu"), "unknown backend 'gpu'; known are cpu"),
     (("run", "--object", "cat"), "unknown object 'cat'; known are bar"),
     (("run", "--controller", "pid"), "expected one of ('direct', 'projected', 'kernel', 'cosine')"),
     (("run", "--goal-grip", "fist"), "unknown grip 'fist'; known are index+thumb"),
+    (("run", "--task", "juggling"), "unknown task 'juggling'; known are finger-gait, gym:NAME"),
+    (
+        ("run", "--task", "gym:Swimmr-v5"),
+        "task gym:Swimmr-v5: Environment `Swimmr` doesn't exist. Did you mean: `Swimmer`?",
+    ),
+    (("run", "--task", "gym:os:Swimmer-v5"), "task 'gym:os:Swimmer-v5' names a module to import, which is refused"),
+    (("run", "--task", "gym:Swimmer"), "task 'gym:Swimmer' is no environment's name; expected gym:NAME-vN"),
+    (("run", "--task", "gym:Pendulum-v1"), "task gym:Pendulum-v1: not an environment of MuJoCo"),
+    (
+        ("run", "--task", "gym:Swimmer-v5", "--preset", "thesis"),
+        "over settings for finger-gait: begin with --preset gym",
+    ),
+    (("run", "--task", "gym:Swimmer-v5", "--state", "tactile"), "--state is a setting of finger-gait; gym: tasks have"),
+    (("run", "--task", "gym:Swimmer-v5", "--action", "absolute"), "--action and --clip are settings of finger-gait"),
+    (("run", "--task", "gym:Swimmer-v5", "--stop-when-solved", "1"), "gym:Swimmer-v5 knows returns, but no success"),
+    (("run", "--task", "gym:Swimmer-v5", "--steps", "10001"), "steps is 10001; expected 0 to 10000"),
     (("run", "--pairs", "-3"), "pairs is -3, expected an integer of 1 or more"),
     (("run", "--pairs", "many"), "error parsing --pairs"),
     (("run", "--gamma", "1.5"), "gamma is 1.5; expected a number in (0, 1]"),
@@ -41,14 +63,39 @@ MISTAKES = [
 ]
 
 
+@pytest.fixture
+def logging_as_before() -> Iterator[None]:
+    """Commands set up the root logger for a process of their own."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+@pytest.mark.usefixtures("logging_as_before")
 @pytest.mark.parametrize(
     ("words", "line"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
 )
-def test_mistakes(farm: Farm, words: tuple[str, ...], line: str) -> None:
-    said = farm.call(*words, status=2, timeout=60)
+def test_mistakes(
+    words: tuple[str, ...],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """In this process: a program for each would take as long as all others together."""
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    said = "".join(capfd.readouterr())
     assert line.lower() in said.lower()
     assert len(said.strip().splitlines()) == 1
-    assert not (farm.folder / "runs").exists()
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_mistake_of_a_program(farm: Farm) -> None:
+    said = farm.call("run", "--seed", "-1", status=2, timeout=60)
+    assert said == "farm: seed is -1; expected 0 to 2^32 - 1\n"
 
 
 def test_a_port_in_use(farm: Farm) -> None:

@@ -32,3 +32,18 @@ def test_a_run_that_ends_when_it_is_solved(farm: Farm) -> None:
     solved = [line["mean_policy_success"] for line in lines]
     assert solved[-3:] == [True] * 3
     assert not any(all(solved[i : i + 3]) for i in range(len(solved) - 3))
+
+
+def test_a_run_that_is_begun_once_and_gone_on_with_later(farm: Farm) -> None:
+    farm.call("run", "--name", "whole", "--generations", "6", *SMALL)
+    once = ("run", "--name", "r", "--resume-existing", *SMALL)
+    farm.call(*once, "--generations", "2")
+    said = farm.call(*once, "--generations", "6")
+    assert "going on after generation 2" in said
+    farm.call(*once, "--generations", "6")  # over already: evaluated again, nothing else
+    assert len(farm.progress("r")) == 6
+    assert farm.summary("r")["parameters_sha256"] == farm.summary("whole")["parameters_sha256"]
+    said = farm.call(*once, "--generations", "6", "--seed", "1", status=2)
+    assert "a resumed run keeps its settings: --seed is 0 in the run and 1 here" in said
+    said = farm.call("run", "--resume-existing", *SMALL, status=2)
+    assert "--resume-existing needs --name" in said

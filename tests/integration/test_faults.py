@@ -5,16 +5,16 @@ Each test ends with the hash of the undisturbed run, and says how long the run s
 """
 
 import os
-import shutil
 import signal
 import subprocess
 import threading
 import time
-import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from network import BadLink, Network, address
 from processes import Farm, children
 
 from farm.local import free_endpoint
@@ -170,6 +170,21 @@ def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:
     check("router killed and back", 15)
 
 
+@pytest.mark.parametrize("which", [0, 1], ids=["dialled", "dialling"])
+def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: int) -> None:
+    here, there = free_endpoint(), free_endpoint()
+    flags = [(here,), (there, "--connect", here)]
+    routers = [farm.start_router(*words) for words in flags]
+    learner = farm.start("learner", "--connect", here, *SETTINGS)
+    farm.start("worker", "--connect", there, "--processes", "2")
+    running(farm)
+    routers[which].kill()
+    routers[which].communicate(timeout=10)
+    farm.start_router(*flags[which])
+    finish(learner)
+    check(f"router of two sites killed and back ({('dialled', 'dialling')[which]})", 15)
+
+
 def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
@@ -201,71 +216,28 @@ def test_clocks_that_jump(farm: Farm, check: Check) -> None:
     check("clocks jump by an hour and a day", 5)
 
 
-class Link:
-    """Two hosts, each a network namespace, and the wire between them."""
-
-    def __init__(self) -> None:
-        tag = uuid.uuid4().hex[:6]
-        self.learner, self.worker = f"farm-l-{tag}", f"farm-w-{tag}"
-        self._ends = (f"fl{tag}", f"fw{tag}")
-        for host in (self.learner, self.worker):
-            self._ip("netns", "add", host)
-        self._ip("link", "add", self._ends[0], "type", "veth", "peer", "name", self._ends[1])
-        for host, end, address in zip((self.learner, self.worker), self._ends, ("1", "2"), strict=True):
-            self._ip("link", "set", end, "netns", host)
-            for words in (("addr", "add", f"10.77.0.{address}/24", "dev", end), ("link", "set", end, "up")):
-                self._ip("-n", host, *words)
-            self._ip("-n", host, "link", "set", "lo", "up")
-
-    def cut(self) -> None:
-        self._ip("-n", self.worker, "link", "set", self._ends[1], "down")
-
-    def heal(self) -> None:
-        self._ip("-n", self.worker, "link", "set", self._ends[1], "up")
-
-    def disturb(self, *netem: str) -> None:
-        command = ["tc", "-n", self.worker, "qdisc", "add", "dev", self._ends[1], "root", "netem", *netem]
-        if subprocess.run(command, capture_output=True, check=False).returncode:
-            pytest.skip("this kernel has no netem")
-
-    def close(self) -> None:
-        for host in (self.learner, self.worker):
-            self._ip("netns", "del", host)
-
-    def _ip(self, *words: str) -> None:
-        subprocess.run(["ip", *words], check=True, capture_output=True)
-
-
-@pytest.fixture
-def link() -> Iterator[Link]:
-    if os.geteuid() != 0 or not shutil.which("ip"):
-        pytest.skip("network namespaces need root and iproute2")
-    made = Link()
-    yield made
-    made.close()
-
-
-def apart(farm: Farm, link: Link) -> "subprocess.Popen[str]":
+def apart(farm: Farm, hosts: list[str]) -> "subprocess.Popen[str]":
     """A learner on one host, two workers on the other."""
-    endpoint = "tcp/10.77.0.1:7447"
-    learner = farm.start("learner", "--listen", endpoint, "--trust-network", *SETTINGS, host=link.learner)
-    farm.start("worker", "--connect", endpoint, "--processes", "2", host=link.worker)
+    endpoint = f"tcp/{address(0)}:7447"
+    learner = farm.start("learner", "--listen", endpoint, "--trust-network", *SETTINGS, host=hosts[0])
+    farm.start("worker", "--connect", endpoint, "--processes", "2", host=hosts[1])
     running(farm)
     return learner
 
 
 @pytest.mark.parametrize("seconds", [3, 15])
-def test_a_link_that_is_cut(farm: Farm, check: Check, link: Link, seconds: int) -> None:
-    learner = apart(farm, link)
-    link.cut()
-    threading.Event().wait(seconds)  # the fault itself lasts so long
-    link.heal()
-    finish(learner)
+def test_a_link_that_is_cut(farm: Farm, check: Check, seconds: int) -> None:
+    with closing(Network(2)) as network:
+        learner = apart(farm, network.hosts)
+        network.cut(1)
+        threading.Event().wait(seconds)  # the fault itself lasts so long
+        network.heal(1)
+        finish(learner)
     check(f"link cut for {seconds} s", seconds + 15)
 
 
-def test_a_link_that_loses_and_delays(farm: Farm, check: Check, link: Link) -> None:
-    learner = apart(farm, link)
-    link.disturb("delay", "40ms", "20ms", "loss", "5%")
-    finish(learner)
-    check("5 % of packets lost, 40 +- 20 ms delay", 15)
+def test_a_link_that_loses_and_delays(farm: Farm, check: Check) -> None:
+    with closing(BadLink(delay=(0.02, 0.06), loss=0.05)) as link:
+        finish(apart(farm, link.hosts))
+        assert link.lost > 0.02 * link.carried > 20, "the link was not bad"
+    check("5 % of packets lost, all 20 to 60 ms late", 15)

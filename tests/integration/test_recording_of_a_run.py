@@ -1,14 +1,16 @@
 """What a run leaves behind to look at: recordings, figures, tables; read back and computed again."""
 
 import json
+import signal
 import socket
-from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from processes import Farm
+from processes import Farm, children
+from recordings import generations, read, rows
 from rerun.chunk import RrdReader
 
 from farm import randomness
@@ -22,34 +24,12 @@ SMALL = ("--name", "r", "--pairs", "3", "--generations", str(GENERATIONS))
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Farm:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
     """A small run that keeps all its traces, served while it was learnt."""
     farm = Farm(tmp_path_factory.mktemp("recorded"))
     farm.call("run", "--traces", "all", *SMALL)
-    return farm
-
-
-def read(path: Path) -> dict[str, list[Any]]:
-    """Record batches by entity."""
-    batches: dict[str, list[Any]] = defaultdict(list)
-    for chunk in RrdReader(path).stream():
-        batches[chunk.entity_path].append(chunk.to_record_batch())
-    return batches
-
-
-def rows(batches: list[Any], name: str) -> dict[int, Any]:
-    """A column's values by generation."""
-    found: dict[int, Any] = {}
-    for batch in batches:
-        columns = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
-        if columns and "generation" in batch.schema.names:
-            values = batch.column(columns[0]).to_pylist()
-            generations = batch.column("generation").cast("int64").to_pylist()
-            for generation, value in zip(generations, values, strict=True):
-                if value is not None:
-                    assert generation not in found, "a generation is recorded twice"
-                    found[generation] = value
-    return found
+    yield farm
+    farm.close()
 
 
 def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
@@ -142,7 +122,7 @@ def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
     assert sorted(path.name for path in folder.glob("*.rrd")) == ["replay.rrd", "run.rrd"]
     (recording,) = RrdReader(folder / "run.rrd").recordings()
     assert recording.recording_id == "r"
-    assert sorted(rows(read(folder / "run.rrd")["/learning/return"], "scalars")) == list(range(1, 31))
+    assert generations(folder / "run.rrd") == list(range(1, 31))
 
 
 def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
@@ -154,7 +134,7 @@ def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
     folder = recorded.folder / "runs" / "r"
     captions = [text for batch in read(folder / "replay.rrd")["/rollout"] for text in _texts(batch)]
     assert [text.split(",")[0].split(" after")[0] for text in captions] == ["### best rollout", "### mean policy"]
-    assert sorted(rows(read(folder / "run.rrd")["/learning/return"], "scalars")) == list(range(1, GENERATIONS + 1))
+    assert generations(folder / "run.rrd") == list(range(1, GENERATIONS + 1))
 
 
 def listeners(port: int) -> set[str]:
@@ -181,3 +161,19 @@ def test_the_stream_stays_on_this_machine(farm: Farm) -> None:
     said, _ = process.communicate(timeout=30)
     assert f"live: rerun rerun+http://127.0.0.1:{port}/proxy" in said
     assert listeners(port) == set()
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_view_takes_its_viewer_with_it(recorded: Farm, ending: signal.Signals) -> None:
+    process = recorded.start("view", "runs/r", "--web")
+
+    def viewers() -> list[int]:
+        return [pid for pid in children(process.pid) if Path(f"/proc/{pid}/exe").resolve().name == "rerun"]
+
+    recorded.wait_for(viewers)
+    [viewer] = viewers()
+    process.send_signal(ending)
+    said, _ = process.communicate(timeout=20)
+    assert process.returncode == 130, said
+    assert not Path(f"/proc/{viewer}").exists()
+    assert "Traceback" not in said

@@ -10,6 +10,7 @@ import msgpack
 import numpy as np
 import pytest
 from processes import SMALL, Farm
+from recordings import generations
 
 from farm import codec, keys, session
 from farm.commands import certificates
@@ -34,16 +35,14 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(params=["learner", "router"])
+@pytest.fixture(params=["learner", "router", "zenohd"])
 def place(farm: Farm, certs: Path, request: pytest.FixtureRequest) -> tuple[str, list[str]]:
-    """Where to dial, and what the learner is told: both topologies are attacked alike."""
+    """Where to dial, and what the learner is told: all topologies are attacked alike."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     tls = ["--tls", str(certs / "own")]
     if request.param == "learner":
         return endpoint, ["--listen", endpoint, *tls]
-    router = farm.start("router", "--listen", endpoint, *tls)
-    assert router.stdout
-    assert "router at" in router.stdout.readline()
+    farm.start_router(endpoint, *tls, zenohd=request.param == "zenohd")
     return endpoint, ["--connect", endpoint, *tls]
 
 
@@ -74,7 +73,7 @@ def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Res
         )
         for index in range(count)
     )
-    return Results(run=run, incarnation=incarnation, round=round_, worker=worker, results=results)
+    return Results.of(results, run=run, incarnation=incarnation, round=round_, worker=worker)
 
 
 def test_intruders_do_nothing_and_honest_workers_do_not_notice(
@@ -90,7 +89,9 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
         w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
         for posing in (w2, eva):
             posing.token(keys.worker_token("farm", "w1/1-abc"))
-            want = Want(worker="w1/1-abc", credits=100, idle=True, version="0", assets="a", canary="c")
+            want = Want(
+                worker="w1/1-abc", credits=100, idle=("r",), version="0", assets="a", canary="c", host="h", cores=2
+            )
             posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))
         farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "2")
         seen = []
@@ -108,6 +109,26 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
     assert "stolen" not in seen, "jobs for another worker were read"
     assert "1-abc" not in said, "nothing of the intruders' got through"
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_a_viewer_records_and_a_worker_cannot_look(farm: Farm, certs: Path, place: tuple[str, list[str]]) -> None:
+    endpoint, learner_flags = place
+    own = certs / "own"
+    learner = farm.start("learner", "--name", "r", "--generations", "5", *SMALL, *learner_flags)
+    recorder = farm.start("record", "--connect", endpoint, "--tls", str(own), "--name", "eva")
+    assert recorder.stdout
+    assert any("recording run r" in line for line in iter(recorder.stdout.readline, ""))
+    with intruder(endpoint, find(own, "worker", "w2")) as w2:
+        w2.subscribe("report", keys.report("farm", "*"))
+        w2.subscribe("history", keys.history("farm", "*"))
+        assert w2.ask(keys.history("farm", "r"), 1.0) is None
+        farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "1")
+        said, _ = learner.communicate(timeout=60)
+        assert learner.returncode == 0, said
+        assert not len(w2.events)
+    said, _ = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, said
+    assert generations(farm.folder / "recordings/r/run.rrd") == [1, 2, 3, 4, 5]
 
 
 def json_of(payload: bytes) -> dict[str, object]:

@@ -8,7 +8,7 @@ from learner.census import Census
 
 
 def want(worker: str = "a/1", assets: str = "hand", canary: str = "bits") -> Want:
-    return Want(worker=worker, credits=4, idle=False, version="7.7", assets=assets, canary=canary)
+    return Want(worker=worker, credits=4, idle=(), version="7.7", assets=assets, canary=canary, host="h", cores=2)
 
 
 def test_the_first_worker_decides_whose_numbers_count() -> None:

@@ -12,7 +12,7 @@ from farm.errors import ConfigError
 from farm.policy import PolicyConfig
 from farm.tasks.finger_gait import TaskConfig
 from learner import config as configs
-from learner.algorithms import PGPE
+from learner.algorithms import ALGORITHMS, PGPE
 from learner.config import PRESETS, RunConfig
 
 ODD = {
@@ -85,6 +85,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"task": {"steps": 2}}, "steps is 2; expected 3 to 1000"),
     ({"policy": {"controller": "pid"}}, "'pid'"),
     ({"policy": {"bandwidth": float("inf")}}, "bandwidth"),
+    ({"algorithm": {"name": "guess"}}, "unknown algorithm 'guess'; known are pgpe"),
+    ({"algorithm": {"name": ["pgpe"]}}, "unknown algorithm ['pgpe']; known are pgpe"),
     ({"algorithm": {"pairs": 0}}, "pairs is 0, expected an integer of 1 or more"),
     ({"algorithm": {"estimator": "guess"}}, "estimator is 'guess', expected one of symmetric, plain"),
     ({"algorithm": {"initial_mu": float("nan")}}, "initial_mu"),
@@ -130,8 +132,48 @@ def test_changes_are_told_by_their_flags() -> None:
     }
 
 
-def test_no_two_settings_share_a_name() -> None:
+@pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)
+def test_no_two_settings_share_a_name(algorithm: Any) -> None:
     """Flags have no prefix, and changes are told without one."""
-    tables = [RunConfig, TaskConfig, PolicyConfig, PGPE]
-    names = [field.name for table in tables for field in dataclasses.fields(table)]
+    tables = [RunConfig, TaskConfig, PolicyConfig, algorithm]
+    fields = [field for table in tables for field in dataclasses.fields(table)]
+    names = [field.name for field in fields if not dataclasses.is_dataclass(field.type)]
     assert len(names) == len(set(names))
+    assert "name" not in names, "config.json keeps the algorithm's there"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Walk:
+    """An algorithm only as far as a configuration goes."""
+
+    pairs: int = 5
+    stride: float | None = None
+
+
+@pytest.fixture
+def walk(monkeypatch: pytest.MonkeyPatch) -> RunConfig:
+    monkeypatch.setitem(ALGORITHMS, "walk", Walk)
+    return RunConfig(algorithm=Walk(stride=0.5))  # type: ignore[arg-type]
+
+
+def test_another_algorithm_there_and_back(walk: RunConfig) -> None:
+    said = configs.to_dict(walk)
+    assert said["algorithm"] == {"name": "walk", "pairs": 5, "stride": 0.5}
+    assert configs.from_dict(json.loads(json.dumps(said)), "here") == walk
+    said["algorithm"]["stride"] = None
+    assert configs.from_dict(said, "here") == RunConfig(algorithm=Walk())  # type: ignore[arg-type]
+    said["algorithm"]["stride"] = "long"
+    with pytest.raises(ConfigError, match="stride is 'long'; expected float or NoneType"):
+        configs.from_dict(said, "here")
+
+
+def test_a_file_that_names_no_algorithm_means_pgpe(walk: RunConfig) -> None:
+    said = configs.to_dict(RunConfig())
+    assert said["algorithm"].pop("name") == "pgpe"
+    assert configs.from_dict(said, "here") == RunConfig()
+    del walk
+
+
+def test_another_algorithm_is_a_change_of_its_name_and_of_what_both_have(walk: RunConfig) -> None:
+    assert list(configs.changes(RunConfig(), walk)) == [("algorithm", "pgpe", "walk"), ("pairs", 15, 5)]
+    assert configs.preset_of(walk) == "own"

@@ -15,8 +15,9 @@ import pytest
 from farm import codec, keys
 from farm.errors import RunError
 from farm.local import free_endpoint
-from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
+from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want, WireTrajectory
 from farm.session import Session, connect, listen
+from learner import attendance
 from learner import dispatcher as dispatchers
 from learner.admission import Admission
 from learner.dispatcher import Dispatcher, Stopped
@@ -24,9 +25,10 @@ from learner.ledger.ledger import LedgerConfig
 
 FARM, RUN, STEPS = "try", "r", 3
 SPEC = Spec(
-    run=RUN, task="none", task_config={"steps": STEPS}, policy_config={}, frequencies=np.empty((0, 8)),
+    run=RUN, task="none", task_config={"steps": STEPS}, policy_config={}, traces=True, frequencies=np.empty((0, 8)),
     phases=np.empty(0),
 )  # fmt: skip
+SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
 PATIENT = LedgerConfig(straggler_seconds=60.0)
 WAIT = 20.0
 
@@ -70,15 +72,24 @@ class Worker:
     def want(self, credits: int, *, idle: bool = False) -> None:
         self.say(
             keys.want(FARM, self.name),
-            Want(worker=self.name, credits=credits, idle=idle, version="0", assets="a", canary="c"),
+            Want(
+                worker=self.name,
+                credits=credits,
+                idle=(RUN,) if idle else (),
+                version="0",
+                assets="a",
+                canary="c",
+                host="h",
+                cores=2,
+            ),
         )
 
     def say(self, key: str, message: object) -> None:
         self.session.publish(key, message if isinstance(message, bytes) else codec.encode(message))
 
     def results(self, chunk: Chunk, *results: Result) -> Results:
-        found = results or tuple(result(job.index) for job in chunk.jobs)
-        return Results(run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.name, results=found)
+        found = results or tuple(result(index) for index in chunk.jobs.tolist())
+        return Results.of(found, run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.name)
 
     def answer(self, message: object) -> None:
         self.say(keys.result(FARM, RUN, self.name), message)
@@ -89,7 +100,7 @@ class Worker:
         while len(done) < count:
             chunk = self.chunk()
             self.answer(self.results(chunk))
-            done += [job.index for job in chunk.jobs]
+            done += chunk.jobs.tolist()
         return done
 
 
@@ -103,7 +114,7 @@ class Learner:
     def show(self, ledger: LedgerConfig = PATIENT, stopped: Callable[[], bool] | None = None) -> Dispatcher:
         join = "farm worker --connect here"
         self.farm = Dispatcher(
-            self.session, FARM, SPEC, 9, join, stopped or self.stop.is_set, Admission("a", None), ledger
+            self.session, FARM, SPEC, 9, join, stopped or self.stop.is_set, Admission("a", None), SHAPES, ledger
         )
         return self.farm
 
@@ -178,7 +189,7 @@ def test_no_more_than_a_worker_wants(learner: Learner, hire: Hire) -> None:
     done = 0
     while done < 30:
         chunk = worker.chunk()
-        held += [job.index for job in chunk.jobs]
+        held += chunk.jobs.tolist()
         assert len(held) <= 3
         while held and (len(held) > 1 or done == 29):
             worker.answer(worker.results(chunk, result(held.pop(0))))
@@ -200,7 +211,7 @@ def test_who_wants_nothing_gets_nothing(learner: Learner, hire: Hire) -> None:
 
 def _next(session: Session):
     try:
-        return session.events.get_nowait()
+        return session.events.get()
     except queue.Empty:
         return None
 
@@ -211,13 +222,15 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     worker = hire("a/1")
     with monkeypatch.context() as other:
         other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
-        newer = codec.encode(Want(worker="a/1", credits=1, idle=False, version="9", assets="a", canary="c"))
+        newer = codec.encode(
+            Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
+        )
     inbox = keys.want(FARM, worker.name)
     for nonsense in (
         b"",
         b"\xc1",
         newer,
-        Want(worker="b/1", credits=50, idle=False, version="0", assets="a", canary="c"),
+        Want(worker="b/1", credits=50, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
     ):
         worker.say(inbox, nonsense)
     worker.want(1)
@@ -226,11 +239,11 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     honest = worker.results(first)
     bad = [
         b"", b"no message", b"\x80", b"\0" * 200_000, newer,
-        replace(honest, results=()), replace(honest, results=(result(0, rollouts=1),)),
-        replace(honest, results=(result(0, steps=2),)), replace(honest, results=(result(4),)),
+        worker.results(first, result(0, rollouts=1)), worker.results(first, result(-1)),
+        worker.results(first, result(0, steps=2)), worker.results(first, result(4)),
         replace(honest, run="other"), replace(honest, worker="b/1"),
         replace(honest, round=0), replace(honest, incarnation="0" * 16),
-        Want(worker="a/1", credits=1, idle=False, version="0", assets="a", canary="c"),
+        Want(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
         Failure(run=RUN, incarnation=first.incarnation, round=first.round, worker="a/1", index=99, error="no"),
         Failure(run=RUN, incarnation="gone", round=first.round, worker="a/1", index=0, error="no"),
     ]  # fmt: skip
@@ -238,11 +251,44 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
         worker.answer(message)
     assert farm.workers == ("a/1",), "somebody joined by a message of another"
     worker.answer(honest)
-    worker.answer(replace(honest, results=(result(0, value=7.0),)))
+    worker.answer(worker.results(first, result(0, value=7.0)))
     worker.work(3)
     found = collected.result(WAIT)
     assert [one.returns.tolist() for one in found] == [[i, i] for i in range(4)]
-    assert farm.ignored == {"bad": 2 + 7, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
+    assert farm.ignored == {"bad": 2 + 8, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
+
+
+def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attendance, "_SOON", 0.0)
+    monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
+    farm = learner.show()
+    worker = hire("a/1")
+    collected = learner.collect(jobs(30))
+    nobody = Want(worker="", credits=9, idle=(), version="0", assets="a", canary="c", host="h", cores=2)
+    for i in range(3000):
+        worker.say(keys.want(FARM, f"nobody/{i}"), replace(nobody, worker=f"nobody/{i}"))
+    worker.want(10)
+    worker.work(30)
+    collected.result(WAIT)
+    assert farm.workers == ("a/1",)
+    assert [known.worker for known in farm.census()] == ["a/1"]
+    collected = learner.collect(jobs(1))
+    worker.work(1)
+    collected.result(WAIT)
+    assert farm.ignored == {"absent": 3000}
+
+
+def test_a_worker_whose_token_was_missed(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing tells the learner that the token came: it asks for it."""
+    monkeypatch.setattr(learner.session, "watch", lambda *_: None)
+    farm = learner.show()
+    worker = hire("a/1")
+    collected = learner.collect(jobs(4))
+    worker.want(10)
+    worker.work(4)
+    collected.result(WAIT)
+    assert farm.workers == ("a/1",)
+    assert not farm.ignored
 
 
 def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
@@ -250,9 +296,12 @@ def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     worker.want(1)
     collected = learner.collect(jobs(1, rate="control"))
-    for _ in range(3):
+    arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items()}
+    good = WireTrajectory(value=0.0, success=False, times=np.zeros(1), **arrays)
+    bodies, terms = replace(good, bodies=np.zeros((1, 3, 7), "<f4")), replace(good, terms=np.zeros((1, 1), "<f4"))
+    for shown in (None, bodies, terms):
         chunk = worker.chunk()
-        worker.answer(worker.results(chunk))
+        worker.answer(worker.results(chunk, replace(result(0), trajectory=shown)))
         worker.answer(Failure(**_head(chunk), worker="a/1", index=0, error="no camera"))
     with pytest.raises(RunError, match="no camera"):
         collected.result(WAIT)
@@ -264,12 +313,12 @@ def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     worker.want(5)
     collected = learner.collect(jobs(1))
-    old = worker.results(worker.chunk())
-    worker.answer(old)
+    first = worker.chunk()
+    worker.answer(worker.results(first))
     collected.result(WAIT)
     collected = learner.collect(jobs(1))
     chunk = worker.chunk()
-    worker.answer(replace(old, results=(result(0, value=-9.0),)))
+    worker.answer(worker.results(first, result(0, value=-9.0)))
     worker.answer(worker.results(chunk))
     assert collected.result(WAIT)[0].returns[0] == 0.0
     assert farm.ignored == {"stale": 1}
@@ -313,7 +362,7 @@ def test_a_worker_that_lost_its_jobs(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     worker.want(2)
     collected = learner.collect(jobs(5))
-    forgotten = {job.index for _ in range(2) for job in worker.chunk().jobs}
+    forgotten = {index for _ in range(2) for index in worker.chunk().jobs.tolist()}
     worker.want(2, idle=True)
     assert forgotten <= set(worker.work(5))
     assert indices(collected.result(WAIT)) == list(range(5))
@@ -357,7 +406,7 @@ def test_a_job_that_fails_everywhere(learner: Learner, hire: Hire, workers: int)
                 chunk = codec.decode(event.payload, Chunk)
                 turn.put(None)
                 text = f"OverflowError: too much for {hand.name}"
-                hand.answer(Failure(**_head(chunk), worker=hand.name, index=chunk.jobs[0].index, error=text))
+                hand.answer(Failure(**_head(chunk), worker=hand.name, index=int(chunk.jobs[0]), error=text))
 
     threads = [threading.Thread(target=fail, args=(hand,)) for hand in hands]
     for thread in threads:

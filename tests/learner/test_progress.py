@@ -37,6 +37,9 @@ def test_refused() -> None:
         Progress.from_dict({**values, "version": 2})
     with pytest.raises(ValueError, match="not a line"):
         Progress.from_dict([])  # type: ignore[arg-type]
+    for wrong in ({"best": "high"}, {"generation": 2.5}, {"baseline": []}, {"rollouts": None}):
+        with pytest.raises(ValueError, match=f"whose {next(iter(wrong))} is"):
+            Progress.from_dict(values | wrong)
     del values["best"], values["workers"]
     with pytest.raises(ValueError, match="without best, workers"):
         Progress.from_dict(values)

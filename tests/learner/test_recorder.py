@@ -22,11 +22,11 @@ from farm import scene as scenes
 from farm.arrays import AnyArray
 from farm.errors import ConfigError
 from farm.hand import FINGERS, TIP_RADIUS
-from farm.scene import Scene
+from farm.scene import Geometry, Scene
 from farm.trajectory import Trajectory
 from learner.progress import Progress
 from learner.recording.curves import ramp
-from learner.recording.drawing import ARROW, TOP_FORCE, Drawing, changes, rotate, solid
+from learner.recording.drawing import ARROW, ENDLESS, TOP_FORCE, Drawing, changes, rotate, solid
 from learner.recording.recorder import Recorder, parts, record_replay
 from learner.recording.thread import RecorderThread
 
@@ -379,6 +379,30 @@ def test_a_capsule_starts_where_its_axis_begins(scene: Scene) -> None:
     np.testing.assert_allclose(ends, [[0.0, 0.0, 0.006], [0.0, 0.0, 0.034]], atol=1e-6)
 
 
+@pytest.mark.parametrize(("size", "sides"), [((2.0, 3.0, 0.1), [2.0, 3.0]), ((0.0, 3.0, 0.1), [ENDLESS, 3.0])])
+def test_a_plane_is_a_thin_box_with_its_top_where_the_plane_is(size: tuple[float, ...], sides: list[float]) -> None:
+    half = np.sqrt(0.5)  # turned by 90 degrees about x: its normal is -y
+    plane = Geometry("floor", "world", "plane", size, (1.0, 2.0, 3.0), (half, half, 0.0, 0.0), (0.5, 0.5, 0.5, 1.0))
+    drawn = solid(plane, [0, 0, 0, 255])
+    [extent], [centre] = (part.as_arrow_array().to_pylist() for part in (drawn.half_sizes, drawn.centers))
+    np.testing.assert_allclose(extent, [*sides, 0.001], atol=1e-9)
+    np.testing.assert_allclose(centre, [1.0, 2.001, 3.0], atol=1e-6)
+
+
+def test_an_ellipsoid_has_three_radii() -> None:
+    shape = Geometry(
+        "e", "b", "ellipsoid", (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 1.0)
+    )
+    drawn = solid(shape, [0, 0, 0, 255])
+    np.testing.assert_allclose(drawn.half_sizes.as_arrow_array().to_pylist(), [[0.1, 0.2, 0.3]], rtol=1e-6)
+
+
+def test_another_tasks_rollout_is_refused(scene: Scene) -> None:
+    good = rollout(scene)
+    with pytest.raises(ValueError, match="another task"):
+        list(Drawing(scene).columns(replace(good, images=good.images[:, :0])))
+
+
 def test_colours_run_from_violet_to_yellow() -> None:
     colours = ramp(np.array([-1.0, 0.0, TOP_FORCE, 9.0]), TOP_FORCE)
     assert [hex(c) for c in colours] == ["0x440154ff"] * 2 + ["0xfde725ff"] * 2
@@ -503,3 +527,12 @@ def test_the_learner_does_without_rerun() -> None:
     code += "sys.exit('rerun' in sys.modules)"
     root = Path(__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+def test_what_moves_is_looked_at():
+    floor = '<geom type="plane" size="40 40 1"/>'
+    ball = '<body name="ball" pos="1 2 3"><freejoint/><geom type="sphere" size="0.5" pos="0 0 1"/></body>'
+    moving = Drawing(Scene(scenes.compiled(f"<mujoco><worldbody>{floor}{ball}</worldbody></mujoco>"))).mover()
+    assert (moving.centre, moving.entity) == ((1.0, 2.0, 4.0), "/world/ball")
+    assert moving.radius == pytest.approx(0.5 * 3**0.5), "half the diagonal of the box around it"
+    assert Drawing(Scene(scenes.compiled(f"<mujoco><worldbody>{floor}</worldbody></mujoco>"))).mover() is None

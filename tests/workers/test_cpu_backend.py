@@ -10,10 +10,13 @@ from farm.errors import ConfigError
 from farm.messages import Job, Result, Results, Spec, WireTrajectory
 from farm.policy import Features, PolicyConfig
 from farm.states import STATES
+from farm.tasks import TASKS
 from farm.tasks.finger_gait import TIMESTEP, Perturbation, TaskConfig
 from workers.backends import BACKENDS
-from workers.backends.cpu import CpuBackend, parameters
+from workers.backends.cpu import CpuBackend
+from workers.jobs import parameters
 from workers.simulation import CAPACITY, Stepper
+from workers.tasks import SIMULATES
 
 P = 64
 
@@ -29,6 +32,7 @@ def make_spec(task=None, policy=None, seed=0, **changes):
         "policy_config": dataclasses.asdict(controller),
         "frequencies": drawn.frequencies,
         "phases": drawn.phases,
+        "traces": True,
     }
     return Spec(**(values | changes))
 
@@ -84,7 +88,7 @@ def test_results_answer_the_jobs_in_their_order(backend):
         job(2, rate="physics", **MEAN),
         job(5, signs=(1,)),
         job(0, rate="control"),
-        job(1, perturbation=(3,)),
+        job(1, perturbation=(3, 0, 0, 0)),
     ]
     results = backend.run(MU, jobs)
     assert [result.index for result in results] == [7, 2, 5, 0, 1]
@@ -104,16 +108,20 @@ def test_results_answer_the_jobs_in_their_order(backend):
         }
 
 
+def travelled(results):
+    """Results as the learner sees them."""
+    sent = Results.of(results, run="r", incarnation="i", round=0, worker="w/0")
+    return codec.decode(codec.encode(sent), Results).split()
+
+
 def test_results_travel(backend):
     results = backend.run(MU, [job(0), job(1, rate="control", **MEAN)])
-    sent = Results(run="r", incarnation="i", round=0, worker="w/0", results=tuple(results))
-    back = codec.decode(codec.encode(sent), Results)
-    for one, two in zip(results, back.results, strict=True):
+    for one, two in zip(results, travelled(results), strict=True):
         for row in range(len(one.returns)):
             assert_rows_equal(one, row, two, row)
 
 
-@pytest.mark.parametrize("perturbation", [None, (1, 2, 3)])
+@pytest.mark.parametrize("perturbation", [None, (1, 2, 3, 4)])
 def test_a_pair_is_two_single_jobs(backend, perturbation):
     pairs = [job(i, perturbation=perturbation) for i in range(6)]
     for asked, pair in zip(pairs, backend.run(MU, pairs), strict=True):
@@ -130,7 +138,7 @@ def test_a_pair_is_two_single_jobs(backend, perturbation):
 
 def test_jobs_do_not_know_of_each_other(backend):
     jobs = [
-        job(i, perturbation=None if i % 3 else (9, i), rate=("none", "control", "physics")[i % 3 if i < 6 else 0])
+        job(i, perturbation=None if i % 3 else (9, i, 0, 0), rate=("none", "control", "physics")[i % 3 if i < 6 else 0])
         for i in range(CAPACITY // 2 + 4)
     ]
     together = backend.run(MU, jobs)
@@ -146,9 +154,9 @@ def test_jobs_do_not_know_of_each_other(backend):
 
 
 def test_another_backend_gives_the_same(backend):
-    jobs = [job(0), job(1, perturbation=(4,)), job(2, rate="physics", **MEAN)]
+    jobs = [job(0), job(1, perturbation=(4, 0, 0, 0)), job(2, rate="physics", **MEAN)]
     other = CpuBackend(make_spec())
-    other.run(-MU, [job(8, perturbation=(5,))])
+    other.run(-MU, [job(8, perturbation=(5, 0, 0, 0))])
     assert [codec.encode(r) for r in other.run(MU, jobs)] == [codec.encode(r) for r in backend.run(MU, jobs)]
 
 
@@ -172,18 +180,18 @@ def test_parameters_of_a_job():
 
 
 def test_the_seed_of_a_perturbation_is_all_there_is_to_it(backend):
-    seeds = [(1, 5), (1, 5), (2, 5), (1, 6)]
+    seeds = [(1, 5, 0, 0), (1, 5, 0, 0), (2, 5, 0, 0), (1, 6, 0, 0)]
     results = backend.run(MU, [job(i, perturbation=seed, **MEAN) for i, seed in enumerate(seeds)])
     assert_rows_equal(results[0], 0, results[1], 0)
     assert len({result.returns[0] for result in results}) == 3
-    drawn = Perturbation.draw(np.random.default_rng((2, 5)), 15)
-    rollouts = backend._simulation.run(MU[None], [drawn])
+    drawn = Perturbation.draw(np.random.default_rng((2, 5, 0, 0)), 15)
+    rollouts = backend._task._simulation.run(MU[None], [drawn])
     assert rollouts.outcome.returns[0] == results[2].returns[0]
 
 
 @pytest.mark.parametrize("rate", ["none", "control", "physics"])
 def test_the_rate_changes_no_figure(backend, rate):
-    for perturbation in (None, (3,)):
+    for perturbation in (None, (3, 0, 0, 0)):
         asked = job(2, perturbation=perturbation)
         one, two = backend.run(MU, [dataclasses.replace(asked, index=i, rate=r) for i, r in enumerate(("none", rate))])
         for row in range(2):
@@ -215,7 +223,7 @@ def dropping(backend):
 @pytest.mark.parametrize("ending", ["lasting", "dropping"])
 @pytest.mark.parametrize(("rate", "parts"), [("control", 1), ("physics", 10)])
 def test_a_trajectory_is_the_rollout_frame_by_frame(backend, dropping, rate, parts, ending):
-    result, shown = seen(backend, rate, dropping if ending == "dropping" else None, perturbation=(6,))
+    result, shown = seen(backend, rate, dropping if ending == "dropping" else None, perturbation=(6, 0, 0, 0))
     steps = int(result.steps[0])
     assert (steps < 15) == (ending == "dropping")
     frames = steps * parts + 1
@@ -233,7 +241,7 @@ def test_a_trajectory_is_the_rollout_frame_by_frame(backend, dropping, rate, par
     assert (held == held[:, :1]).all()
     rewards = held[:, 0].sum(axis=1)
     assert 0.1 * np.sum(0.95 ** np.arange(steps) * rewards) == pytest.approx(shown.value, rel=1e-5)
-    np.testing.assert_array_equal(shown.targets[0], backend._simulation.task.commands.astype("f4"))
+    np.testing.assert_array_equal(shown.targets[0], backend._task._simulation.task.commands.astype("f4"))
     points = tactile.contact_points(shown.images)
     np.testing.assert_allclose(shown.points, points, atol=1e-5)
 
@@ -257,7 +265,7 @@ def test_targets_hold_for_a_control_step(backend):
 
 def test_bodies_stand_where_the_joints_put_them(backend):
     _, shown = seen(backend, "control")
-    scene = backend._simulation.scene
+    scene = backend._task._simulation.scene
     assert shown.bodies.shape == (16, len(scene.bodies), 7)
     qpos = np.concatenate([shown.joints, shown.bodies[:, scene.bodies.index("object")]], axis=1)
     np.testing.assert_allclose(scene.poses(qpos), shown.bodies, atol=1e-6)
@@ -282,7 +290,7 @@ def test_a_failed_rollout_can_be_shown_and_sent(monkeypatch):
     assert result.failed[0]
     assert not result.dropped[0]
     assert result.steps[0] == 4
-    shown = codec.decode(codec.encode(result), Result).trajectory.trajectory()
+    shown = travelled([result])[0].trajectory.trajectory()
     assert len(shown.times) == 41
     np.testing.assert_array_equal(shown.terms[-1], [0, 0, 0, 0, -400])
 
@@ -293,13 +301,17 @@ def test_absurd_parameters_are_answered(clip, size):
     backend = CpuBackend(make_spec(policy={"controller": "direct", "clip": clip}))
     eps = np.where(np.arange(backend.parameters) % 2, 1.0, -1.0) * size
     results = backend.run(np.zeros(backend.parameters), [job(0, eps=eps, rate="control")])
-    back = codec.decode(codec.encode(results[0]), Result)
+    [back] = travelled(results)
     assert back.clamped.all()
     assert (back.returns == -1e12).all()
     assert isinstance(back.trajectory, WireTrajectory)
 
 
 # ---------------------------------------------------------------- specifications
+
+
+def test_both_sides_know_the_same_tasks():
+    assert list(TASKS) == list(SIMULATES)
 
 
 def test_an_unknown_task_names_the_known_ones():

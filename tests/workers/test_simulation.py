@@ -421,7 +421,7 @@ def test_physics_that_explodes_by_itself_is_failed(monkeypatch, tmp_path):
     sim = Simulation(TaskConfig(), Fixed(goal_offset()))
     different = [*perturbations(2), None]
     healthy = sim.run(np.zeros((3, 8)), different)
-    run = Simulation._begin
+    run = Simulation.begin
 
     def begin(self, *arguments):
         stepper, start, noise = run(self, *arguments)
@@ -430,7 +430,7 @@ def test_physics_that_explodes_by_itself_is_failed(monkeypatch, tmp_path):
         return stepper, start, noise
 
     with monkeypatch.context() as patch:
-        patch.setattr(Simulation, "_begin", begin)
+        patch.setattr(Simulation, "begin", begin)
         rollouts = sim.run(np.zeros((3, 8)), different)
     assert rollouts.outcome.failed.tolist() == [False, True, False]
     assert rollouts.outcome.returns[1] == pytest.approx(-40.0)

@@ -72,6 +72,7 @@ class Learner:
                 task=task,
                 task_config=dataclasses.asdict(TaskConfig()),
                 policy_config={},
+                traces=True,
                 frequencies=np.empty((0, 8)),
                 phases=np.empty(0),
             )  # fmt: skip
@@ -98,8 +99,8 @@ class Learner:
             Job(index=i, origin="mu", signs=(1,), perturbation=None, rate="none", eps=np.full(P, float(i)))
             for i in indices
         )
-        values = {"run": self.run, "incarnation": header.incarnation, "round": header.round, "jobs": jobs}
-        chunk = Chunk(**(values | changed))  # type: ignore[arg-type]
+        values = {"run": self.run, "incarnation": header.incarnation, "round": header.round}
+        chunk = Chunk.of(jobs, **(values | changed))  # type: ignore[arg-type]
         self.session.publish(keys.inbox(FARM, worker), codec.encode(chunk))
 
 
@@ -120,11 +121,13 @@ class Stage:
         thread = threading.Thread(target=self._work, args=(worker,))
         thread.start()
         self._open.callback(thread.join)
+        until(lambda: self.session.present(keys.worker_token(FARM, worker.id), 1.0))  # before, it could not be reached
         return worker
 
     def _work(self, worker: Worker) -> None:
         while not self._stop.is_set():
             worker.turn()
+        worker.leave()
 
     def next(self, *topics: str, kind: type[object] | None = None) -> tuple[str, object]:
         """The next message of these topics: its key's tail and what it says."""
@@ -146,8 +149,12 @@ class Stage:
         assert isinstance(said, Failure)
         return said
 
-    def close(self) -> None:
+    def let_go(self) -> None:
+        """Ask the worker to leave."""
         self._stop.set()
+
+    def close(self) -> None:
+        self.let_go()
         Backend.go.set()
         self._open.close()
 
@@ -172,7 +179,7 @@ def until(event: Callable[[], object]) -> None:
 
 
 def indices(results: Results) -> list[int]:
-    return [one.index for one in results.results]
+    return results.jobs.tolist()
 
 
 @pytest.mark.parametrize("_", range(10))
@@ -191,7 +198,7 @@ def test_it_says_what_it_wants(stage: Stage) -> None:
     worker = stage.hire()
     _, want = stage.next("want")
     assert isinstance(want, Want)
-    assert (want.worker, want.credits, want.idle) == (worker.id, 2 * Backend.capacity, False)
+    assert (want.worker, want.credits, want.idle) == (worker.id, 2 * Backend.capacity, ())
 
 
 def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
@@ -202,7 +209,7 @@ def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
         answer = stage.results()
         assert (answer.run, answer.incarnation, answer.round, answer.worker) == ("r", "first", 2, worker.id)
         assert indices(answer) == [first, first + 1]
-        assert [one.returns[0] for one in answer.results] == [3.0 + 3 * first, 6.0 + 3 * first]
+        assert answer.returns.tolist() == [3.0 + 3 * first, 6.0 + 3 * first]
     assert learner.asked == {"generation": 1, "spec": 1}
     assert Backend.made == ["r"]
 
@@ -217,19 +224,24 @@ def test_chunks_of_rounds_gone_by_are_dropped(stage: Stage) -> None:
     assert indices(stage.results()) == [2]
 
 
-def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
+def at_work(stage: Stage) -> tuple[Learner, Worker]:
+    """A worker in the middle of job 0, held up there, with jobs 1 and 2 on their way."""
+    learner, worker = Learner(stage.session, "r"), stage.hire()
     stage.next("want")
     Backend.go.clear()
     learner.send(worker.id, 0)
     until(lambda: Backend.ran)
     for index in (1, 2):
         learner.send(worker.id, index)
+    return learner, worker
+
+
+def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
+    learner, worker = at_work(stage)
     learner.header = replace(learner.header, round=3)
     learner.announce()
     learner.send(worker.id, 3)
-    until(lambda: worker._session.events.qsize() == 4)
+    until(lambda: len(worker._session.events) == 4)
     Backend.go.set()
     assert [(indices(said), said.round) for said in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
 
@@ -245,10 +257,10 @@ def test_two_runs_in_turn(stage: Stage) -> None:
     for learner, sent in zip(learners, ((1, 2), (0, 1, 2)), strict=True):
         for index in sent:
             learner.send(worker.id, index)
-    until(lambda: worker._session.events.qsize() == 5)
+    until(lambda: len(worker._session.events) == 5)
     Backend.go.set()
     answers = [stage.results("a", "b") for _ in range(6)]
-    assert Backend.ran == ["a", "a", "b", "a", "b", "b"]  # b shows up after the first
+    assert Backend.ran == ["a", "b", "a", "b", "a", "b"]
     assert [indices(said) for said in answers if said.run == "b"] == [[0], [1], [2]]
     assert Backend.made == ["a", "b"]
 
@@ -268,7 +280,43 @@ def test_an_idle_worker_says_so(stage: Stage, monkeypatch: pytest.MonkeyPatch) -
     Learner(stage.session, "r")
     stage.hire()
     said = [stage.next("want")[1] for _ in range(3)]
-    assert [want.idle for want in said if isinstance(want, Want)] == [False, True, True]
+    assert [want.idle for want in said if isinstance(want, Want)] == [(), ("r",), ("r",)]
+
+
+def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "IDLE", 0.05)
+    busy, _ = Learner(stage.session, "busy"), Learner(stage.session, "lost")
+    worker = stage.hire()
+    idle: set[str] = set()
+    end = time.monotonic() + WAIT
+    while "lost" not in idle:
+        assert time.monotonic() < end
+        busy.send(worker.id, 0)
+        stage.results("busy")
+        while len(stage.session.events):
+            event = stage.session.events.get()
+            if event.topic == "want":
+                idle.update(codec.decode(event.payload, Want).idle)
+
+
+def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
+    learner, worker = at_work(stage)
+    until(lambda: len(worker._session.events) == 2)
+    stage.let_go()
+    Backend.go.set()
+    said: list[object] = []
+    while len(said) < 2:
+        _, message = stage.next("result of r", "want")
+        if not isinstance(message, Want) or message.credits == 0:
+            said.append(message)
+    said.sort(key=lambda message: isinstance(message, Want))
+    done, want = said
+    assert isinstance(done, Results)
+    assert isinstance(want, Want)
+    assert indices(done) == [0], "what it has begun is done"
+    assert want.idle == ("r",)
 
 
 def test_a_task_it_does_not_know(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
@@ -279,7 +327,7 @@ def test_a_task_it_does_not_know(stage: Stage, caplog: pytest.LogCaptureFixture)
         answers = [stage.failure(), stage.failure()]
         assert [said.index for said in answers] == [4, 5]
         assert all("unknown task 'juggling'; known are finger-gait" in said.error for said in answers)
-    assert caplog.messages == ["cannot serve run r: unknown task 'juggling'; known are finger-gait"]
+    assert caplog.messages == ["cannot serve run r: unknown task 'juggling'; known are finger-gait, gym:NAME"]
     assert caplog.records[0].exc_info in (None, False)
 
 
@@ -318,7 +366,7 @@ def test_messages_it_cannot_read(
             b"",
             b"\xc1",
             newer,
-            codec.encode(Want(worker="w", credits=1, idle=False, version="0", assets="a", canary="c")),
+            codec.encode(Want(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)),
         ):
             stage.session.publish(key, payload)
     learner.announce()

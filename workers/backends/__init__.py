@@ -30,5 +30,7 @@ class Backend(Protocol):
         """Give back what it holds."""
 
 
-BACKENDS: Final[dict[str, type[Backend]]] = {"cpu": CpuBackend}
+BACKENDS: Final[dict[str, type[Backend]]] = {
+    "cpu": CpuBackend,
+}
 """Backends by name."""

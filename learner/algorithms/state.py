@@ -1,4 +1,4 @@
-"""What PGPE remembers between two generations: frozen, checked, told to a checkpoint as a dict.
+"""What an algorithm remembers between two generations: frozen, checked, told to a checkpoint as a dict.
 
 Shapes: P is the number of parameters. Every array is float64 and read-only, so a state that was
 handed to the algorithm, the recorder or a checkpoint is the same afterwards.
@@ -7,8 +7,8 @@ handed to the algorithm, the recorder or a checkpoint is the same afterwards.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import TypeAlias
+from dataclasses import dataclass, fields
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -16,41 +16,37 @@ from farm.arrays import FloatArray
 
 StateValue: TypeAlias = FloatArray | float | int | None
 
-ARRAYS = ("mu", "sigma", "velocity", "first_moment", "second_moment")
+S = TypeVar("S", bound="SearchState")
+
+_FIGURES: Final = ("baseline", "best", "generation")  # all other fields are vectors
 
 
 class Diverged(ArithmeticError):  # noqa: N818  it says what happened
     """An update would have made the state non-finite; the state before it is untouched."""
 
 
-def _empty() -> FloatArray:
-    return np.empty(0)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PGPEState:
-    """The search distribution N(mu, diag(sigma^2)) and the running figures around it."""
+class SearchState:
+    """The search distribution N(mu, diag(sigma^2)) and the running figures around it.
+
+    Learner, recorder and checkpoint know no more of any algorithm. One that remembers more adds fields of its own in
+    a subclass: vectors, (P,), or empty where they are not used.
+    """
 
     mu: FloatArray
     """Mean of the search distribution, (P,)."""
     sigma: FloatArray
     """Standard deviation of each parameter, (P,), positive."""
     baseline: float | None = None
-    """Return that counts as neither good nor bad; None until a generation set it."""
+    """Return that counts as neither good nor bad; None until a generation set it, or where there is none."""
     best: float | None = None
     """Best return so far over the whole run (m); None before the first generation."""
     generation: int = 0
     """Number of updates done."""
-    velocity: FloatArray = field(default_factory=_empty)
-    """ClipUp's velocity, (P,), or empty where it is not used."""
-    first_moment: FloatArray = field(default_factory=_empty)
-    """Adam's running mean of the gradient, (P,), or empty."""
-    second_moment: FloatArray = field(default_factory=_empty)
-    """Adam's running mean of the squared gradient, (P,), or empty."""
 
     def __post_init__(self) -> None:
         """Copy the arrays, make them read-only, and check every value."""
-        for name in ARRAYS:
+        for name in self._vectors():
             object.__setattr__(self, name, _read_only(name, getattr(self, name)))
         self._check_sizes()
         if not (self.sigma > 0.0).all():
@@ -62,13 +58,18 @@ class PGPEState:
             raise ValueError(f"state: generation must be an integer of 0 or more, not {count!r}")
         object.__setattr__(self, "generation", int(count))
 
+    @classmethod
+    def _vectors(cls) -> list[str]:
+        """Names of the fields that are vectors: mu, sigma, then a subclass' own."""
+        return [each.name for each in fields(cls) if each.name not in _FIGURES]
+
     def _check_sizes(self) -> None:
         size = self.mu.size
         if size == 0:
             raise ValueError("state: mu must have one parameter or more, it is empty")
         if self.sigma.size != size:
             raise ValueError(f"state: sigma must have mu's size {size}, not {self.sigma.size}")
-        for name in ARRAYS[2:]:
+        for name in self._vectors()[2:]:
             if (found := getattr(self, name).size) not in (0, size):
                 raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {found}")
 
@@ -77,7 +78,7 @@ class PGPEState:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, StateValue]) -> PGPEState:
+    def from_dict(cls: type[S], values: Mapping[str, StateValue]) -> S:
         """Build the state that `to_dict` told.
 
         Raises:

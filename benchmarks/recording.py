@@ -1,0 +1,148 @@
+"""What recording costs a learner, and how large recordings become.
+
+    python benchmarks/recording.py [--blocks 10] [--repeats 3] [--long 500]
+
+A run at N 15 that is recorded in every second block of ten generations, so that both kinds of blocks have the same
+share of a noisy machine and of the learning; into a file, and live with no viewer, one that looks on, and one that has
+stopped. Compared are the medians of a generation's time, and the processor time of the learner's thread and of the
+recorder's.
+"""
+
+import argparse
+import os
+import platform
+import signal
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import rerun_cli
+
+from farm import tasks
+from farm.local import Place, Run, free_endpoint, open_run
+from learner.config import RunConfig
+from learner.recording.run import Recording
+
+BLOCK = 10
+"""Generations of a block; the first of each is left out, and of every run the first two blocks."""
+
+KINDS = {
+    "into a file": "",
+    "file and live, nobody looks": "live",
+    "file and live, a viewer looks on": "looks",
+    "file and live, the viewer has stopped": "stopped",
+}
+
+
+@dataclass
+class Times:
+    """Of generations, each list one number a generation [ms]."""
+
+    wall: list[float] = field(default_factory=list)
+    """From report to report."""
+    thread: list[float] = field(default_factory=list)
+    """Processor time of the learner's thread."""
+    process: list[float] = field(default_factory=list)
+    """Processor time of the learner's process."""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--blocks", type=int, default=10, help="pairs of blocks a run")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--long", type=int, default=500, help="generations of the recording whose size is told")
+    arguments = parser.parse_args()
+    found = {name: (Times(), Times()) for name in KINDS}
+    for repeat in range(arguments.repeats):
+        for name, kind in KINDS.items():
+            _run(RunConfig(seed=repeat, generations=2 * BLOCK * (arguments.blocks + 1)), kind, *found[name])
+    print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}")
+    print("\n| recorded | a generation [ms] | recorded | longest | learner's thread | recorded | of it | recorder |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, (without, with_) in found.items():
+        wall, thread, process = (
+            [statistics.median(getattr(times, what)) for times in (without, with_)]
+            for what in ("wall", "thread", "process")
+        )
+        recorder = process[1] - process[0] - (thread[1] - thread[0])
+        print(
+            f"| {name} | {wall[0]:.1f} | {wall[1] / wall[0] - 1:+.1%} | {max(with_.wall):.0f} | {thread[0]:.2f} "
+            f"| {thread[1]:.2f} | {(thread[1] - thread[0]) / wall[0]:+.1%} | {recorder:.1f} |"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        place = Place(workers=2, listen=free_endpoint())
+        with open_run(RunConfig(generations=arguments.long), Path(folder, "r"), place) as run:
+            for _ in run.learn():
+                pass
+        size = Path(folder, "r", "run.rrd").stat().st_size
+    print(f"\n{arguments.long} generations: {size / 2**20:.1f} MiB, {size / arguments.long / 1000:.0f} kB each")
+
+
+def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
+    """Learn, recording every second block."""
+    place = Place(workers=2, listen=free_endpoint(), record=False)
+    port = int(free_endpoint().rpartition(":")[2])
+    with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
+        recording = Recording(
+            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config,
+            scene=tasks.scene(config.task), done=0, serve=("127.0.0.1", port) if kind else None,
+        )  # fmt: skip
+        looking = (
+            _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("looks", "stopped") else nullcontext()
+        )
+        try:
+            with looking:
+                _learn(run, recording, without, with_)
+        finally:
+            recording.finish()
+
+
+def _learn(run: Run, recording: Recording, without: Times, with_: Times) -> None:
+    """Note what each generation took, but for the first of a block and those of the first two blocks."""
+    before = _now()
+    for report in run.learn():
+        number = report.progress.generation
+        block, within = divmod(number, BLOCK)
+        if within == 0:
+            recording.settled()
+        now = _now()
+        if block >= 2 and within:
+            times = with_ if block % 2 else without
+            for values, a, b in zip((times.wall, times.thread, times.process), before, now, strict=True):
+                values.append(1e3 * (b - a))
+        before = now
+        if block % 2:
+            recording.generation(report)
+
+
+def _now() -> tuple[float, float, float]:
+    return time.perf_counter(), time.thread_time(), time.process_time()
+
+
+@contextmanager
+def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
+    """A viewer without a window that looks on, or has stopped doing so."""
+    program, port = Path(rerun_cli.__file__).with_name("rerun"), free_endpoint().rpartition(":")[2]
+    command = [str(program), uri, "--headless", "--bind", "127.0.0.1", "--port", port]
+    with tempfile.TemporaryDirectory() as home:
+        process = subprocess.Popen(
+            command, env={**os.environ, "HOME": home}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        try:
+            if stopped:
+                time.sleep(2.0)  # it has connected by then
+                os.kill(process.pid, signal.SIGSTOP)
+            yield
+        finally:
+            process.kill()
+            process.wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""A learnt policy in plain MuJoCo: needs mujoco and numpy, nothing of rolloutfarm.
+
+    python play_policy.py POLICY.npz
+
+`farm export RUN POLICY.npz` writes the file; docs/export.md says what is in it.
+"""
+
+import sys
+
+import mujoco
+import numpy as np
+
+
+class Policy:
+    """The controller: joint positions and touch in, targets of the eight servos out."""
+
+    def __init__(self, path: str) -> None:
+        """Read the file, compile its scene."""
+        with np.load(path, allow_pickle=False) as file:
+            self.p = {name: file[name] if file[name].ndim else file[name].item() for name in file.files}
+        self.model = mujoco.MjModel.from_xml_string(self.p["mjcf"])
+        self.data = mujoco.MjData(self.model)
+        self.sites = [self.model.site(name).id for name in self.p["tips"]]
+        self.theta = self.p["mu"].reshape(8, -1)
+        self.rows = np.ascontiguousarray((self.p["W"] / self.p["bandwidth"]).T)  # one a state component
+        if self.p["controller"] in ("projected", "cosine"):
+            maps = {"projected": lambda rows: np.stack([self.features(row) for row in rows]), "cosine": np.cos}
+            self.theta = maps[self.p["controller"]](self.theta)
+
+    def reset(self) -> None:
+        """The moment of release: the fingers hold the object, and nothing else does."""
+        mujoco.mj_setState(self.model, self.data, self.p["state"], self.p["state_kind"])
+        self.x, self.last = self.p["x"], self.p["start_command"]
+
+    def act(self) -> np.ndarray:
+        """One action (8,) [rad]; the servos' targets follow from it."""
+        if self.p["controller"] == "kernel":
+            difference = self.theta - self.x
+            a = np.exp((difference * difference).sum(axis=-1) * (-0.5 / self.p["bandwidth"] ** 2))
+        else:
+            a = (self.theta * self.features(self.x)).sum(axis=-1)
+        base = {"offset": self.p["start_command"], "absolute": 0.0, "increment": self.last}[self.p["action"]]
+        target = base + a
+        target[np.isnan(target)] = 0.0
+        self.last = np.minimum(np.maximum(target, self.p["lower"]), self.p["upper"])
+        self.data.ctrl[:] = self.last
+        return a
+
+    def features(self, x: np.ndarray) -> np.ndarray:
+        """Random Fourier features z(x), (d,) -> (D,)."""
+        angle = self.p["c"].copy()
+        for row, value in zip(self.rows, x, strict=True):
+            angle += row * value
+        return np.sqrt(2.0 / len(angle)) * np.cos(angle)
+
+    def feel(self) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Taxels (3, 18) [N], their centres of force (3, 3) [radii], and whether anything is touched at all."""
+        images, any_contact = np.zeros((3, 18)), False
+        contacts = self.data.sensordata.reshape(3, -1, 7)  # found, force (3), position (3)
+        for finger, site in enumerate(self.sites):
+            axes = self.data.site_xmat[site].reshape(3, 3)
+            for found, normal, _, _, *position in contacts[finger]:
+                if found > 0 and normal > 0:
+                    x, y, z = away = np.array(position) - self.data.site_xpos[site]
+                    x, y, z = (axes[0, k] * away[0] + axes[1, k] * away[1] + axes[2, k] * away[2] for k in range(3))
+                    length = np.sqrt(x * x + y * y + z * z) or 1.0
+                    u = self.p["taxels"]
+                    cosine = x / length * u[:, 0] + y / length * u[:, 1] + z / length * u[:, 2]
+                    weight = np.exp(self.p["kappa"] * (cosine - 1.0))
+                    images[finger] += weight * (normal / weight.sum())
+                    any_contact = True
+        total = images.sum(axis=-1)
+        share = images / np.where(total > 0, total, 1.0)[:, None]
+        points = np.stack([(share * self.p["taxels"][:, k]).sum(axis=-1) for k in range(3)], axis=-1)
+        return images, points, any_contact
+
+    def step(self) -> tuple[float, bool]:
+        """One control step: its reward, and whether the object is still held."""
+        a = self.act()
+        for _ in range(self.p["substeps"]):
+            mujoco.mj_step(self.model, self.data)
+        joints, (images, points, held) = self.data.qpos[:8].copy(), self.feel()
+        parts = {"joints": joints * self.p["joints_scale"], "contacts": points.ravel() * self.p["contacts_scale"]}
+        parts["tactile"] = images.ravel() * self.p["tactile_scale"]
+        self.x = np.concatenate([parts[part] for part in self.p["input"].split("+")])
+        punished = np.minimum(np.abs(a), self.p["punished_to"])
+        wrong = (
+            images - self.p["goal_images"],
+            joints - self.p["goal_joints"],
+            punished,
+            points - self.p["goal_points"],
+        )
+        terms = [-w * (v.ravel() * v.ravel()).sum() for w, v in zip(self.p["weights"], wrong, strict=True)]
+        return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"]])), held
+
+
+def main() -> None:
+    """Play it once and say how it went."""
+    policy = Policy(sys.argv[1])
+    policy.reset()
+    total, held, t = 0.0, True, 0
+    while held and t < policy.p["steps"]:
+        reward, held = policy.step()
+        total += policy.p["gamma"] ** t * reward
+        t += 1
+    forces = policy.feel()[0].sum(axis=-1)
+    print(f"{t} control steps of {policy.p['control_period']} s, the object {'is held' if held else 'fell'}")
+    print("forces [N]: " + ", ".join(f"{n} {f:.2f}" for n, f in zip(policy.p["tips"], forces, strict=True)))
+    print(f"return {policy.p['return_scale'] * total!r}")
+
+
+if __name__ == "__main__":
+    main()

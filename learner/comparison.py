@@ -1,0 +1,97 @@
+"""Several runs beside each other: what differs between them, and what came out. Pure but for the folders read."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from farm.errors import ConfigError
+from learner.config import RunConfig, changes, preset_of, settings
+from learner.folder import RunFolder
+from learner.progress import Progress
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One of the runs."""
+
+    name: str
+    """Its own among them."""
+    config: RunConfig
+    progress: Sequence[Progress]
+    summary: Mapping[str, Any]
+    """Empty as long as there is none."""
+
+
+def read(folders: Sequence[RunFolder]) -> list[Compared]:
+    """What the folders say.
+
+    Raises:
+      ConfigError: one has no generation behind it.
+    """
+    runs = []
+    for name, folder in zip(names([folder.path for folder in folders]), folders, strict=True):
+        progress = folder.progress()
+        if not progress:
+            raise ConfigError(f"the run in {folder.path} has no generation behind it: nothing to compare")
+        runs.append(Compared(name, folder.read_config(), progress, folder.read_summary() or {}))
+    return runs
+
+
+def names(paths: Sequence[Path]) -> list[str]:
+    """A name for each folder: its own, with those of folders above it as long as two are alike.
+
+    Raises:
+      ConfigError: a folder is there twice.
+    """
+    whole = [path.resolve() for path in paths]
+    for path, given in zip(whole, paths, strict=True):
+        if whole.count(path) > 1:
+            raise ConfigError(f"{given} is there twice; each run once")
+    depth = 1
+    while len({path.parts[-depth:] for path in whole}) < len(whole):
+        depth += 1
+    return ["/".join(path.parts[-depth:]) for path in whole]
+
+
+def table(runs: Sequence[Compared]) -> str:
+    """A table of the runs, Markdown: a column each; settings that are the same everywhere are left out."""
+    rows = [("", *(f"**{run.name}**" for run in runs)), *_results(runs), *_settings(runs)]
+    first, *rest = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([first, f"|{'---|' * (len(runs) + 1)}", *rest])
+
+
+def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
+    """What differs in the configurations."""
+    first = runs[0].config
+    differing = dict.fromkeys(name for run in runs[1:] for name, _, _ in changes(first, run.config))
+    yield "preset", *(preset_of(run.config) for run in runs)
+    for name in differing:
+        values = []
+        for run in runs:
+            changed = {key: value for key, _, value in changes(first, run.config)}
+            values.append(changed[name] if name in changed else settings(first)[name])
+        yield name, *(str(value) for value in values)
+
+
+def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
+    """What came out."""
+
+    def said(key: str, form: str) -> tuple[str, ...]:
+        values = [run.summary.get(key) for run in runs]
+        return tuple("-" if value is None else format(value, form) for value in values)
+
+    yield "generations done", *(str(run.progress[-1].generation) for run in runs)
+    yield "rollouts", *(str(run.progress[-1].rollouts) for run in runs)
+    yield "return of the final policy", *said("mean_policy_return", ".3f")
+    success = {True: "yes", False: "no", None: "-"}
+    yield "it succeeds", *(success[run.summary.get("mean_policy_success")] for run in runs)
+    yield "robust success", *said("robust_success_rate", ".0%")
+    yield "first success, generation", *(_first_success(run.progress) for run in runs)
+    yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)
+    yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)
+
+
+def _first_success(progress: Sequence[Progress]) -> str:
+    """After how many updates the mean policy first succeeded."""
+    return next((str(p.generation - 1) for p in progress if p.mean_policy_success), "-")

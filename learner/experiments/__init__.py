@@ -1,0 +1,1 @@
+"""Experiments as data: which runs, which question, which figure, and what the thesis says came out."""

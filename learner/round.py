@@ -1,0 +1,81 @@
+"""A round's jobs, and what came of them: one array of each kind over all rollouts, in the jobs' order. Pure."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from farm.arrays import BoolArray, FloatArray
+from farm.messages import RATES, Chunk, Result, Results, WireTrajectory
+
+
+class Round:
+    """Jobs 0..n-1 and their results, S rollouts in all; a result is written where it belongs, whenever it comes."""
+
+    def __init__(self, jobs: Chunk, trace: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Make room.
+
+        Args:
+          jobs: all of them, by index.
+          trace: steps and taxels of a tactile trace.
+          shapes: of a trajectory's frames.
+        """
+        self.jobs, self._trace, self._shapes = jobs, trace, shapes
+        self._rollouts = np.count_nonzero(jobs.signs, axis=1)
+        self._ends = np.cumsum(self._rollouts)
+        self._starts = self._ends - self._rollouts
+        self._seen = jobs.rates != RATES.index("none")
+        self._trajectories: dict[int, WireTrajectory] = {}
+        count = int(self._rollouts.sum())
+        self.returns: FloatArray = np.zeros(count)
+        """(S,)"""
+        self.steps = np.zeros(count, dtype="<i8")
+        """Control steps until the end, (S,)"""
+        self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
+        """success, dropped, failed, clamped, (S, 4)"""
+        self.traces = np.zeros((count, *trace), dtype="<f4")
+        """Tactile traces [N], (S, T, 54)"""
+
+    def __len__(self) -> int:
+        """How many jobs."""
+        return len(self.jobs.jobs)
+
+    def __getitem__(self, index: int) -> Result:
+        """One job's result; the arrays are views."""
+        at = index + len(self) if index < 0 else index
+        rows = slice(int(self._starts[at]), int(self._ends[at]))
+        success, dropped, failed, clamped = self.flags[rows].T
+        return Result(
+            index=at, trajectory=self._trajectories.get(at), returns=self.returns[rows], success=success,
+            steps=self.steps[rows], dropped=dropped, failed=failed, clamped=clamped, traces=self.traces[rows],
+        )  # fmt: skip
+
+    def __iter__(self) -> Iterator[Result]:
+        """Job by job."""
+        return (self[index] for index in range(len(self)))
+
+    def fitting(self, results: Results) -> BoolArray:
+        """Which of these results (J,) are of a job of this round, and have its shapes."""
+        if results.traces.shape[1:] != self._trace:
+            return np.zeros(len(results.jobs), dtype=bool)
+        fits = (results.jobs >= 0) & (results.jobs < len(self))
+        jobs = np.where(fits, results.jobs, 0)
+        fits &= (results.rollouts == self._rollouts[jobs]) & (results.seen == self._seen[jobs])
+        for at, trajectory in zip(np.flatnonzero(results.seen), results.trajectories, strict=True):
+            fits[at] &= trajectory.fits(self._shapes)
+        return fits
+
+    def put(self, results: Results, chosen: BoolArray) -> None:
+        """Write down some results (J,) that fit."""
+        jobs, rollouts = results.jobs[chosen], results.rollouts[chosen]
+        there = np.repeat(self._starts[jobs] - (np.cumsum(rollouts) - rollouts), rollouts) + np.arange(rollouts.sum())
+        here = slice(None) if chosen.all() else np.repeat(chosen, results.rollouts)
+        for mine, theirs in (
+            (self.returns, results.returns),
+            (self.steps, results.steps),
+            (self.flags, results.flags),
+            (self.traces, results.traces),
+        ):
+            mine[there] = theirs[here]
+        for at, trajectory in zip(np.flatnonzero(results.seen).tolist(), results.trajectories, strict=True):
+            if chosen[at]:
+                self._trajectories[int(results.jobs[at])] = trajectory

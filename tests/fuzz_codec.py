@@ -1,0 +1,28 @@
+"""Coverage-guided fuzzing of the decoder: `python tests/fuzz_codec.py -max_total_time=60` (needs atheris).
+
+The first byte says which message is expected. Whatever the bytes, the outcome is a message or a MessageError.
+"""
+
+import contextlib
+import sys
+
+import atheris
+
+with atheris.instrument_imports(include=["farm"]):
+    from farm import codec
+    from farm.errors import MessageError
+    from farm.messages import Chunk, Failure, Generation, Refusal, Results, Spec, Want
+    from farm.reports import RunStatus
+
+KINDS = (Chunk, Failure, Generation, Refusal, Results, RunStatus, Spec, Want)
+
+
+def one(data: bytes) -> None:
+    kind = KINDS[data[0] % len(KINDS)] if data else Want
+    with contextlib.suppress(MessageError):
+        codec.decode(data[1:], kind)
+
+
+if __name__ == "__main__":
+    atheris.Setup(sys.argv, one)
+    atheris.Fuzz()

@@ -1,0 +1,50 @@
+"""Recordings read back with Rerun's own reader."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import RrdReader
+
+_TIMES = ("generation", "sim_time", "wall_time")
+
+
+def read(path: Path) -> dict[str, list[Any]]:
+    """Record batches by entity."""
+    batches: dict[str, list[Any]] = defaultdict(list)
+    for chunk in RrdReader(path).stream():
+        batches[chunk.entity_path].append(chunk.to_record_batch())
+    return batches
+
+
+def rows(batches: list[Any], name: str) -> dict[int, Any]:
+    """A column's values by generation."""
+    found: dict[int, Any] = {}
+    for batch in batches:
+        columns = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
+        if columns and "generation" in batch.schema.names:
+            values = batch.column(columns[0]).to_pylist()
+            generations = batch.column("generation").cast("int64").to_pylist()
+            for generation, value in zip(generations, values, strict=True):
+                if value is not None:
+                    assert generation not in found, "a generation is recorded twice"
+                    found[generation] = value
+    return found
+
+
+def generations(path: Path) -> list[int]:
+    """Generations in a recording, each of which is there once."""
+    return sorted(rows(read(path)["/learning/return"], "scalars"))
+
+
+def content(path: Path) -> dict[tuple[Any, ...], list[Any]]:
+    """Every value of a recording but the time of day, by entity, column, generation and time in the simulation."""
+    found: dict[tuple[Any, ...], list[Any]] = defaultdict(list)
+    for entity, batches in read(path).items():
+        for batch in (b for b in batches if "generation" in b.schema.names):
+            at = [batch.column(name).cast("int64").to_pylist() for name in _TIMES[:2]]
+            for name in (n for n in batch.schema.names if n not in _TIMES and "RowId" not in n):
+                for generation, time, value in zip(*at, batch.column(name).to_pylist(), strict=True):
+                    if value is not None:
+                        found[entity, name, generation, time].append(value)
+    return found
