@@ -5,6 +5,7 @@ from collections import deque
 from dataclasses import replace
 from typing import Final
 
+from farm import codec
 from farm.messages import WireTrajectory
 from farm.reports import RunReport, Trace
 
@@ -14,7 +15,7 @@ MEMORY: Final = 32 << 20
 PAGE: Final = 4 << 20
 """A page ends with the report that reaches this size [bytes]."""
 
-_PLAIN: Final = 1000  # [bytes] of a report's statistics, about
+_PLAIN: Final = 600  # [bytes] of a report's statistics, about
 
 
 class History:
@@ -22,7 +23,7 @@ class History:
 
     def __init__(self, memory: int = MEMORY, page: int = PAGE) -> None:
         self._memory, self._page = memory, page
-        self._reports: list[RunReport] = []
+        self._reports: list[RunReport | bytes] = []  # as bytes, statistics take a fifth
         self._whole: deque[int] = deque()  # where the reports with rollouts or traces stand
         self._size = 0
         self._lock = threading.Lock()
@@ -30,22 +31,25 @@ class History:
     def add(self, report: RunReport) -> None:
         """Keep the next generation's report, and let go of the oldest rollouts if they are too many."""
         with self._lock:
-            self._reports.append(report)
-            if size := _size(report):
+            size = _size(report)
+            self._reports.append(report if size else codec.encode(report))
+            if size:
                 self._whole.append(len(self._reports) - 1)
                 self._size += size
             while self._size > self._memory:
                 at = self._whole.popleft()
-                self._size -= _size(self._reports[at])
-                self._reports[at] = statistics(self._reports[at])
+                oldest = self._at(at)
+                self._size -= _size(oldest)
+                self._reports[at] = codec.encode(statistics(oldest))
 
     def page(self, generation: int) -> tuple[RunReport, ...]:
         """Reports from that generation on, as many as a message should hold; one at least, if there is one."""
         with self._lock:
-            chosen, size = [], 0
+            chosen: list[RunReport] = []
+            size = 0
             for i in range(self._first(generation), len(self._reports)):
-                chosen.append(self._reports[i])
-                size += _PLAIN + _size(self._reports[i])
+                chosen.append(self._at(i))
+                size += _PLAIN + _size(chosen[-1])
                 if size >= self._page:
                     break
             return tuple(chosen)
@@ -53,9 +57,13 @@ class History:
     def _first(self, generation: int) -> int:
         """Where the first report of this generation or a later one stands; one a generation, but some may lack."""
         at = min(max(generation - 1, 0), len(self._reports))
-        while at > 0 and self._reports[at - 1].generation >= generation:
+        while at > 0 and self._at(at - 1).generation >= generation:
             at -= 1
         return at
+
+    def _at(self, i: int) -> RunReport:
+        report = self._reports[i]
+        return codec.decode(report, RunReport) if isinstance(report, bytes) else report
 
 
 def statistics(report: RunReport) -> RunReport:
