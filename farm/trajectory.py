@@ -1,6 +1,10 @@
 """One rollout as it is shown: where everything was and what was felt, frame by frame. Pure."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
 
 from farm.arrays import FloatArray
 
@@ -32,3 +36,11 @@ class Trajectory:
     """The rollout's return"""
     success: bool | None
     """Whether the gait succeeded; None where the task knows no success"""
+
+
+def joined(rollouts: Sequence[Trajectory]) -> Trajectory:
+    """The frames of at least one rollout after another; what is of a whole rollout is the last one's."""
+    last = rollouts[-1]
+    names = [field.name for field in fields(last) if isinstance(getattr(last, field.name), np.ndarray)]
+    frames: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in rollouts]) for name in names}
+    return replace(last, **frames)

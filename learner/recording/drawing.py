@@ -142,8 +142,8 @@ class Drawing:
             lines([f"{n} target" for n in _joint_names()], _joint_colours(), width=0.8),
         )
 
-    def columns(self, rollout: Trajectory) -> Iterator[Columns]:
-        """A rollout, all its frames.
+    def check(self, rollout: Trajectory) -> None:
+        """Whether it can be drawn.
 
         Raises:
           ValueError: the rollout is not one of this scene.
@@ -154,6 +154,17 @@ class Drawing:
             raise ValueError(f"poses of shape {rollout.bodies.shape}, expected {expected}: another scene?")
         if self.touch != (rollout.images.shape[1:] == (len(FINGERS), tactile.TAXELS)):
             raise ValueError(f"images of shape {rollout.images.shape}: another task?")
+        moving = (rollout.joints, rollout.targets, rollout.images, rollout.points, rollout.terms)
+        if any(len(values) != count for values in moving):
+            raise ValueError(f"arrays over {count} and {[len(values) for values in moving]} frames")
+
+    def columns(self, rollout: Trajectory) -> Iterator[Columns]:
+        """A rollout, all its frames; or several that are joined.
+
+        Raises:
+          ValueError: the rollout is not one of this scene.
+        """
+        self.check(rollout)
         for name, poses in zip(self._bodies, np.moveaxis(rollout.bodies, 1, 0), strict=True):
             if name not in self._fixed:
                 yield Columns(
@@ -175,7 +186,7 @@ class Drawing:
         return [round(255 * value) for value in geometry.colour]
 
     def _touch(self, rollout: Trajectory) -> Iterator[Columns]:
-        force = rollout.images.sum(axis=-1)
+        force, number = rollout.images.sum(axis=-1), np.cumsum(rollout.times == 0.0)
         yield Columns("/contacts/force", _scalars(force))
         yield Columns("/world/contacts", self._arrows(rollout, force))
         for i, (finger, tip) in enumerate(zip(FINGERS, self._tips, strict=True)):
@@ -184,7 +195,7 @@ class Drawing:
             yield Columns(_taxels(tip), colours.partition(np.full(len(image), tactile.TAXELS)))
             buffers = np.ascontiguousarray(image, dtype=np.float32).view(np.uint8)
             yield Columns(f"/tactile/{finger}", rr.DepthImage.columns(buffer=buffers))
-            rows = changes(force[:, i] > 0)
+            rows = changes(2 * number + (force[:, i] > 0))  # and where a rollout begins
             states = [_FELT[int(force[row, i] > 0)] for row in rows]
             yield Columns(f"/contacts/state/{finger}", rr.StateChange.columns(state=states), rows)
 
@@ -192,7 +203,7 @@ class Drawing:
         """What pushes each finger that touches: from the centre of force into the finger."""
         origins, vectors = self.contacts(rollout.bodies, rollout.points, force)
         touching = force > 0
-        colours = np.broadcast_to(np.array([pack(c) for c in FINGER_COLOURS.values()]), force.shape)
+        colours = np.broadcast_to(np.array([pack(c) for c in FINGER_COLOURS.values()], np.uint32), force.shape)
         columns = rr.Arrows3D.columns(
             origins=origins[touching],
             vectors=vectors[touching],

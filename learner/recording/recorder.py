@@ -16,16 +16,17 @@ import shutil
 import socket
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 
-from farm.arrays import AnyArray
+from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
 from farm.scene import Scene
-from farm.trajectory import Trajectory
+from farm.trajectory import Trajectory, joined
 from learner.progress import Progress
 from learner.recording import blueprint, curves
 from learner.recording.drawing import Drawing, trace
@@ -36,6 +37,8 @@ log = logging.getLogger(__name__)
 
 __all__ = ["Recorder", "parts", "record_replay"]
 
+HOLD: Final = 0.5
+"""Rollouts of so long are written together, statistics at once: a row costs much more than what it says [s]."""
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
 RESERVE: Final = 32 << 20
@@ -82,6 +85,7 @@ class Recorder:
             raise ConfigError("a recording without a file and without an address to serve; give one")
         self._path, self._horizon, self._generation = path, horizon, done
         self._last = time.time() - horizon
+        self._held: list[_Held] = []
         self._broken = False
         self._run, self._scene, self._config = run, scene, config
         self._drawing = Drawing(scene)
@@ -112,7 +116,7 @@ class Recorder:
         traces: Mapping[str, AnyArray],
         rate: float,
     ) -> None:
-        """Record a generation that is over.
+        """Record a generation that is over; its rollout may be held back for HOLD, or until `settle` or `close`.
 
         Args:
           progress: its statistics.
@@ -126,9 +130,11 @@ class Recorder:
           OSError: the file takes no more (a full disk); what is there stays.
         """
         self._check_space()
+        if sample is not None:
+            self._drawing.check(sample)
         self._generation = progress.generation
         start, now = self._start, time.time()
-        at = times("generation", progress.generation, np.array([start]), np.array([now]))
+        at = times("generation", np.array([progress.generation]), np.array([start]), np.array([now]))
         for entity, values in curves.statistics(progress, rate):
             self._stream.send_columns(entity, at, row(values))
         for name, values in traces.items():
@@ -137,14 +143,25 @@ class Recorder:
         if sample is not None:
             wall = now + (sample.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
             end = start + self._horizon - SEAM
-            frames = progress.generation, np.minimum(start + sample.times, end), wall
-            send(self._stream, self._drawing.columns(sample), rows("generation", *frames))
+            self._held.append(_Held(progress.generation, np.minimum(start + sample.times, end), wall, sample))
         self._last = now
+        if self._held and now - self._held[0].wall[-1] >= HOLD:
+            self._draw()
         self._flush()
+
+    def settle(self) -> None:
+        """Write what is held back.
+
+        Raises:
+          OSError: the file takes no more.
+        """
+        if self._held:
+            self._draw()
+            self._flush()
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a line; levels are those of the standard library."""
-        at = times("generation", self._generation, np.array([self._start]), np.array([time.time()]))
+        at = times("generation", np.array([self._generation]), np.array([self._start]), np.array([time.time()]))
         self._stream.send_columns("/log", at, row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
     def result(self, values: Mapping[str, object]) -> None:
@@ -166,10 +183,22 @@ class Recorder:
         """
         if self._broken:
             return
+        self._draw()
         self._flush()
         self._stream.disconnect()
         if self._path is not None and merge:
             compact(self._path)
+
+    def _draw(self) -> None:
+        """Send the rollouts that are held back, each entity's rows of all of them together."""
+        held, self._held = self._held, []
+        if not held:
+            return
+        lengths = [len(one.sim) for one in held]
+        numbers = np.repeat([one.generation for one in held], lengths)
+        sim, wall = np.concatenate([one.sim for one in held]), np.concatenate([one.wall for one in held])
+        columns = self._drawing.columns(joined([one.rollout for one in held]))
+        send(self._stream, columns, rows("generation", numbers, sim, wall))
 
     def _flush(self) -> None:
         """See every row into the file: a kill loses nothing, and what goes wrong is noticed."""
@@ -220,13 +249,29 @@ def record_replay(
     log_static(stream, [*drawing.static(), _config(config)])
     start = 0.0
     for number, (name, rollout) in enumerate(rollouts, 1):
-        at = times("rollout", number, np.array([start]))
+        at = times("rollout", np.array([number]), np.array([start]))
         stream.send_columns("/rollout", at, row(_caption(name, rollout)))
-        send(stream, drawing.columns(rollout), rows("rollout", number, start + rollout.times))
+        send(
+            stream,
+            drawing.columns(rollout),
+            rows("rollout", np.full(len(rollout.times), number), start + rollout.times),
+        )
         start += float(rollout.times[-1]) + PAUSE
     stream.flush(timeout_sec=FLUSH)
     stream.disconnect()
     compact(path)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """A rollout that waits to be written."""
+
+    generation: int
+    sim: FloatArray
+    """Where its frames stand on sim_time [s], (F,)"""
+    wall: FloatArray
+    """And on wall_time [s since the epoch], (F,)"""
+    rollout: Trajectory
 
 
 class _Abandoned:

@@ -45,10 +45,10 @@ def row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no publi
     return [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
 
 
-def times(counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None) -> Times:
-    """Timelines of n rows: a number, times in the simulation and since the epoch (n,) [s]."""
+def times(counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None) -> Times:
+    """Timelines of n rows: numbers (n,), times in the simulation and since the epoch (n,) [s]."""
     columns = [
-        rr.TimeColumn(counter, sequence=np.full(len(sim), number)),
+        rr.TimeColumn(counter, sequence=numbers),
         rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
     ]
     if wall is not None:
@@ -62,15 +62,15 @@ def _nanoseconds(seconds: FloatArray) -> IntArray:
 
 
 def rows(
-    counter: str, number: int, sim: FloatArray, wall: FloatArray | None = None
+    counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None
 ) -> Callable[[IntArray | None], Times]:
     """Timelines of some of n rows, of all where None."""
-    whole = times(counter, number, sim, wall)
+    whole = times(counter, numbers, sim, wall)
 
     def some(chosen: IntArray | None) -> Times:
         if chosen is None:
             return whole
-        return times(counter, number, sim[chosen], None if wall is None else wall[chosen])
+        return times(counter, numbers[chosen], sim[chosen], None if wall is None else wall[chosen])
 
     return some
 

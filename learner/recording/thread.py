@@ -17,6 +17,9 @@ log = logging.getLogger(__name__)
 WAITING: Final = 256
 """Messages that may wait before rollouts and traces are dropped."""
 
+QUIET: Final = 0.5
+"""When nothing has come for so long, what the recorder holds back is written [s]."""
+
 
 class Recording(Protocol):
     """What `Recorder` offers."""
@@ -46,6 +49,10 @@ class Recording(Protocol):
 
     def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
         """Record rollouts into a file of their own."""
+        ...
+
+    def settle(self) -> None:
+        """Write what is held back."""
         ...
 
     def close(self, *, merge: bool = True) -> None:
@@ -112,6 +119,7 @@ class RecorderThread:
     def settled(self) -> bool:
         """Wait until what was handed over is recorded; false when the recording ended before its time."""
         reached = threading.Event()
+        self._put(self._recorder.settle)
         self._put(reached.set)
         while not (reached.wait(0.1) or self.failed):
             pass
@@ -141,13 +149,20 @@ class RecorderThread:
 
     def _work(self) -> None:
         try:
-            while (call := self._queue.get()) is not None:
+            while (call := self._next()) is not None:
                 call()
             self._recorder.close(merge=self._merge)
         except Exception as error:
             self._failed.set()
             log.error("the recording ends here, learning goes on: %s", error)
             self._abandon()
+
+    def _next(self) -> Callable[[], None] | None:
+        """What to do next; where nothing comes for a while, to write what is held back."""
+        try:
+            return self._queue.get(timeout=QUIET)
+        except queue.Empty:
+            return self._recorder.settle
 
     def _abandon(self) -> None:
         """Let go of what waits, and keep what is recorded as far as that goes."""

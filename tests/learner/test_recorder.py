@@ -25,10 +25,11 @@ from farm.hand import FINGERS, TIP_RADIUS
 from farm.scene import Geometry, Scene
 from farm.trajectory import Trajectory
 from learner.progress import Progress
+from learner.recording import recorder as recorders
 from learner.recording.curves import ramp
 from learner.recording.drawing import ARROW, ENDLESS, TOP_FORCE, Drawing, changes, rotate, solid
 from learner.recording.recorder import Recorder, parts, record_replay
-from learner.recording.thread import RecorderThread
+from learner.recording.thread import QUIET, RecorderThread
 
 STEPS = 15
 HORIZON = 1.5
@@ -279,6 +280,48 @@ def test_what_cannot_be_merged_stays(
     assert column(read(path)[0], "/learning/return", "generation") == [2]
 
 
+def test_rollouts_written_together_are_as_written_one_by_one(
+    tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lengths = (STEPS + 1, 3, STEPS + 1, 1)  # some ended early; one does not touch at all in the end
+    shown = [rollout(scene, frames) for frames in lengths]
+    rows = []
+    for hold in (0.0, 1e9):
+        monkeypatch.setattr(recorders, "HOLD", hold)
+        monkeypatch.setattr(recorders.time, "time", iter(range(1_700_000_000, 1_800_000_000)).__next__)
+        path = tmp_path / f"held-{hold:g}.rrd"
+        recorder = Recorder(path, run="try", scene=scene, config="", horizon=HORIZON)
+        for generation, sample in enumerate(shown, 1):
+            recorder.generation(progress(generation), sample, {}, rate=1.0)
+        recorder.close()
+        batches, _ = read(path)
+        names = {entity: {name for batch in batches[entity] for name in batch.schema.names} for entity in batches}
+        rows.append(
+            {
+                (entity, name): column(batches, entity, name)
+                for entity in batches
+                for name in names[entity]
+                if ":" in name or name == "generation"
+            }
+        )
+    assert len(rows[0]) > 60
+    assert rows[0] == rows[1]
+    assert rows[0]["/contacts/state/index", "generation"] == [1, 2, 3, 4]
+    assert rows[0]["/joints/position", "generation"] == [g for g, n in enumerate(lengths, 1) for _ in range(n)]
+
+
+def test_what_is_held_back_is_written_when_nothing_comes() -> None:
+    quiet = Slow()
+    quiet.go.set()
+    thread = RecorderThread(quiet)
+    thread.generation(progress(), None, {}, 1.0)
+    assert quiet.settled.wait(10 * QUIET)
+    quiet.settled.clear()
+    assert thread.settled()
+    assert quiet.settled.is_set()
+    assert thread.close(timeout=10)
+
+
 def test_a_torn_file_is_mended(start: Start, tmp_path: Path, scene: Scene) -> None:
     path = tmp_path / "run.rrd"
     code = f"""
@@ -308,7 +351,7 @@ def test_wrong_input_is_refused(start: Start, scene: Scene) -> None:
     good = rollout(scene)
     with pytest.raises(ValueError, match="another scene"):
         recorder.generation(progress(), replace(good, bodies=good.bodies[:, 1:]), {}, rate=1.0)
-    with pytest.raises(ValueError, match="same length"):
+    with pytest.raises(ValueError, match="frames"):
         recorder.generation(progress(), replace(good, terms=good.terms[1:]), {}, rate=1.0)
     with pytest.raises(ValueError, match="2D"):
         recorder.generation(progress(), None, {"best": np.zeros((2, 3, 4))}, rate=1.0)
@@ -422,6 +465,7 @@ class Slow:
         self.go = threading.Event()
         self.generations: list[tuple[Progress, Trajectory | None, Mapping[str, AnyArray], float]] = []
         self.lines: list[tuple[str, str]] = []
+        self.settled = threading.Event()
         self.closed = False
         self.fails = fails
 
@@ -435,6 +479,9 @@ class Slow:
 
     def log(self, text: str, level: str = "INFO") -> None:
         self.lines.append((text, level))
+
+    def settle(self) -> None:
+        self.settled.set()
 
     def close(self, *, merge: bool = True) -> None:  # noqa: ARG002
         self.closed = True
