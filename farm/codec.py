@@ -220,6 +220,6 @@ def _array(name: str, dtype: "np.dtype[Any]", ndim: int, value: object) -> AnyAr
         raise MessageError(f"{name}: expected an array {dtype.str} of {ndim} dimensions")
     if dtype.kind == "f" and not np.isfinite(value).all():
         raise MessageError(f"{name}: not finite")
-    if dtype.kind == "b" and value.view(np.uint8).max(initial=0) > 1:
+    if dtype.kind == "b" and value.tobytes().strip(b"\0\1"):
         raise MessageError(f"{name}: not true or false")
     return value

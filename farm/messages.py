@@ -57,8 +57,6 @@ class Spec:
     """finger-gait, or gym:NAME."""
     task_config: dict[str, Any]
     policy_config: dict[str, Any]
-    traces: bool
-    """Whether results bring tactile traces."""
     release: str = ""
     """Of the package that the task comes from, empty for the farm's own."""
     frequencies: FloatArray = array("<f8", 2)
@@ -77,10 +75,17 @@ class Generation:
     generation: int
     spec: str
     """Digest of the Spec's bytes."""
+    traces: str
+    """Which tactile traces results bring, one of TRACES."""
     mu: FloatArray = array("<f8", 1)
     """(P,)"""
     sigma: FloatArray = array("<f8", 1)
     """(P,)"""
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        if self.traces not in TRACES:
+            raise ValueError(f"traces {self.traces[:40]!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +204,18 @@ _NO_EPS: Final = np.empty(0)
 
 
 def _within(values: IntArray, least: int, end: int) -> bool:
-    return values.size == 0 or bool(values.min() >= least and values.max() < end)
+    if values.size < _FEW:
+        listed = values.ravel().tolist()
+        return not listed or (min(listed) >= least and max(listed) < end)
+    return bool(values.min() >= least and values.max() < end)
+
+
+def _rising(values: IntArray) -> bool:
+    listed = values.tolist()
+    return listed == sorted(set(listed))
+
+
+_FEW: Final = 100  # values: with fewer, Python is quicker than NumPy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +237,7 @@ class Result:
     clamped: BoolArray
     """(R,)"""
     traces: AnyArray
-    """Tactile traces [N], (R, T, 54) float32, zero after the end; (R, 0, 54) where the run wants none."""
+    """Tactile traces [N], (R, T, 54) float32, zero after the end; (R, 0, 54) where there are none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +254,7 @@ class Results:
     trajectories: "tuple[WireTrajectory, ...]"
     """Of the jobs that are seen, in their order."""
     jobs: IntArray = array("<i8", 1)
-    """Indices, (J,)"""
+    """Indices, rising (J,)"""
     rollouts: IntArray = array("<i8", 1)
     """Of each job, (J,), S in all"""
     seen: BoolArray = array("|b1", 1)
@@ -249,58 +265,75 @@ class Results:
     """(S,)"""
     flags: BoolArray = array("|b1", 2)
     """success, dropped, failed, clamped, (S, 4)"""
+    traced: IntArray = array("<i8", 1)
+    """Which rollouts have a trace here, rising (K,)"""
     traces: AnyArray = array("<f4", 3)
-    """(S, T, 54)"""
+    """(K, T, 54)"""
 
     def __post_init__(self) -> None:
         """Check that all speak of as many jobs and rollouts."""
         if not len(self.jobs) == len(self.rollouts) == len(self.seen) >= 1:
             raise ValueError("no jobs, or arrays over different ones")
-        if not _within(self.rollouts, 1, 3):
-            raise ValueError("jobs of other than one or two rollouts")
+        if not _rising(self.jobs) or not _within(self.rollouts, 1, 3):
+            raise ValueError("jobs that do not rise, or of other than one or two rollouts")
         count = self.rollouts.sum()
-        if not len(self.returns) == len(self.steps) == len(self.traces) == count or self.flags.shape != (count, 4):
+        if not len(self.returns) == len(self.steps) == count or self.flags.shape != (count, 4):
             raise ValueError("arrays over different rollouts")
+        rising = _within(self.traced, 0, count) and _rising(self.traced)
+        if len(self.traced) != len(self.traces) or not rising:
+            raise ValueError(f"{len(self.traces)} traces of {len(self.traced)} rollouts, which do not rise")
         if len(self.trajectories) != np.count_nonzero(self.seen):
             raise ValueError(f"{len(self.trajectories)} trajectories of {np.count_nonzero(self.seen)} jobs")
 
     @classmethod
-    def of(cls, results: Sequence[Result], *, run: str, incarnation: str, round: int, worker: str) -> "Results":
-        """Make at least one result ready to send."""
+    def of(
+        cls, results: Sequence[Result], *, run: str, incarnation: str, round: int, worker: str, traces: str
+    ) -> "Results":
+        """Make at least one result ready to send, with those of its traces that are wanted, one of TRACES."""
+        results = sorted(results, key=lambda result: result.index)
+        returns = np.concatenate([r.returns for r in results])
+        seen = np.array([r.trajectory is not None for r in results])
+        rollouts = np.array([len(r.returns) for r in results])
+        felt = traced(traces, returns, rollouts, seen)
         flags = [np.stack([r.success, r.dropped, r.failed, r.clamped], axis=1) for r in results]
         return cls(
             run=run, incarnation=incarnation, round=round, worker=worker,
             trajectories=tuple(r.trajectory for r in results if r.trajectory),
             jobs=np.array([r.index for r in results]),
-            rollouts=np.array([len(r.returns) for r in results]),
-            seen=np.array([r.trajectory is not None for r in results]),
-            returns=np.concatenate([r.returns for r in results]),
+            rollouts=rollouts,
+            seen=seen,
+            returns=returns,
             steps=np.concatenate([r.steps for r in results]),
             flags=np.concatenate(flags),
-            traces=np.concatenate([r.traces for r in results]),
+            traced=felt,
+            traces=np.concatenate([r.traces for r in results])[felt],
         )  # fmt: skip
 
-    def split(self) -> list[Result]:
-        """Job by job again; the arrays are views."""
-        trajectories, found, start = iter(self.trajectories), [], 0
-        success, dropped, failed, clamped = self.flags.T
-        for index, count, seen in zip(self.jobs.tolist(), self.rollouts.tolist(), self.seen.tolist(), strict=True):
-            rows = slice(start, start + count)
-            start += count
-            found.append(
-                Result(
-                    index=index,
-                    trajectory=next(trajectories) if seen else None,
-                    returns=self.returns[rows],
-                    success=success[rows],
-                    steps=self.steps[rows],
-                    dropped=dropped[rows],
-                    failed=failed[rows],
-                    clamped=clamped[rows],
-                    traces=self.traces[rows],
-                )
-            )
-        return found
+
+TRACES: Final = ("none", "extremes", "all")
+"""Tactile traces that results bring: none, of the best and the worst exploring rollout of each message, of all of them.
+
+The best rollout of a round (of equals the first) is the best of the message that brings it: with `extremes` its trace
+is never missed, whichever jobs travel together.
+"""
+
+
+def traced(traces: str, returns: FloatArray, rollouts: IntArray, seen: BoolArray) -> IntArray:
+    """Which rollouts of a message have a trace, rising (K,).
+
+    Args:
+      traces: one of TRACES.
+      returns: (S,).
+      rollouts: of each job, (J,), S in all.
+      seen: which jobs have a trajectory and so do not explore, (J,).
+    """
+    exploring = np.flatnonzero(~np.repeat(seen, rollouts))
+    if traces == "all":
+        return exploring
+    if traces == "none" or not exploring.size:
+        return exploring[:0]
+    theirs = returns[exploring]
+    return exploring[sorted({int(theirs.argmax()), int(theirs.argmin())})]
 
 
 @dataclass(frozen=True, kw_only=True)

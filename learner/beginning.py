@@ -39,7 +39,7 @@ def specification(config: RunConfig, at: Checkpoint) -> Spec:
     settings, sizes = configs.to_dict(config), tasks.sizes(config.task)
     return Spec(
         run=at.run, task=config.task.task, release=sizes.release, task_config=settings["task"],
-        policy_config=settings["policy"], traces=config.traces != "none" and sizes.fingers > 0,
+        policy_config=settings["policy"],
         frequencies=at.frequencies, phases=at.phases,
     )  # fmt: skip
 

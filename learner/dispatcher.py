@@ -77,13 +77,13 @@ class Dispatcher:
         self._session, self._farm, self._stopped = session, farm, stopped
         self._ledger = Ledger(ledger or LedgerConfig())
         self._how_to_join = how_to_join
-        self._trace = (spec.task_config["steps"] if spec.traces else 0, len(FINGERS) * TAXELS)
+        self._trace = (spec.task_config["steps"], len(FINGERS) * TAXELS)
         self._shapes = shapes
         self._incarnation = secrets.token_hex(8)
         self._spec = codec.encode(spec)
         self._header = Generation(
             run=self.run, incarnation=self._incarnation, round=0, generation=0,
-            spec=hashlib.sha256(self._spec).hexdigest(), mu=_NOTHING, sigma=_NOTHING,
+            spec=hashlib.sha256(self._spec).hexdigest(), traces="none", mu=_NOTHING, sigma=_NOTHING,
         )  # fmt: skip
         self._round: Round | None = None
         self._told: set[str] = set()
@@ -121,14 +121,24 @@ class Dispatcher:
         """Jobs given out again since the start."""
         return self._ledger.reissued
 
-    def begin(self, generation: int, mu: FloatArray, sigma: FloatArray, jobs: Sequence[Job]) -> None:
-        """Announce a round and hand out its first jobs."""
+    def begin(
+        self, generation: int, mu: FloatArray, sigma: FloatArray, jobs: Sequence[Job], traces: str = "none"
+    ) -> None:
+        """Announce a round and hand out its first jobs.
+
+        Args:
+          generation: updates done.
+          mu: (P,).
+          sigma: (P,).
+          jobs: all of them, by index.
+          traces: which tactile traces of the exploring rollouts are wanted, one of TRACES.
+        """
         self._header = Generation(
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
-            generation=generation, spec=self._header.spec, mu=mu, sigma=sigma,
+            generation=generation, spec=self._header.spec, traces=traces, mu=mu, sigma=sigma,
         )  # fmt: skip
         chunk = Chunk.of(jobs, run=self.run, incarnation=self._incarnation, round=self._header.round)
-        self._round = Round(chunk, self._trace, self._shapes)
+        self._round = Round(chunk, traces, self._trace, self._shapes)
         self._ledger.begin(len(jobs))
         self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
         self._hand_out()

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
@@ -109,7 +109,7 @@ class Learner:
                 progress=progress,
                 rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
                 sample=_trajectory(results[len(eps)]),
-                traces=_traces(results.traces[:rollouts], returns, self._keep),
+                traces=_traces(results.traces, returns, self._keep),
                 replay=_trajectory(results[-1]) if len(results) > len(eps) + 1 else None,
                 replay_generation=last.best_generation,
             )
@@ -174,7 +174,7 @@ class Learner:
         ]
         jobs.append(mean_job(len(jobs), rate="control", perturbation=None))
         replay = self._replay_job(len(jobs)) if state.generation % REPLAY_EVERY == 0 else []
-        farm.begin(state.generation, state.mu, state.sigma, [*jobs, *replay])
+        farm.begin(state.generation, state.mu, state.sigma, [*jobs, *replay], self._keep)
         return eps
 
     def _perturbation(self, generation: int, index: int) -> tuple[int, ...] | None:
@@ -258,10 +258,9 @@ def _trajectory(result: Result) -> Trajectory | None:
     return result.trajectory.trajectory() if result.trajectory else None
 
 
-def _traces(traces: AnyArray, returns: FloatArray, keep: str) -> dict[str, AnyArray]:
-    """Those of the rollouts' traces (S, T, 54) that are kept, by name."""
+def _traces(traces: Mapping[int, AnyArray], returns: FloatArray, keep: str) -> dict[str, AnyArray]:
+    """Those of the rollouts' traces, (T, 54) each, that are kept, by name."""
     if keep == "none":
         return {}
-    flat = returns.reshape(-1)
-    kept = {"best": traces[int(flat.argmax())], "worst": traces[int(flat.argmin())]}
-    return {**kept, "all": traces} if keep == "all" else kept
+    kept = {"best": traces[int(returns.argmax())], "worst": traces[int(returns.argmin())]}
+    return {**kept, "all": np.stack([traces[i] for i in range(returns.size)])} if keep == "all" else kept

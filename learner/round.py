@@ -4,22 +4,23 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray
-from farm.messages import RATES, Chunk, Result, Results, WireTrajectory
+from farm.arrays import AnyArray, BoolArray, FloatArray
+from farm.messages import RATES, Chunk, Result, Results, WireTrajectory, traced
 
 
 class Round:
     """Jobs 0..n-1 and their results, S rollouts in all; a result is written where it belongs, whenever it comes."""
 
-    def __init__(self, jobs: Chunk, trace: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    def __init__(self, jobs: Chunk, traces: str, trace: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Make room.
 
         Args:
           jobs: all of them, by index.
-          trace: steps and taxels of a tactile trace.
+          traces: which tactile traces are wanted, one of TRACES.
+          trace: steps and taxels of one.
           shapes: of a trajectory's frames.
         """
-        self.jobs, self._trace, self._shapes = jobs, trace, shapes
+        self.jobs, self._traces, self._trace, self._shapes = jobs, traces, trace, shapes
         self._rollouts = np.count_nonzero(jobs.signs, axis=1)
         self._ends = np.cumsum(self._rollouts)
         self._starts = self._ends - self._rollouts
@@ -32,21 +33,22 @@ class Round:
         """Control steps until the end, (S,)"""
         self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
         """success, dropped, failed, clamped, (S, 4)"""
-        self.traces = np.zeros((count, *trace), dtype="<f4")
-        """Tactile traces [N], (S, T, 54)"""
+        self.traces: dict[int, AnyArray] = {}
+        """Tactile traces [N] of the rollouts that brought one, (T, 54) each"""
 
     def __len__(self) -> int:
         """How many jobs."""
         return len(self.jobs.jobs)
 
     def __getitem__(self, index: int) -> Result:
-        """One job's result; the arrays are views."""
+        """One job's result, without traces; the arrays are views."""
         at = index + len(self) if index < 0 else index
         rows = slice(int(self._starts[at]), int(self._ends[at]))
         success, dropped, failed, clamped = self.flags[rows].T
         return Result(
             index=at, trajectory=self._trajectories.get(at), returns=self.returns[rows], success=success,
-            steps=self.steps[rows], dropped=dropped, failed=failed, clamped=clamped, traces=self.traces[rows],
+            steps=self.steps[rows], dropped=dropped, failed=failed, clamped=clamped,
+            traces=np.empty((rows.stop - rows.start, 0, self._trace[1]), "<f4"),
         )  # fmt: skip
 
     def __iter__(self) -> Iterator[Result]:
@@ -55,7 +57,9 @@ class Round:
 
     def fitting(self, results: Results) -> BoolArray:
         """Which of these results (J,) are of a job of this round, and have its shapes."""
-        if results.traces.shape[1:] != self._trace:
+        wanted = traced(self._traces, results.returns, results.rollouts, results.seen)
+        whole = not len(wanted) or results.traces.shape[1:] == self._trace
+        if not whole or not np.array_equal(results.traced, wanted):
             return np.zeros(len(results.jobs), dtype=bool)
         fits = (results.jobs >= 0) & (results.jobs < len(self))
         jobs = np.where(fits, results.jobs, 0)
@@ -68,14 +72,17 @@ class Round:
         """Write down some results (J,) that fit."""
         jobs, rollouts = results.jobs[chosen], results.rollouts[chosen]
         there = np.repeat(self._starts[jobs] - (np.cumsum(rollouts) - rollouts), rollouts) + np.arange(rollouts.sum())
-        here = slice(None) if chosen.all() else np.repeat(chosen, results.rollouts)
+        here = np.flatnonzero(np.repeat(chosen, results.rollouts))
         for mine, theirs in (
             (self.returns, results.returns),
             (self.steps, results.steps),
             (self.flags, results.flags),
-            (self.traces, results.traces),
         ):
             mine[there] = theirs[here]
+        rows = dict(zip(here.tolist(), there.tolist(), strict=True))
+        for at, trace in zip(results.traced.tolist(), results.traces, strict=True):
+            if at in rows:
+                self.traces[rows[at]] = trace
         for at, trajectory in zip(np.flatnonzero(results.seen).tolist(), results.trajectories, strict=True):
             if chosen[at]:
                 self._trajectories[int(results.jobs[at])] = trajectory

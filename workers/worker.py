@@ -253,7 +253,7 @@ class Worker:
         self._runs[chunk.run].busy = time.monotonic()
         if results:
             head = {"incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
-            self._answer(chunk, Results.of(results, run=chunk.run, **head))
+            self._answer(chunk, Results.of(results, run=chunk.run, traces=header.traces, **head))
 
     def _backend(self, header: Generation) -> Backend | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""

@@ -60,8 +60,8 @@ def result(rollouts=2, steps=15, **changes):
     return Result(**(values | changes))
 
 
-def results(*parts):
-    return Results.of(parts, **HEAD, worker="host/a1")
+def results(*parts, traces="all"):
+    return Results.of(parts, **HEAD, worker="host/a1", traces=traces)
 
 
 def report(**changes):
@@ -115,7 +115,6 @@ MESSAGES = {
         task="finger-gait",
         task_config={"object": "bar", "steps": 15, "gamma": 0.95, "perturb": False},
         policy_config={"controller": "projected", "features": 50},
-        traces=True,
         frequencies=RNG.normal(size=(50, 8)),
         phases=RNG.uniform(size=50),
     ),
@@ -124,11 +123,12 @@ MESSAGES = {
         task="t",
         task_config={},
         policy_config={},
-        traces=False,
         frequencies=np.zeros((0, 8)),
         phases=np.zeros(0),
     ),
-    "generation": Generation(**HEAD, generation=6, spec="0f" * 32, mu=RNG.normal(size=64), sigma=np.full(64, 2.0)),
+    "generation": Generation(
+        **HEAD, generation=6, spec="0f" * 32, traces="all", mu=RNG.normal(size=64), sigma=np.full(64, 2.0)
+    ),
     "job": job(),
     "job of one nominal rollout": job(signs=(1,), perturbation=None, rate="physics", origin="zero"),
     "job of the mean": job(signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),
@@ -136,7 +136,8 @@ MESSAGES = {
     "chunk of means": Chunk.of(JOBS[2:3], **HEAD),
     "results": results(result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)),
     "results of one": results(result(rollouts=1)),
-    "results without traces": results(result(steps=0)),
+    "results without traces": results(result(steps=0), traces="none"),
+    "results of two traces": results(result(index=1), result(index=2), result(index=3), traces="extremes"),
     "failure": Failure(**HEAD, worker="host/a1", index=3, error="ValueError: so it went"),
     "report": report(),
     "report of statistics": report(traces=(), sample=None, lines=()),
@@ -251,11 +252,13 @@ REFUSED = {
     ],
     "results": [
         {"jobs": np.zeros(2, dtype=np.int64)},
+        {"jobs": np.array([0, 9, 3])},
+        {"jobs": np.array([0, 3, 3])},
         {"rollouts": np.array([2, 1])},
         {"rollouts": np.array([2, 1, 3])},
         {"rollouts": np.array([2, 1, 0])},
         {"rollouts": np.array([2**62, 2**62, 2**62])},
-        {"rollouts": np.array([2, 2, 1])[::-1].copy() * 2},
+        {"rollouts": np.array([2, 4, 4])},
         {"seen": np.array([True, True, False])},
         {"seen": np.zeros(3, dtype=bool)},
         {"seen": np.zeros(2, dtype=bool)},
@@ -265,6 +268,10 @@ REFUSED = {
         {"flags": np.zeros((3, 4), dtype=bool)},
         {"flags": np.zeros((5, 3), dtype=bool)},
         {"traces": np.zeros((3, 15, 54), dtype="<f4")},
+        {"traced": np.array([0, 1, 2])},
+        {"traced": np.array([0, 1, 1, 2])},
+        {"traced": np.array([0, 1, 2, 5])},
+        {"traced": np.array([-1, 0, 1, 2])},
     ],
     "trajectory": [
         *(
@@ -296,12 +303,29 @@ def test_jobs_are_split_as_they_were_put_together():
         assert_same(one, two)
 
 
-def test_results_are_split_as_they_were_put_together():
+def test_results_stand_in_the_jobs_order():
     parts = [result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)]
-    back = codec.decode(codec.encode(results(*parts)), Results).split()
-    assert len(back) == len(parts)
-    for one, two in zip(parts, back, strict=True):
-        assert_same(one, two)
+    back = codec.decode(codec.encode(results(*parts)), Results)
+    assert back.jobs.tolist() == [0, 3, 9]
+    assert back.rollouts.tolist() == [2, 2, 1]
+    assert back.returns.tolist() == [*parts[2].returns, *parts[0].returns, *parts[1].returns]
+    assert back.flags[:, 1].tolist() == [*parts[2].dropped, *parts[0].dropped, *parts[1].dropped]
+    assert back.traced.tolist() == [0, 1, 2, 3]  # the one that is seen does not explore
+    assert back.traces.tobytes() == parts[2].traces.tobytes() + parts[0].traces.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("returns", "expected"), [([0.5, 2.0, -1.0, 1.0], [1, 2]), ([1.0, 2.0, 2.0, 1.0], [0, 1]), ([3.0] * 4, [0])]
+)
+def test_traces_of_the_best_and_the_worst(returns, expected):
+    seen = result(1, index=0, trajectory=WireTrajectory.of(trajectory()), returns=np.array([9.0]))
+    parts = [seen, *(result(index=i, returns=np.array(returns[2 * i - 2 : 2 * i])) for i in (1, 2))]
+    back = results(*parts, traces="extremes")
+    assert back.traced.tolist() == [1 + row for row in expected]
+    for row, trace in zip(expected, back.traces, strict=True):
+        assert trace.tobytes() == parts[1 + row // 2].traces[row % 2].tobytes()
+    assert not results(seen, traces="extremes").traced.size
+    assert not results(*parts, traces="none").traced.size
 
 
 def test_results_of_nothing_are_refused():

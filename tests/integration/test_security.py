@@ -73,7 +73,7 @@ def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Res
         )
         for index in range(count)
     )
-    return Results.of(results, run=run, incarnation=incarnation, round=round_, worker=worker)
+    return Results.of(results, run=run, incarnation=incarnation, round=round_, worker=worker, traces="extremes")
 
 
 def test_intruders_do_nothing_and_honest_workers_do_not_notice(

@@ -25,7 +25,7 @@ from learner.ledger.ledger import LedgerConfig
 
 FARM, RUN, STEPS = "try", "r", 3
 SPEC = Spec(
-    run=RUN, task="none", task_config={"steps": STEPS}, policy_config={}, traces=True, frequencies=np.empty((0, 8)),
+    run=RUN, task="none", task_config={"steps": STEPS}, policy_config={}, frequencies=np.empty((0, 8)),
     phases=np.empty(0),
 )  # fmt: skip
 SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
@@ -89,7 +89,8 @@ class Worker:
 
     def results(self, chunk: Chunk, *results: Result) -> Results:
         found = results or tuple(result(index) for index in chunk.jobs.tolist())
-        return Results.of(found, run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.name)
+        head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.name}
+        return Results.of(found, traces="extremes", **head)
 
     def answer(self, message: object) -> None:
         self.say(keys.result(FARM, RUN, self.name), message)
@@ -119,7 +120,7 @@ class Learner:
         return self.farm
 
     def collect(self, todo: list[Job]) -> "Future[list[Result]]":
-        self.farm.begin(0, np.zeros(2), np.ones(2), todo)
+        self.farm.begin(0, np.zeros(2), np.ones(2), todo, "extremes")
         return self._pool.submit(self.farm.collect)
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from farm import codec, randomness, tasks
 from farm.errors import ConfigError
-from farm.messages import Job, Results, Spec
+from farm.messages import Job, Result, Results, Spec
 from farm.policy import Features, Policy, PolicyConfig
 from farm.rewards import RETURN_FLOOR
 from farm.tasks.finger_gait import TaskConfig
@@ -79,6 +79,10 @@ def test_both_rollouts_of_a_pair_start_alike():
     assert len({reset_seed(randomness.training(0, 0, i)) for i in range(100)}) == 100
 
 
+def sent(result: Result) -> bytes:
+    return codec.encode(Results.of([result], run="r", incarnation="i", round=1, worker="w/1", traces="none"))
+
+
 def test_jobs_do_not_know_of_each_other():
     runner, mu = episodes("gym:Hopper-v5"), theta_of("gym:Hopper-v5")
     jobs = [
@@ -90,9 +94,7 @@ def test_jobs_do_not_know_of_each_other():
     alone = [runner.run(mu, [one])[0] for one in reversed(jobs)][::-1]
     assert [result.index for result in together] == [4, 2, 9]
     for one, other in zip(together, alone, strict=True):
-        assert codec.encode(Results.of([one], run="r", incarnation="i", round=1, worker="w/1")) == codec.encode(
-            Results.of([other], run="r", incarnation="i", round=1, worker="w/1")
-        )
+        assert sent(one) == sent(other)
 
 
 @pytest.mark.parametrize("rate", ["control", "physics"])
@@ -138,7 +140,7 @@ def make_spec(**changes) -> Spec:
     values = {
         "run": "r", "task": config.task, "task_config": dataclasses.asdict(config),
         "policy_config": dataclasses.asdict(CONTROLLER), "frequencies": drawn.frequencies, "phases": drawn.phases,
-        "traces": False, "release": gymnasium.__version__,
+        "release": gymnasium.__version__,
     }  # fmt: skip
     return Spec(**(values | changes))
 

@@ -72,14 +72,20 @@ class Learner:
                 task=task,
                 task_config=dataclasses.asdict(TaskConfig()),
                 policy_config={},
-                traces=True,
                 frequencies=np.empty((0, 8)),
                 phases=np.empty(0),
             )  # fmt: skip
         )
         digest = hashlib.sha256(self.spec).hexdigest()
         self.header = Generation(
-            run=run, incarnation="first", round=2, generation=0, spec=digest, mu=np.ones(P), sigma=np.ones(P)
+            run=run,
+            incarnation="first",
+            round=2,
+            generation=0,
+            spec=digest,
+            traces="all",
+            mu=np.ones(P),
+            sigma=np.ones(P),
         )
         session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
         session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))

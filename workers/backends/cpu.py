@@ -1,7 +1,6 @@
 """Jobs on this machine's processor, on one thread."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar
 
 from farm.arrays import FloatArray
@@ -24,7 +23,7 @@ class CpuBackend:
           ConfigError: it names something this release does not know, or this machine does not have.
         """
         config, policy = specified(spec)
-        self._size, self._traces = policy.size, spec.traces
+        self._size = policy.size
         self._task = SIMULATES[config.kind](config, policy)
 
     @property
@@ -34,8 +33,7 @@ class CpuBackend:
 
     def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
         """Run jobs around a mean (P,); results in the jobs' order."""
-        results = self._task.run(mu, jobs)
-        return results if self._traces else [replace(r, traces=r.traces[:, :0]) for r in results]
+        return self._task.run(mu, jobs)
 
     def close(self) -> None:
         """Give back what it holds."""
