@@ -1,0 +1,70 @@
+"""A round's results: whichever messages bring them, in whatever order, doubled or not, the same comes out."""
+
+import numpy as np
+import pytest
+
+from farm.messages import Chunk, Job, Result, Results, WireTrajectory
+from learner.round import Round
+
+TRACE = (3, 54)
+SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
+PAIRS = 12
+RETURNS = np.random.default_rng(0).integers(0, 4, (PAIRS, 2)).astype(float)  # many are equal
+TRACES = np.random.default_rng(1).exponential(size=(PAIRS, 2, *TRACE)).astype("<f4")
+
+
+def job(index: int) -> Job:
+    seen = index == PAIRS
+    return Job(
+        index=index, origin="mu", signs=(1,) if seen else (1, -1), perturbation=None,
+        rate="control" if seen else "none", eps=np.zeros(0 if seen else 2),
+    )  # fmt: skip
+
+
+def result(index: int) -> Result:
+    seen = index == PAIRS
+    no = np.zeros(1 if seen else 2, bool)
+    arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items()}
+    return Result(
+        index=index, trajectory=WireTrajectory(value=9.0, success=True, times=np.zeros(1), **arrays) if seen else None,
+        returns=np.full(1, 9.0) if seen else RETURNS[index], success=no, steps=np.full(no.size, 3), dropped=no,
+        failed=no, clamped=no, traces=np.zeros((1, *TRACE), "<f4") if seen else TRACES[index],
+    )  # fmt: skip
+
+
+def begun(traces: str) -> Round:
+    chunk = Chunk.of([job(i) for i in range(PAIRS + 1)], run="r", incarnation="i", round=1)
+    return Round(chunk, traces, TRACE, SHAPES)
+
+
+def message(indices: list[int], traces: str) -> Results:
+    return Results.of([result(i) for i in indices], run="r", incarnation="i", round=1, worker="w/1", traces=traces)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("traces", ["extremes", "all"])
+def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: str, seed: int) -> None:
+    rng, done, round_ = np.random.default_rng(seed), set[int](), begun(traces)
+    while len(done) <= PAIRS:
+        some = rng.permutation(PAIRS + 1)[: rng.integers(1, 6)].tolist()
+        sent = message(some, traces)
+        assert round_.fitting(sent).all()
+        round_.put(sent, np.array([index not in done for index in sent.jobs.tolist()]))
+        done.update(some)
+    assert round_.returns.tolist() == [*RETURNS.reshape(-1), 9.0]
+    flat, kept = TRACES.reshape(-1, *TRACE), round_.traces
+    chosen = {int(RETURNS.argmax()), int(RETURNS.argmin())} if traces == "extremes" else set(range(2 * PAIRS))
+    assert chosen <= set(kept)
+    assert all(kept[row].tobytes() == flat[row].tobytes() for row in kept)
+    assert round_[PAIRS].trajectory is not None
+
+
+@pytest.mark.parametrize(("wanted", "sent"), [("extremes", "none"), ("extremes", "all"), ("none", "extremes")])
+def test_other_traces_than_were_wanted_do_not_fit(wanted: str, sent: str) -> None:
+    assert not begun(wanted).fitting(message([0, 3, PAIRS], sent)).any()
+
+
+def test_traces_of_another_length_do_not_fit() -> None:
+    longer = Round(begun("all").jobs, "all", (4, 54), SHAPES)
+    assert not longer.fitting(message([0], "all")).any()
+    assert longer.fitting(message([PAIRS], "all")).all()  # it has none
