@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes import Farm, children
+from recordings import generations
 
+from farm.local import free_endpoint
 from learner import config as configs
 from learner.experiments.catalogue import SETUPS
 from learner.experiments.experiment import trial
@@ -160,3 +162,18 @@ def test_what_is_measured_on_learnt_policies(farm: Farm, name: str, measured: st
     assert path.stat().st_mtime_ns == before
     path.unlink()
     assert "is gone" in farm.call("plot", "e", status=2)
+
+
+@pytest.mark.slow
+def test_on_the_workers_of_a_farm_encrypted_and_recorded(farm: Farm, done: Farm) -> None:
+    endpoint = free_endpoint().replace("tcp", "tls")
+    farm.call("certificates", "new", "certs", "--learner", "127.0.0.1", "--worker", "w")
+    farm.start_router(endpoint, "--tls", "certs/learner")
+    farm.start("worker", "--connect", endpoint, "--tls", "certs/worker-w", "--processes", "1")
+    words = ("experiment", "fig-4.3", "--trials", "1", "--generations", "3", "--out", "side", "--record")
+    farm.call(*words, "--connect", endpoint, "--tls", "certs/learner")
+    found = hashes(farm.folder / "side")
+    assert len(found) == 3
+    assert found.items() <= hashes(done.folder / "side").items()
+    for name in found:
+        assert generations(farm.folder / "side/runs" / name / "run.rrd") == [1, 2, 3]

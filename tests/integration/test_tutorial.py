@@ -12,7 +12,9 @@ from processes import Farm, children
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs/tutorial.md").read_text("utf-8")
-COMMANDS = [shlex.split(line, comments=True) for line in re.findall(r"^    ((?:farm|python) [a-z].*)$", TEXT, flags=re.M)]
+COMMANDS = [
+    shlex.split(line, comments=True) for line in re.findall(r"^    ((?:farm|python) [a-z].*)$", TEXT, flags=re.M)
+]
 APART = [["farm", "learner", "--name", "apart"], ["farm", "worker"]]
 LOOKS = "view"  # opens a window; test_finished_runs looks into what it opens
 FEW = ("--generations", "5")
