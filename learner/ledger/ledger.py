@@ -180,8 +180,9 @@ class Ledger:
         return "new" if self._books.finish(worker, index) else "doubled"
 
     def _first_time(self, size: int) -> list[Assignment]:
-        """Hand out pending jobs in chunks, lowest index first."""
+        """Hand out pending jobs in chunks, lowest index first; where there are too few for two chunks each, evenly."""
         free = self._books.free(2 * size) if self._books.any_pending() else []
+        load = sum(held for held, _ in free)
         chunks: list[Assignment] = []
         while free and self._books.any_pending():
             held, name = heapq.heappop(free)
@@ -189,11 +190,16 @@ class Ledger:
             credits = self._books.workers[name].credits
             chunk = min(size, (credits + 1) // 2)
             if held > chunk:
+                load -= held
                 continue
-            taken = self._books.take(name, min(chunk, credits - held), self._now)
+            even = -(-(self._books.waiting + load) // (len(free) + 1)) - held  # until all hold as much
+            taken = self._books.take(name, min(chunk, even, credits - held), self._now)
             chunks.append(Assignment(name, taken))
-            if held + len(taken) < credits:
-                heapq.heappush(free, (held + len(taken), name))
+            load -= held
+            held += len(taken)
+            if held < credits and held <= chunk:
+                heapq.heappush(free, (held, name))
+                load += held
         return chunks
 
     def _again(self, queue: dict[int, float], size: int) -> list[Assignment]:

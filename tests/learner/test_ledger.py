@@ -1,6 +1,7 @@
 """The ledger's rules, one at a time; `test_ledger_simulation` has them all at once."""
 
 import math
+from collections import Counter
 from itertools import pairwise
 
 import pytest
@@ -118,9 +119,25 @@ def test_chunks_do_not_shrink_below_what_is_worth_a_message():
     ledger = started(40, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
     assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [10, 10, 10, 10]
     ledger = started(20, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
-    assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [8, 8, 4]
+    assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [8, 8, 2, 2]
     ledger = started(6, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
     assert [len(chunk.indices) for chunk in ledger.assign(0.0)] == [3, 3]
+
+
+def test_what_is_left_after_the_first_chunks_is_dealt_evenly():
+    names = [f"w{i:02}" for i in range(64)]
+    ledger = started(1001, names, credits=128, seconds=0.02, chunk_seconds=0.2)
+    held = Counter[str]()
+    for chunk in ledger.assign(0.0):
+        held[chunk.worker] += len(chunk.indices)
+    assert Counter(held.values()) == {16: 41, 15: 23}
+    ledger = started(17, ["a", "b"], credits=128, seconds=0.004, least_seconds=0.015)
+    assert [(chunk.worker, len(chunk.indices)) for chunk in ledger.assign(0.0)] == [
+        ("a", 5),
+        ("b", 5),
+        ("a", 4),
+        ("b", 3),
+    ]
 
 
 def test_credits_are_the_limit_and_two_chunks_fit_into_them():
