@@ -38,6 +38,7 @@ from workers.worker import Worker, WorkerConfig
 
 TOGETHER = 32  # emulated workers a process
 MOST = 3200  # pairs a second that are tried
+PAIRS = 1000  # a generation; beyond 64 workers as many a worker as there
 PARAMETERS = 64
 
 
@@ -117,7 +118,7 @@ def main() -> None:
           "us a pair | MB | emulation: cores |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for count in counts:
-        pair, pairs = max(arguments.pair, count / MOST), max(1000, 16 * count)
+        pair, pairs = max(arguments.pair, count / MOST), max(PAIRS, PAIRS * count // 64)
         m, ideal = _measure(count, pairs, pair, arguments.seconds), 2 * count / pair
         print(
             f"| {count} | {pair * 1000:g} | {pairs} | {m.joined:.1f} | {2 * m.pairs_per_second:.0f} | {ideal:.0f} | "

@@ -1,3 +1,3 @@
 """The farm: what is learned, and how learner and workers speak."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"

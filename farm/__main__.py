@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2 if isinstance(error, ConfigError) else 1
     except BrokenPipeError:
         sys.stderr.close()
-        return 0
+        return 1
 
 
 def _overview() -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 """Version of everything on the wire; stands in every message."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -39,13 +39,13 @@ def array(dtype: str, ndim: int) -> Any:  # noqa: ANN401  a dataclass field, as 
     return dataclasses.field(metadata={"dtype": np.dtype(dtype), "ndim": ndim})
 
 
-def encode(message: object) -> bytes:
+def encode(message: object, schema: int | None = None) -> bytes:
     """The message with its type's name and the schema version."""
-    body = {"schema": SCHEMA, "type": type(message).__name__, **_plain(message)}
+    body = {"schema": SCHEMA if schema is None else schema, "type": type(message).__name__, **_plain(message)}
     return bytes(msgpack.packb(body, default=_pack, use_bin_type=True) or b"")
 
 
-def decode(payload: bytes, kind: type[M]) -> M:
+def decode(payload: bytes, kind: type[M], schema: int | None = None) -> M:
     """The message of that type in these bytes.
 
     Raises:
@@ -69,10 +69,10 @@ def decode(payload: bytes, kind: type[M]) -> M:
         raise MessageError(f"not a message: {error}") from None
     if not isinstance(body, dict):
         raise MessageError(f"not a message: a {type(body).__name__}")
-    schema, name = body.get("schema"), body.get("type")
-    if type(schema) is not int or schema != SCHEMA:
+    version, name, ours = body.get("schema"), body.get("type"), SCHEMA if schema is None else schema
+    if type(version) is not int or version != ours:
         raise MessageError(
-            f"schema version {_brief(schema)}, this side speaks {SCHEMA}: run the same release on both", "version"
+            f"schema version {_brief(version)}, this side speaks {ours}: run the same release on both", "version"
         )
     if type(name) is not str or name != kind.__name__:
         raise MessageError(f"a {_brief(name)} where a {kind.__name__} was expected")

@@ -44,6 +44,7 @@ def measure(folder: ExperimentFolder, experiment: Experiment) -> None:
     path = folder.measured(experiment)
     known = {name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()}
     of = {"hashes": np.array([digest for series in known.values() for digest in series.hashes])}
+    of["recorded"] = np.array([(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in known.values()])
     of |= {"trials": np.array(folder.trials), "figure": np.array(repr(experiment.figure))}
     if path.exists():
         kept = read_arrays(path)

@@ -15,6 +15,7 @@ from farm.codec import array
 from farm.trajectory import Trajectory
 
 _SHORT: Final = 250  # characters; names have up to 100, a worker's is two of them
+_LINE: Final = 1000  # characters
 
 RATES: Final = ("none", "control", "physics")
 """How much of a rollout a job wants to see, besides its figures: nothing, or a trajectory at that rate."""
@@ -42,8 +43,9 @@ class Want:
 
     def __post_init__(self) -> None:
         """Check the number, and that what is remembered of a worker is short."""
-        if max(map(len, (self.worker, self.version, self.assets, self.canary, self.host))) > _SHORT:
-            raise ValueError(f"a name of more than {_SHORT} characters")
+        for said in (self.worker, self.version, self.assets, self.canary, self.host):
+            if len(said) > _SHORT or not said.isprintable():
+                raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
         if not 0 <= self.credits <= 100_000:
             raise ValueError(f"{self.credits} credits")
 
@@ -78,8 +80,6 @@ class Generation:
     traces: str
     """Which tactile traces results bring, one of TRACES."""
     mu: FloatArray = array("<f8", 1)
-    """(P,)"""
-    sigma: FloatArray = array("<f8", 1)
     """(P,)"""
 
     def __post_init__(self) -> None:
@@ -346,6 +346,12 @@ class Failure:
     worker: str
     index: int
     error: str
+    """One line."""
+
+    def __post_init__(self) -> None:
+        """Check that it can be shown."""
+        if len(self.error) > _LINE or not self.error.isprintable():
+            raise ValueError(f"an error of more than {_LINE} characters, or unprintable ones")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,7 +377,9 @@ class WireTrajectory:
     terms: AnyArray = array("<f4", 2)
 
     def __post_init__(self) -> None:
-        """Check that all have as many frames; how wide each is, the run's task says."""
+        """Check that all have as many frames, at rising times; how wide each is, the run's task says."""
+        if not len(self.times) or self.times[0] != 0.0 or (np.diff(self.times) <= 0.0).any():
+            raise ValueError(f"{len(self.times)} frames that do not begin at 0 and rise")
         for name in ("bodies", "joints", "targets", "images", "points", "terms"):
             shape = getattr(self, name).shape
             if shape[0] != len(self.times):

@@ -19,7 +19,6 @@ from farm import keys
 from farm.errors import ConfigError
 
 Role = Literal["learner", "worker", "viewer"]
-ROLES: Final[tuple[Role, ...]] = ("learner", "worker", "viewer")
 
 _FILES: Final = ("ca.pem", "cert.pem", "key.pem", "identity.json")
 

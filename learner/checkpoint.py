@@ -13,6 +13,7 @@ from farm.errors import CheckpointError, MessageError
 from farm.messages import Job
 
 _MAGIC: Final = b"rolloutfarm checkpoint 1\n"
+_SCHEMA: Final = 1  # of what follows, whichever version messages have
 _DIGEST: Final = hashlib.sha256().digest_size
 
 
@@ -49,7 +50,7 @@ class Checkpoint:
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
     """Replace the file by a new one, or leave the old one as it is."""
-    body = codec.encode(checkpoint)
+    body = codec.encode(checkpoint, _SCHEMA)
     aside = path.with_name(path.name + ".new")
     try:
         with aside.open("wb") as file:
@@ -80,6 +81,6 @@ def load(path: Path) -> Checkpoint:
     if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
         raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
     try:
-        return codec.decode(body, Checkpoint)
+        return codec.decode(body, Checkpoint, _SCHEMA)
     except MessageError as error:
         raise CheckpointError(f"{path}: {error}") from None

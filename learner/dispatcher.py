@@ -83,7 +83,7 @@ class Dispatcher:
         self._spec = codec.encode(spec)
         self._header = Generation(
             run=self.run, incarnation=self._incarnation, round=0, generation=0,
-            spec=hashlib.sha256(self._spec).hexdigest(), traces="none", mu=_NOTHING, sigma=_NOTHING,
+            spec=hashlib.sha256(self._spec).hexdigest(), traces="none", mu=_NOTHING,
         )  # fmt: skip
         self._round: Round | None = None
         self._told: set[str] = set()
@@ -121,21 +121,18 @@ class Dispatcher:
         """Jobs given out again since the start."""
         return self._ledger.reissued
 
-    def begin(
-        self, generation: int, mu: FloatArray, sigma: FloatArray, jobs: Sequence[Job], traces: str = "none"
-    ) -> None:
+    def begin(self, generation: int, mu: FloatArray, jobs: Sequence[Job], traces: str = "none") -> None:
         """Announce a round and hand out its first jobs.
 
         Args:
           generation: updates done.
           mu: (P,).
-          sigma: (P,).
           jobs: all of them, by index.
           traces: which tactile traces of the exploring rollouts are wanted, one of TRACES.
         """
         self._header = Generation(
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
-            generation=generation, spec=self._header.spec, traces=traces, mu=mu, sigma=sigma,
+            generation=generation, spec=self._header.spec, traces=traces, mu=mu,
         )  # fmt: skip
         chunk = Chunk.of(jobs, run=self.run, incarnation=self._incarnation, round=self._header.round)
         self._round = Round(chunk, traces, self._trace, self._shapes)
@@ -257,18 +254,13 @@ class Dispatcher:
 
     def _count(self, message: Results) -> None:
         assert self._round is not None
-        good = self._round.fitting(message)
-        indices = message.jobs[good].tolist()
-        if len(indices) < len(good):
+        if not self._round.fits(message):
             self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
-        if not indices:
             return
-        verdicts = self._ledger.results(message.worker, indices, time.monotonic())
-        new = good.copy()
-        new[good] = [verdict == "new" for verdict in verdicts]
-        self._round.put(message, new)
+        verdicts = self._ledger.results(message.worker, message.jobs.tolist(), time.monotonic())
+        self._round.put(message, np.array([verdict == "new" for verdict in verdicts]))
         self.ignored.update(verdict for verdict in verdicts if verdict != "new")
-        self._census.did(message.worker, int(message.rollouts[good].sum()), time.monotonic())
+        self._census.did(message.worker, len(message.returns), time.monotonic())
 
     def _failed(self, failure: Failure) -> None:
         if self._round is None or not 0 <= failure.index < len(self._round):

@@ -113,10 +113,11 @@ class RunFolder:
         """
         folder = os.open(self.path, os.O_RDONLY)
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError(f"another process is working on the run in {self.path}: let it end first") from None
             yield
-        except BlockingIOError:
-            raise ConfigError(f"another process is working on the run in {self.path}: let it end first") from None
         finally:
             os.close(folder)
 

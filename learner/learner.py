@@ -118,7 +118,7 @@ class Learner:
         """The mean policy at the end of the run."""
         jobs = evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED)
         best = self._replay_job(len(jobs))
-        farm.begin(self.state.generation, self.state.mu, self.state.sigma, [*jobs, *best])
+        farm.begin(self.state.generation, self.state.mu, [*jobs, *best])
         results = farm.collect()
         return Evaluation(
             mean=results[EVALUATION_ROLLOUTS],
@@ -174,7 +174,7 @@ class Learner:
         ]
         jobs.append(mean_job(len(jobs), rate="control", perturbation=None))
         replay = self._replay_job(len(jobs)) if state.generation % REPLAY_EVERY == 0 else []
-        farm.begin(state.generation, state.mu, state.sigma, [*jobs, *replay], self._keep)
+        farm.begin(state.generation, state.mu, [*jobs, *replay], self._keep)
         return eps
 
     def _perturbation(self, generation: int, index: int) -> tuple[int, ...] | None:
@@ -262,5 +262,7 @@ def _traces(traces: Mapping[int, AnyArray], returns: FloatArray, keep: str) -> d
     """Those of the rollouts' traces, (T, 54) each, that are kept, by name."""
     if keep == "none":
         return {}
-    kept = {"best": traces[int(returns.argmax())], "worst": traces[int(returns.argmin())]}
+    rows = {"best": int(returns.argmax()), "worst": int(returns.argmin())}
+    # Where machines of different numbers take part, a doubled job's trace may have travelled in another's place.
+    kept = {name: traces[row] for name, row in rows.items() if row in traces}
     return {**kept, "all": np.stack([traces[i] for i in range(returns.size)])} if keep == "all" else kept

@@ -55,21 +55,20 @@ class Round:
         """Job by job."""
         return (self[index] for index in range(len(self)))
 
-    def fitting(self, results: Results) -> BoolArray:
-        """Which of these results (J,) are of a job of this round, and have its shapes."""
+    def fits(self, results: Results) -> bool:
+        """Whether these are of jobs of this round, have their shapes, and the traces that are wanted of them."""
+        known = bool((results.jobs >= 0).all() and (results.jobs < len(self)).all())
+        if not known or (results.rollouts != self._rollouts[results.jobs]).any():
+            return False
+        if (results.seen != self._seen[results.jobs]).any():
+            return False
         wanted = traced(self._traces, results.returns, results.rollouts, results.seen)
-        whole = not len(wanted) or results.traces.shape[1:] == self._trace
-        if not whole or not np.array_equal(results.traced, wanted):
-            return np.zeros(len(results.jobs), dtype=bool)
-        fits = (results.jobs >= 0) & (results.jobs < len(self))
-        jobs = np.where(fits, results.jobs, 0)
-        fits &= (results.rollouts == self._rollouts[jobs]) & (results.seen == self._seen[jobs])
-        for at, trajectory in zip(np.flatnonzero(results.seen), results.trajectories, strict=True):
-            fits[at] &= trajectory.fits(self._shapes)
-        return fits
+        if not np.array_equal(results.traced, wanted) or (len(wanted) and results.traces.shape[1:] != self._trace):
+            return False
+        return all(trajectory.fits(self._shapes) for trajectory in results.trajectories)
 
     def put(self, results: Results, chosen: BoolArray) -> None:
-        """Write down some results (J,) that fit."""
+        """Write down some (J,) of results that fit."""
         jobs, rollouts = results.jobs[chosen], results.rollouts[chosen]
         there = np.repeat(self._starts[jobs] - (np.cumsum(rollouts) - rollouts), rollouts) + np.arange(rollouts.sum())
         here = np.flatnonzero(np.repeat(chosen, results.rollouts))

@@ -211,8 +211,12 @@ class Worker:
         """What we know of a run.
 
         Raises:
-          MessageError: there are more runs than anybody honest has.
+          MessageError: that is no name, or there are more runs than anybody honest has.
         """
+        try:
+            keys.checked("run", run)
+        except ConfigError as error:
+            raise MessageError(str(error)) from None
         if run not in self._runs and len(self._runs) >= _RUNS:
             raise MessageError(f"run {run[:40]}: {_RUNS} runs are served already", "large")
         return self._runs.setdefault(run, _Served())
@@ -279,7 +283,8 @@ class Worker:
         return self._backends[header.spec]
 
     def _fail(self, chunk: Chunk, index: int, error: Exception) -> None:
-        text = " ".join(f"{type(error).__name__}: {error}".split())[:500]
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:500]
+        text = "".join(letter if letter.isprintable() else "?" for letter in said)
         self._answer(
             chunk,
             Failure(

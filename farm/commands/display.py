@@ -188,7 +188,7 @@ class LiveDisplay:
         dropped = self._run.dropped
         table.add_row("farm", f"{report.rate:.0f}", f"rollouts/s, {p.workers} workers{extra}")
         for worker in workers[:_WORKERS]:
-            table.add_row("", f"{worker.rate:.0f}", name(worker))
+            table.add_row("", f"{worker.rate:.0f}", Text(name(worker)))
         if len(workers) > _WORKERS:
             table.add_row("", f"{sum(w.rate for w in workers[_WORKERS:]):.0f}", f"{len(workers) - _WORKERS} more")
         if dropped:

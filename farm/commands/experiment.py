@@ -182,7 +182,7 @@ class Runs:
 
     def _print(self, line: str) -> None:
         if self._live:
-            self._bars.console.print(line, highlight=False)
+            self._bars.console.print(line, highlight=False, markup=False)
         else:
             sys.stdout.write(line + "\n")
             sys.stdout.flush()

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from farm import arguments, codec, keys
 from farm.commands import logs
@@ -115,9 +116,10 @@ def _tables(runs: list[RunStatus]) -> Group:
         ignored = ", ".join(f"{kind} {count}" for kind, count in sorted(run.ignored.items())) or "-"
         figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
-        table.add_row(run.run, generation, *figures, str(run.open), str(run.reissued), ignored, str(run.refused))
+        what = run.run, generation, *figures, str(run.open), str(run.reissued), ignored, str(run.refused)
+        table.add_row(*map(Text, what))  # as they are: a name in brackets is no style
         for worker in run.workers:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
-            workers.add_row(worker.worker, *machine, run.run, *did)
+            workers.add_row(*map(Text, (worker.worker, *machine, run.run, *did)))
     return Group(table, workers)

@@ -82,6 +82,7 @@ class ExperimentFolder:
         try:
             if not (path / "experiment.json").exists() and path.exists() and any(path.iterdir()):
                 raise ConfigError(f"{path} holds something else and no experiment.json: give another --out")
+            folder.check_runs(go_on=True)
             (path / "runs").mkdir(parents=True, exist_ok=True)
             (path / "data").mkdir(exist_ok=True)
             told = {"version": _VERSION, "experiments": list(names), "trials": trials, "generations": generations}
@@ -90,7 +91,6 @@ class ExperimentFolder:
             aside.replace(path / "experiment.json")
         except OSError as error:
             raise ConfigError(f"cannot write to {path}: {error.strerror}") from None
-        folder.check_runs(go_on=True)
         return folder
 
     @property

@@ -25,7 +25,7 @@ from learner.progress import Progress
 from learner.recording import blueprint
 from learner.recording.curves import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, Colour, lines
 from learner.recording.drawing import Drawing
-from learner.recording.rows import begin, log_static
+from learner.recording.rows import begin, flush, log_static
 
 COLOURS: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 """One a run."""
@@ -35,7 +35,6 @@ SPACING: Final = 0.22
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a layout of its own, which never becomes that of a run
 _LABEL: Final = (0.0, 0.0, 0.19)  # over the fingers [m]
-_FLUSH: Final = 30.0  # [s]
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
         log_static(stream, [(root, place), *hand, *((root + e, v) for e, v in _names(run.name, colour))])
         _send_curves(stream, root, run.progress)
         _send_rollout(stream, root, drawing, run.rollout)
-    stream.flush(timeout_sec=_FLUSH)
+    flush(stream)
     stream.disconnect()
 
 

@@ -16,7 +16,8 @@ from typing import Final
 
 log = logging.getLogger(__name__)
 
-_COMPACTING: Final = 600.0  # [s]; 30 MiB take about one
+COMPACTING: Final = 600.0
+"""How long merging may take [s]; 30 MiB take about one."""
 
 
 def parts(path: Path) -> list[Path]:
@@ -50,7 +51,7 @@ def compact(path: Path) -> bool:
 def _optimise(found: list[Path], merged: Path) -> None:
     command = [sys.executable, "-m", "rerun_cli", "rrd", "optimize", *map(str, found), "-o", str(merged)]
     with tempfile.TemporaryDirectory() as home:
-        subprocess.run(command, env=_quiet(home), check=True, capture_output=True, timeout=_COMPACTING)
+        subprocess.run(command, env=_quiet(home), check=True, capture_output=True, timeout=COMPACTING)
 
 
 def next_part(path: Path) -> Path:

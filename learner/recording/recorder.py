@@ -31,7 +31,7 @@ from learner.progress import Progress
 from learner.recording import blueprint, curves
 from learner.recording.drawing import Drawing, trace
 from learner.recording.files import compact, next_part, parts
-from learner.recording.rows import begin, log_static, row, rows, send, send_properties, times
+from learner.recording.rows import begin, flush, log_static, row, rows, send, send_properties, times
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,6 @@ __all__ = ["Recorder", "parts", "record_replay"]
 
 HOLD: Final = 0.5
 """Rollouts of so long are written together, statistics at once: a row costs much more than what it says [s]."""
-FLUSH: Final = 30.0
-"""How long rows may take to reach the file before the recording counts as broken [s]."""
 RESERVE: Final = 32 << 20
 """Free space on the disk below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
@@ -201,15 +199,12 @@ class Recorder:
         send(self._stream, columns, rows("generation", numbers, sim, wall))
 
     def _flush(self) -> None:
-        """See every row into the file: a kill loses nothing, and what goes wrong is noticed."""
+        """See every row into the file: a kill loses what is held back or waits to be recorded, no more."""
         try:
-            self._stream.flush(timeout_sec=FLUSH)
-        except RuntimeError as error:
-            # Rerun would now wait for this file for ever, at the latest when the process ends.
+            flush(self._stream)
+        except OSError:
             self._broken = True
-            rr.unregister_shutdown()
-            self._stream.inner = _Abandoned()  # type: ignore[assignment]
-            raise OSError(f"Rerun writes no more: {error}") from error
+            raise
 
     def _check_space(self) -> None:
         """Stop before Rerun meets a full disk."""
@@ -239,12 +234,16 @@ def record_replay(
       scene: what is drawn.
       config: the resolved configuration, Markdown.
       rollouts: names and rollouts, at any rate.
+
+    Raises:
+      OSError: the file cannot be written; one that was there stays.
     """
     drawing = Drawing(scene)
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
-    path.unlink(missing_ok=True)
+    aside = path.with_name(f"{path.stem}.new{path.suffix}")
+    aside.unlink(missing_ok=True)
     stream = begin(
-        f"{run}-replay", [_file(path)], blueprint.replay(longest, touch=drawing.touch, mover=drawing.mover())
+        f"{run}-replay", [_file(aside)], blueprint.replay(longest, touch=drawing.touch, mover=drawing.mover())
     )
     log_static(stream, [*drawing.static(), _config(config)])
     start = 0.0
@@ -257,9 +256,10 @@ def record_replay(
             rows("rollout", np.full(len(rollout.times), number), start + rollout.times),
         )
         start += float(rollout.times[-1]) + PAUSE
-    stream.flush(timeout_sec=FLUSH)
+    flush(stream)
     stream.disconnect()
-    compact(path)
+    compact(aside)
+    aside.replace(path)
 
 
 @dataclass(frozen=True)
@@ -272,14 +272,6 @@ class _Held:
     wall: FloatArray
     """And on wall_time [s since the epoch], (F,)"""
     rollout: Trajectory
-
-
-class _Abandoned:
-    """Stands in for a native recording that must not be waited for."""
-
-    def is_forked_child(self) -> bool:
-        """Yes: Rerun lets go of those without a word."""
-        return True
 
 
 def _free_port(host: str, port: int) -> int:

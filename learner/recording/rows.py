@@ -10,6 +10,8 @@ import rerun.blueprint as rrb
 from farm.arrays import FloatArray, IntArray
 from learner.recording.drawing import Columns
 
+FLUSH: Final = 30.0
+"""How long rows may take to reach the file before the recording counts as broken [s]."""
 APPLICATION: Final = "rolloutfarm"
 Times = list[rr.TimeColumn]
 
@@ -24,6 +26,29 @@ def begin(
     stream.send_blueprint(layout)
     stream.send_recording_name(recording)
     return stream
+
+
+def flush(stream: rr.RecordingStream) -> None:
+    """See every row into the files: what goes wrong is noticed.
+
+    Raises:
+      OSError: the files take no more; the stream writes nothing any more.
+    """
+    try:
+        stream.flush(timeout_sec=FLUSH)
+    except RuntimeError as error:
+        # Rerun would now wait for this file for ever, at the latest when the process ends.
+        rr.unregister_shutdown()
+        stream.inner = _Abandoned()  # type: ignore[assignment]
+        raise OSError(f"Rerun writes no more: {error}") from error
+
+
+class _Abandoned:
+    """Stands in for a native recording that must not be waited for."""
+
+    def is_forked_child(self) -> bool:
+        """Yes: Rerun lets go of those without a word."""
+        return True
 
 
 def send_properties(stream: rr.RecordingStream, name: str, values: Mapping[str, object]) -> None:

@@ -11,6 +11,7 @@ from farm.scene import Scene
 from farm.trajectory import Trajectory
 from learner import config as configs
 from learner.config import RunConfig
+from learner.recording.files import COMPACTING
 from learner.recording.recorder import Recorder
 from learner.recording.thread import RecorderThread
 from learner.report import Report
@@ -110,7 +111,7 @@ class Recording(logging.Handler):
     def finish(self) -> None:
         """Write out what waits, and close; an interrupted run is in a hurry and merges when it goes on."""
         logging.getLogger().removeHandler(self)
-        self._thread.close(_CLOSE, merge=self._ended)
+        self._thread.close(_CLOSE + (COMPACTING if self._ended else 0.0), merge=self._ended)
 
     def _show(self, rollouts: list[tuple[str, Trajectory]]) -> None:
         if self._replay is not None:

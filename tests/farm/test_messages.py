@@ -126,9 +126,7 @@ MESSAGES = {
         frequencies=np.zeros((0, 8)),
         phases=np.zeros(0),
     ),
-    "generation": Generation(
-        **HEAD, generation=6, spec="0f" * 32, traces="all", mu=RNG.normal(size=64), sigma=np.full(64, 2.0)
-    ),
+    "generation": Generation(**HEAD, generation=6, spec="0f" * 32, traces="all", mu=RNG.normal(size=64)),
     "job": job(),
     "job of one nominal rollout": job(signs=(1,), perturbation=None, rate="physics", origin="zero"),
     "job of the mean": job(signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),
@@ -155,7 +153,6 @@ MESSAGES = {
     ),
     "trajectory": WireTrajectory.of(trajectory()),
     "trajectory of one frame": WireTrajectory.of(trajectory(frames=1)),
-    "trajectory of none": WireTrajectory.of(trajectory(frames=0, bodies=0)),
 }
 
 
@@ -326,6 +323,21 @@ def test_traces_of_the_best_and_the_worst(returns, expected):
         assert trace.tobytes() == parts[1 + row // 2].traces[row % 2].tobytes()
     assert not results(seen, traces="extremes").traced.size
     assert not results(*parts, traces="none").traced.size
+
+
+@pytest.mark.parametrize("times", [[], [0.1], [0.0, 0.2, 0.1], [0.0, 0.0]])
+def test_frames_begin_at_the_release_and_rise(times):
+    shown = trajectory(frames=len(times), times=np.array(times))
+    with pytest.raises(ValueError, match="begin at 0"):
+        WireTrajectory.of(shown)
+
+
+@pytest.mark.parametrize("text", ["x" * 1001, "two\nlines", "\x1b[2J"])
+def test_texts_that_cannot_be_shown_are_refused(text):
+    with pytest.raises(ValueError, match="unprintable"):
+        dataclasses.replace(MESSAGES["failure"], error=text)
+    with pytest.raises(ValueError, match="unprintable"):
+        dataclasses.replace(MESSAGES["want"], host=text)
 
 
 def test_results_of_nothing_are_refused():

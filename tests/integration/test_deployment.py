@@ -119,12 +119,12 @@ def unit(name: str) -> list[str]:
 
 def test_the_units_commands_learn(farm: Farm, place: Place) -> None:
     _, here = place
-    farm.call("run", "--name", "settings", "--generations", "0", "--pairs", "6", "--no-record")
+    farm.call("run", "--no-record", "--name", "settings", "--generations", "5", "--pairs", "6")
     shutil.copy(farm.folder / "runs/settings/config.json", farm.folder / "first.json")
     names = ("farm-router.service", "farm-worker.service", "farm-learner@.service")
     commands = [[here(word) for word in unit(name)] for name in names]
     assert {command[0] for command in commands} == {"farm"}
-    learn(farm, *(command[1:] for command in commands), "--generations", "5")
+    learn(farm, *(command[1:] for command in commands))
 
 
 def test_units_are_what_systemd_takes(tmp_path: Path) -> None:

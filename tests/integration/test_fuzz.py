@@ -45,9 +45,7 @@ VALUES = st.recursive(
 HONEST = (
     Want(worker="w/1", credits=1, idle=("r",), version="0", assets="a", canary="c", host="h", cores=2),
     Failure(run="r", incarnation="i", round=1, worker="w/1", index=0, error="e"),
-    Generation(
-        run="r", incarnation="i", round=1, generation=0, spec="s", traces="all", mu=np.zeros(2), sigma=np.ones(2)
-    ),
+    Generation(run="r", incarnation="i", round=1, generation=0, spec="s", traces="all", mu=np.zeros(2)),
     Refusal(run="r", reason="so"),
 )
 

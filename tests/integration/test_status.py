@@ -3,8 +3,11 @@
 import json
 
 from processes import SMALL, Farm
+from rich.console import Console
 
+from farm.commands import status
 from farm.local import free_endpoint
+from farm.reports import RunStatus, WorkerStatus
 
 
 def test_runs_and_workers_are_seen(farm: Farm) -> None:
@@ -21,6 +24,21 @@ def test_runs_and_workers_are_seen(farm: Farm) -> None:
     said = farm.call("status", "--connect", endpoint)
     assert "100000" in said
     assert "workers" in said
+
+
+def test_names_in_brackets_are_shown_as_they_are() -> None:
+    worker = WorkerStatus(
+        worker="w/1", host="[/red]", cores=2, version="[bold]", canary="c", rollouts=1, rate=1.0, seen=0.0
+    )
+    run = RunStatus(
+        run="r", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0,
+        refused=0, ignored={}, workers=(worker,),
+    )  # fmt: skip
+    console = Console(width=200)
+    with console.capture() as shown:
+        console.print(status._tables([run]))
+    assert "[/red]" in shown.get()
+    assert "[bold]" in shown.get()
 
 
 def test_nobody_there(farm: Farm) -> None:

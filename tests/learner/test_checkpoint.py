@@ -102,7 +102,7 @@ def test_of_another_version(tmp_path: Path, whole: bytes) -> None:
 
 
 def test_of_another_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("farm.codec.SCHEMA", 2)
+    monkeypatch.setattr("learner.checkpoint._SCHEMA", 2)
     save(tmp_path / "checkpoint", checkpoint())
     monkeypatch.undo()
     with pytest.raises(CheckpointError, match="schema version 2"):

@@ -120,7 +120,7 @@ class Learner:
         return self.farm
 
     def collect(self, todo: list[Job]) -> "Future[list[Result]]":
-        self.farm.begin(0, np.zeros(2), np.ones(2), todo, "extremes")
+        self.farm.begin(0, np.zeros(2), todo, "extremes")
         return self._pool.submit(self.farm.collect)
 
     def close(self) -> None:
@@ -172,9 +172,9 @@ def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
 def test_a_round_is_announced(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
-    farm.begin(7, np.array([1.0, 2.0]), np.array([3.0, 4.0]), jobs(1))
+    farm.begin(7, np.array([1.0, 2.0]), jobs(1), "all")
     said = codec.decode(worker.next("generation"), Generation)
-    assert (said.run, said.round, said.generation, said.mu.tolist(), said.sigma.tolist()) == (RUN, 1, 7, [1, 2], [3, 4])
+    assert (said.run, said.round, said.generation, said.mu.tolist(), said.traces) == (RUN, 1, 7, [1, 2], "all")
     asked = worker.session.ask(keys.generation(FARM, RUN), WAIT)
     assert asked is not None
     assert codec.decode(asked, Generation).incarnation == said.incarnation

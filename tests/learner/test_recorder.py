@@ -536,8 +536,8 @@ def test_a_full_disk_is_noticed(tmp_path: Path) -> None:
         import pickle, resource, sys
         from pathlib import Path
         from farm import scene as scenes
-        from learner.recording import recorder as recorders
-        recorders.FLUSH = 1.0
+        from learner.recording import recorder as recorders, rows
+        rows.FLUSH = 1.0
         recorder = recorders.Recorder(Path({str(tmp_path / "run.rrd")!r}), run="try",
                             scene=scenes.load("bar"), config="", horizon={HORIZON})
         resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))

@@ -1,5 +1,7 @@
 """A round's results: whichever messages bring them, in whatever order, doubled or not, the same comes out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,7 +50,7 @@ def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: 
     while len(done) <= PAIRS:
         some = rng.permutation(PAIRS + 1)[: rng.integers(1, 6)].tolist()
         sent = message(some, traces)
-        assert round_.fitting(sent).all()
+        assert round_.fits(sent)
         round_.put(sent, np.array([index not in done for index in sent.jobs.tolist()]))
         done.update(some)
     assert round_.returns.tolist() == [*RETURNS.reshape(-1), 9.0]
@@ -61,10 +63,18 @@ def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: 
 
 @pytest.mark.parametrize(("wanted", "sent"), [("extremes", "none"), ("extremes", "all"), ("none", "extremes")])
 def test_other_traces_than_were_wanted_do_not_fit(wanted: str, sent: str) -> None:
-    assert not begun(wanted).fitting(message([0, 3, PAIRS], sent)).any()
+    assert not begun(wanted).fits(message([0, 3, PAIRS], sent))
 
 
 def test_traces_of_another_length_do_not_fit() -> None:
     longer = Round(begun("all").jobs, "all", (4, 54), SHAPES)
-    assert not longer.fitting(message([0], "all")).any()
-    assert longer.fitting(message([PAIRS], "all")).all()  # it has none
+    assert not longer.fits(message([0], "all"))
+    assert longer.fits(message([PAIRS], "all"))  # it has none
+
+
+def test_a_message_with_a_job_of_no_round_does_not_fit() -> None:
+    """Its best rollout may be that job's, and a trace that is needed be missing."""
+    good = message([0, 3], "extremes")
+    for index in (-1, PAIRS + 1):
+        assert not begun("extremes").fits(replace(good, jobs=np.sort(np.array([0, index]))))
+    assert not begun("extremes").fits(replace(good, jobs=np.array([0, PAIRS])))  # that one is of one rollout

@@ -85,7 +85,6 @@ class Learner:
             spec=digest,
             traces="all",
             mu=np.ones(P),
-            sigma=np.ones(P),
         )
         session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
         session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))
@@ -372,13 +371,14 @@ def test_messages_it_cannot_read(
             b"",
             b"\xc1",
             newer,
+            codec.encode(replace(learner.header, run="a//b")),
             codec.encode(Want(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)),
         ):
             stage.session.publish(key, payload)
     learner.announce()
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]
-    assert sum("schema version 2, this side speaks 1" in line for line in caplog.messages) == 2
+    assert sum("schema version 3, this side speaks 2" in line for line in caplog.messages) == 2
 
 
 def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
