@@ -116,12 +116,9 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chunk:
-    """Jobs for one worker: one array of each kind over all of them, as a map for each would take ten times as long."""
+class Jobs:
+    """Jobs as one array of each kind over all of them: a map or an object for each would take ten times as long."""
 
-    run: str
-    incarnation: str
-    round: int
     jobs: IntArray = array("<i8", 1)
     """Indices, (J,)"""
     around: BoolArray = array("|b1", 1)
@@ -136,6 +133,83 @@ class Chunk:
     """Which jobs have eps, (J,)"""
     eps: FloatArray = array("<f8", 2)
     """Of those that have, one after the other (K, P)"""
+
+    @staticmethod
+    def of(jobs: Sequence[Job]) -> "Jobs":
+        """At least one job."""
+        eps = [job.eps for job in jobs if job.eps.size]
+        return Jobs(
+            jobs=np.array([job.index for job in jobs]),
+            around=np.array([job.origin == "mu" for job in jobs]),
+            signs=np.array([(*job.signs, 0)[:2] for job in jobs]),
+            seeds=np.array([_NOMINAL if job.perturbation is None else job.perturbation for job in jobs]),
+            rates=np.array([RATES.index(job.rate) for job in jobs]),
+            explores=np.array([job.eps.size > 0 for job in jobs]),
+            eps=np.stack(eps) if eps else np.empty((0, 0)),
+        )
+
+    @staticmethod
+    def exploring(
+        eps: FloatArray, signs: tuple[int, ...], seeds: Sequence[tuple[int, ...]] | None, then: Sequence[Job]
+    ) -> "Jobs":
+        """Jobs 0..N-1 around the mean, and at least one further job.
+
+        Args:
+          eps: (N, P).
+          signs: of each.
+          seeds: of their perturbations, N of four words; None for nominal conditions.
+          then: what comes behind them, with the indices from N on.
+        """
+        count, others = len(eps), Jobs.of(then)
+        every = np.ones(count, dtype=bool)
+        return Jobs(
+            jobs=np.append(np.arange(count), others.jobs),
+            around=np.append(every, others.around),
+            signs=np.concatenate([np.tile((*signs, 0)[:2], (count, 1)), others.signs]),
+            seeds=np.concatenate([np.tile(_NOMINAL, (count, 1)) if seeds is None else np.array(seeds), others.seeds]),
+            rates=np.append(np.full(count, RATES.index("none")), others.rates),
+            explores=np.append(every, others.explores),
+            eps=np.concatenate([eps, others.eps]) if others.eps.size else eps,
+        )
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.jobs)
+
+    def take(self, chosen: Sequence[int]) -> "Jobs":
+        """Some of these jobs, by their places here."""
+        at = np.array(chosen)
+        explores = self.explores[at]
+        rows = at[explores] if len(self.eps) == len(self.jobs) else (np.cumsum(self.explores) - 1)[at[explores]]
+        return Jobs(
+            jobs=self.jobs[at], around=self.around[at], signs=self.signs[at], seeds=self.seeds[at],
+            rates=self.rates[at], explores=explores, eps=self.eps[rows],
+        )  # fmt: skip
+
+    def split(self) -> list[Job]:
+        """Job by job again; the arrays are views."""
+        eps, around, explores = iter(self.eps), self.around.tolist(), self.explores.tolist()
+        signs, seeds, rates = self.signs.tolist(), self.seeds.tolist(), self.rates.tolist()
+        return [
+            Job(
+                index=index,
+                origin="mu" if around[i] else "zero",
+                signs=tuple(sign for sign in signs[i] if sign),
+                perturbation=None if seeds[i][0] < 0 else tuple(seeds[i]),
+                rate=RATES[rates[i]],
+                eps=next(eps) if explores[i] else _NO_EPS,
+            )
+            for i, index in enumerate(self.jobs.tolist())
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk(Jobs):
+    """Jobs for one worker."""
+
+    run: str
+    incarnation: str
+    round: int
 
     def __post_init__(self) -> None:
         """Check that all speak of as many jobs, and of such that there are."""
@@ -156,46 +230,9 @@ class Chunk:
                 raise ValueError("seeds out of range")
 
     @classmethod
-    def of(cls, jobs: Sequence[Job], *, run: str, incarnation: str, round: int) -> "Chunk":
-        """Make at least one job ready to send."""
-        eps = [job.eps for job in jobs if job.eps.size]
-        return cls(
-            run=run, incarnation=incarnation, round=round,
-            jobs=np.array([job.index for job in jobs]),
-            around=np.array([job.origin == "mu" for job in jobs]),
-            signs=np.array([(*job.signs, 0)[:2] for job in jobs]),
-            seeds=np.array([_NOMINAL if job.perturbation is None else job.perturbation for job in jobs]),
-            rates=np.array([RATES.index(job.rate) for job in jobs]),
-            explores=np.array([job.eps.size > 0 for job in jobs]),
-            eps=np.stack(eps) if eps else np.empty((0, 0)),
-        )  # fmt: skip
-
-    def take(self, chosen: Sequence[int]) -> "Chunk":
-        """Some of these jobs, by their places here."""
-        at = np.array(chosen)
-        explores = self.explores[at]
-        rows = at[explores] if len(self.eps) == len(self.jobs) else (np.cumsum(self.explores) - 1)[at[explores]]
-        return Chunk(
-            run=self.run, incarnation=self.incarnation, round=self.round,
-            jobs=self.jobs[at], around=self.around[at], signs=self.signs[at], seeds=self.seeds[at],
-            rates=self.rates[at], explores=explores, eps=self.eps[rows],
-        )  # fmt: skip
-
-    def split(self) -> list[Job]:
-        """Job by job again; the arrays are views."""
-        eps, around, explores = iter(self.eps), self.around.tolist(), self.explores.tolist()
-        signs, seeds, rates = self.signs.tolist(), self.seeds.tolist(), self.rates.tolist()
-        return [
-            Job(
-                index=index,
-                origin="mu" if around[i] else "zero",
-                signs=tuple(sign for sign in signs[i] if sign),
-                perturbation=None if seeds[i][0] < 0 else tuple(seeds[i]),
-                rate=RATES[rates[i]],
-                eps=next(eps) if explores[i] else _NO_EPS,
-            )
-            for i, index in enumerate(self.jobs.tolist())
-        ]
+    def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
+        """At least one job, ready to send."""
+        return cls(run=run, incarnation=incarnation, round=round, **vars(jobs))
 
 
 _SIGNS: Final = ((1, -1), (1,), (-1,), (-1, 1), (1, 1), (-1, -1))

@@ -8,7 +8,7 @@ import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from farm.arrays import FloatArray
 from farm.codec import M
 from farm.errors import MessageError, RunError
 from farm.hand import FINGERS
-from farm.messages import Chunk, Failure, Generation, Job, Refusal, Results, Spec, Want
+from farm.messages import Chunk, Failure, Generation, Jobs, Refusal, Results, Spec, Want
 from farm.reports import RunStatus, WorkerStatus
 from farm.session import Event, Session
 from farm.tactile import TAXELS
@@ -121,7 +121,7 @@ class Dispatcher:
         """Jobs given out again since the start."""
         return self._ledger.reissued
 
-    def begin(self, generation: int, mu: FloatArray, jobs: Sequence[Job], traces: str = "none") -> None:
+    def begin(self, generation: int, mu: FloatArray, jobs: Jobs, traces: str = "none") -> None:
         """Announce a round and hand out its first jobs.
 
         Args:
@@ -134,8 +134,7 @@ class Dispatcher:
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
             generation=generation, spec=self._header.spec, traces=traces, mu=mu,
         )  # fmt: skip
-        chunk = Chunk.of(jobs, run=self.run, incarnation=self._incarnation, round=self._header.round)
-        self._round = Round(chunk, traces, self._trace, self._shapes)
+        self._round = Round(jobs, traces, self._trace, self._shapes)
         self._ledger.begin(len(jobs))
         self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
         self._hand_out()
@@ -278,7 +277,8 @@ class Dispatcher:
         assert self._round is not None
         for worker, indices in self._ledger.assign(time.monotonic()):
             # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
-            chunk = codec.encode(self._round.jobs.take(indices))
+            head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
+            chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices), **head))
             self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
     def report(self, progress: Progress) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from farm import randomness, tasks
 from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import CheckpointError, RunError
-from farm.messages import Job, Result, Spec
+from farm.messages import Job, Jobs, Result, Spec
 from farm.trajectory import Trajectory
 from learner import config as configs
 from learner.algorithms import SearchState
@@ -118,7 +118,7 @@ class Learner:
         """The mean policy at the end of the run."""
         jobs = evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED)
         best = self._replay_job(len(jobs))
-        farm.begin(self.state.generation, self.state.mu, [*jobs, *best])
+        farm.begin(self.state.generation, self.state.mu, Jobs.of([*jobs, *best]))
         results = farm.collect()
         return Evaluation(
             mean=results[EVALUATION_ROLLOUTS],
@@ -161,20 +161,13 @@ class Learner:
         """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
         config, state = self.config, self.state
         eps = config.algorithm.ask(state, randomness.exploration(config.seed, state.generation))
-        jobs = [
-            Job(
-                index=i,
-                origin="mu",
-                signs=self._signs,
-                perturbation=self._perturbation(state.generation, i),
-                rate="none",
-                eps=row,
-            )
-            for i, row in enumerate(eps)
-        ]
-        jobs.append(mean_job(len(jobs), rate="control", perturbation=None))
-        replay = self._replay_job(len(jobs)) if state.generation % REPLAY_EVERY == 0 else []
-        farm.begin(state.generation, state.mu, [*jobs, *replay], self._keep)
+        seeds = None
+        if config.task.perturb:
+            seeds = [randomness.training(config.seed, state.generation, i) for i in range(len(eps))]
+        mean = mean_job(len(eps), rate="control", perturbation=None)
+        replay = self._replay_job(len(eps) + 1) if state.generation % REPLAY_EVERY == 0 else []
+        jobs = Jobs.exploring(eps, self._signs, seeds, [mean, *replay])
+        farm.begin(state.generation, state.mu, jobs, self._keep)
         return eps
 
     def _perturbation(self, generation: int, index: int) -> tuple[int, ...] | None:

@@ -5,13 +5,13 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray
-from farm.messages import RATES, Chunk, Result, Results, WireTrajectory, traced
+from farm.messages import RATES, Jobs, Result, Results, WireTrajectory, traced
 
 
 class Round:
     """Jobs 0..n-1 and their results, S rollouts in all; a result is written where it belongs, whenever it comes."""
 
-    def __init__(self, jobs: Chunk, traces: str, trace: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    def __init__(self, jobs: Jobs, traces: str, trace: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Make room.
 
         Args:
@@ -38,7 +38,7 @@ class Round:
 
     def __len__(self) -> int:
         """How many jobs."""
-        return len(self.jobs.jobs)
+        return len(self.jobs)
 
     def __getitem__(self, index: int) -> Result:
         """One job's result, without traces; the arrays are views."""

@@ -11,7 +11,20 @@ from hypothesis import strategies as st
 
 from farm import codec
 from farm.errors import MessageError
-from farm.messages import RATES, Chunk, Failure, Generation, Job, Refusal, Result, Results, Spec, Want, WireTrajectory
+from farm.messages import (
+    RATES,
+    Chunk,
+    Failure,
+    Generation,
+    Job,
+    Jobs,
+    Refusal,
+    Result,
+    Results,
+    Spec,
+    Want,
+    WireTrajectory,
+)
 from farm.reports import Line, RunEnd, RunHistory, RunReport, RunStatus, Trace, WorkerStatus
 from farm.trajectory import Trajectory
 
@@ -130,8 +143,8 @@ MESSAGES = {
     "job": job(),
     "job of one nominal rollout": job(signs=(1,), perturbation=None, rate="physics", origin="zero"),
     "job of the mean": job(signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),
-    "chunk": Chunk.of(JOBS, **HEAD),
-    "chunk of means": Chunk.of(JOBS[2:3], **HEAD),
+    "chunk": Chunk.carrying(Jobs.of(JOBS), **HEAD),
+    "chunk of means": Chunk.carrying(Jobs.of(JOBS[2:3]), **HEAD),
     "results": results(result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)),
     "results of one": results(result(rollouts=1)),
     "results without traces": results(result(steps=0), traces="none"),
@@ -294,10 +307,24 @@ def test_values_that_make_no_sense_are_refused(name, change):
 
 
 def test_jobs_are_split_as_they_were_put_together():
-    back = codec.decode(codec.encode(Chunk.of(JOBS, **HEAD)), Chunk).split()
+    back = codec.decode(codec.encode(Chunk.carrying(Jobs.of(JOBS), **HEAD)), Chunk).split()
     assert len(back) == len(JOBS)
     for one, two in zip(JOBS, back, strict=True):
         assert_same(one, two)
+
+
+@pytest.mark.parametrize("signs", [(1, -1), (1,)])
+@pytest.mark.parametrize("seeds", [None, [(1, 2, 3, i) for i in range(5)]])
+@pytest.mark.parametrize("replayed", [False, True])
+def test_jobs_that_explore_are_as_those_put_together_one_by_one(signs, seeds, replayed):
+    eps = RNG.normal(size=(5, 7))
+    one_by_one = [
+        job(index=i, signs=signs, perturbation=seeds[i] if seeds else None, eps=row, rate="none", origin="mu")
+        for i, row in enumerate(eps)
+    ]
+    then = [job(index=5, signs=(1,), eps=np.zeros(0), rate="control", perturbation=None)]
+    then += [job(index=6, signs=(1,), eps=eps[2], rate="physics", origin="zero")] if replayed else []
+    assert_same(Jobs.exploring(eps, signs, seeds, then), Jobs.of([*one_by_one, *then]))
 
 
 def test_results_stand_in_the_jobs_order():

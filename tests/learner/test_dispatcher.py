@@ -15,7 +15,7 @@ import pytest
 from farm import codec, keys
 from farm.errors import RunError
 from farm.local import free_endpoint
-from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want, WireTrajectory
+from farm.messages import Chunk, Failure, Generation, Job, Jobs, Result, Results, Spec, Want, WireTrajectory
 from farm.session import Session, connect, listen
 from learner import attendance
 from learner import dispatcher as dispatchers
@@ -120,7 +120,7 @@ class Learner:
         return self.farm
 
     def collect(self, todo: list[Job]) -> "Future[list[Result]]":
-        self.farm.begin(0, np.zeros(2), todo, "extremes")
+        self.farm.begin(0, np.zeros(2), Jobs.of(todo), "extremes")
         return self._pool.submit(self.farm.collect)
 
     def close(self) -> None:
@@ -172,7 +172,7 @@ def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
 def test_a_round_is_announced(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
-    farm.begin(7, np.array([1.0, 2.0]), jobs(1), "all")
+    farm.begin(7, np.array([1.0, 2.0]), Jobs.of(jobs(1)), "all")
     said = codec.decode(worker.next("generation"), Generation)
     assert (said.run, said.round, said.generation, said.mu.tolist(), said.traces) == (RUN, 1, 7, [1, 2], "all")
     asked = worker.session.ask(keys.generation(FARM, RUN), WAIT)

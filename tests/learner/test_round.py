@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from farm.messages import Chunk, Job, Result, Results, WireTrajectory
+from farm.messages import Job, Jobs, Result, Results, WireTrajectory
 from learner.round import Round
 
 TRACE = (3, 54)
@@ -35,8 +35,7 @@ def result(index: int) -> Result:
 
 
 def begun(traces: str) -> Round:
-    chunk = Chunk.of([job(i) for i in range(PAIRS + 1)], run="r", incarnation="i", round=1)
-    return Round(chunk, traces, TRACE, SHAPES)
+    return Round(Jobs.of([job(i) for i in range(PAIRS + 1)]), traces, TRACE, SHAPES)
 
 
 def message(indices: list[int], traces: str) -> Results:

@@ -18,7 +18,7 @@ from farm import codec, keys
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.local import free_endpoint
-from farm.messages import Chunk, Failure, Generation, Job, Result, Results, Spec, Want
+from farm.messages import Chunk, Failure, Generation, Job, Jobs, Result, Results, Spec, Want
 from farm.session import Session, connect, listen
 from farm.tasks.finger_gait import TaskConfig
 from workers import worker as workers
@@ -105,7 +105,7 @@ class Learner:
             for i in indices
         )
         values = {"run": self.run, "incarnation": header.incarnation, "round": header.round}
-        chunk = Chunk.of(jobs, **(values | changed))  # type: ignore[arg-type]
+        chunk = Chunk.carrying(Jobs.of(jobs), **(values | changed))  # type: ignore[arg-type]
         self.session.publish(keys.inbox(FARM, worker), codec.encode(chunk))
 
 
