@@ -29,6 +29,7 @@ _T = TypeVar("_T")
 _AT_ONCE: Final = 10_000  # events that are taken in before anything else is done
 _BACKLOG: Final = 256 * 1024 * 1024  # [bytes] of events that wait; what comes on top is lost, as on a bad network
 _OVERHEAD: Final = 500  # [bytes] that an event takes besides its payload
+_TOKENS: Final = 65_536  # that one question for them may bring; a router takes 4096 sessions
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _DESCRIPTORS: Final = 65_536
 _OPEN_S: Final = 1.0
@@ -195,7 +196,9 @@ class Session:
 
     def tokens(self, key: str, timeout: float) -> list[str]:
         """The liveliness tokens of the key that are there, as far as is known in time [s]."""
-        replies = self._session.liveliness().get(key, timeout=timeout)
+        # A router knows them all and gives them before `get` returns: with room for fewer it would wait for ever.
+        room = zenoh.handlers.FifoChannel(_TOKENS)
+        replies = self._session.liveliness().get(key, room, timeout=timeout)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def ask(self, key: str, timeout: float) -> bytes | None:

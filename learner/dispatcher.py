@@ -134,9 +134,9 @@ class Dispatcher:
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
             generation=generation, spec=self._header.spec, traces=traces, mu=mu,
         )  # fmt: skip
+        self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
         self._round = Round(jobs, traces, self._trace, self._shapes)
         self._ledger.begin(len(jobs))
-        self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
         self._hand_out()
 
     def collect(self) -> Round:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from farm.arrays import AnyArray, BoolArray, FloatArray
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.messages import RATES, Jobs, Result, Results, WireTrajectory, traced
 
 
@@ -57,10 +57,10 @@ class Round:
 
     def fits(self, results: Results) -> bool:
         """Whether these are of jobs of this round, have their shapes, and the traces that are wanted of them."""
-        known = bool((results.jobs >= 0).all() and (results.jobs < len(self)).all())
-        if not known or (results.rollouts != self._rollouts[results.jobs]).any():
+        jobs = results.jobs  # they rise
+        if jobs[0] < 0 or jobs[-1] >= len(self) or (results.rollouts != self._rollouts[jobs]).any():
             return False
-        if (results.seen != self._seen[results.jobs]).any():
+        if (results.seen != self._seen[jobs]).any():
             return False
         wanted = traced(self._traces, results.returns, results.rollouts, results.seen)
         if not np.array_equal(results.traced, wanted) or (len(wanted) and results.traces.shape[1:] != self._trace):
@@ -69,19 +69,25 @@ class Round:
 
     def put(self, results: Results, chosen: BoolArray) -> None:
         """Write down some (J,) of results that fit."""
-        jobs, rollouts = results.jobs[chosen], results.rollouts[chosen]
-        there = np.repeat(self._starts[jobs] - (np.cumsum(rollouts) - rollouts), rollouts) + np.arange(rollouts.sum())
-        here = np.flatnonzero(np.repeat(chosen, results.rollouts))
+        rows, new = self._rows(results), np.repeat(chosen, results.rollouts)
+        some = slice(None) if new.all() else new
         for mine, theirs in (
             (self.returns, results.returns),
             (self.steps, results.steps),
             (self.flags, results.flags),
         ):
-            mine[there] = theirs[here]
-        rows = dict(zip(here.tolist(), there.tolist(), strict=True))
+            mine[rows[some]] = theirs[some]
         for at, trace in zip(results.traced.tolist(), results.traces, strict=True):
-            if at in rows:
-                self.traces[rows[at]] = trace
+            if new[at]:
+                self.traces[int(rows[at])] = trace
         for at, trajectory in zip(np.flatnonzero(results.seen).tolist(), results.trajectories, strict=True):
             if chosen[at]:
                 self._trajectories[int(results.jobs[at])] = trajectory
+
+    def _rows(self, results: Results) -> IntArray:
+        """Where each of these rollouts belongs, (S,)."""
+        first, last = results.jobs[0], results.jobs[-1]
+        if last - first == len(results.jobs) - 1:  # nearly always
+            return np.arange(self._starts[first], self._ends[last])
+        before = np.cumsum(results.rollouts) - results.rollouts
+        return np.repeat(self._starts[results.jobs] - before, results.rollouts) + np.arange(len(results.returns))

@@ -1,5 +1,6 @@
 """What `farm run` and `farm learner` have in common."""
 
+import gc
 from dataclasses import replace
 
 from farm.commands import display, logs, options
@@ -36,6 +37,7 @@ def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunF
         opened = open_run(config, path, place, resume=resumed is not None, stopped=stop.is_set)
         with opened as run:
             shown = display.display(run, _announcement(run, place), chosen.style)
+            gc.freeze()  # what is there stays: looking through it for garbage took 20 ms a time
             with shown:
                 for report in run.learn():
                     shown.show(report)

@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 
 from farm.arrays import FloatArray
 from learner.config import RunConfig
@@ -73,9 +73,13 @@ def _caption(experiment: Experiment, data: Data) -> str:
     """The set-up as far as all curves share it, and what went wrong."""
     trials = max(s.trials for s in data.series.values())
     said = ", ".join(common(list(data.configs.values()))) + f"; {trials} {'trials' if trials > 1 else 'trial'}"
-    said += (
-        ", line: mean of those that run, shaded: standard deviation." if isinstance(experiment.figure, Curves) else "."
-    )
+    if isinstance(experiment.figure, Curves):
+        said += (
+            ", line: median of those that run, shaded: from the least to the greatest"
+            if _run_away(experiment.figure, data)
+            else ", line: mean of those that run, shaded: standard deviation"
+        )
+    said += "."
     broken = [f"{label}: {', '.join(s.failures())}" for label, s in data.series.items() if s.failures()]
     return said[0].upper() + said[1:] + (f" Not finished: {'; '.join(broken)}." if broken else "")
 
@@ -112,44 +116,58 @@ def _curves(experiment: Experiment, data: Data) -> Canvas:
             if panel == "success":
                 values = 100 * values
             step = series.rollouts if figure.over == "rollouts" else 1
-            mean = _line(axis, i, name, values, step)
-            low.append(np.nanmin(mean))
-            high.append(np.nanmax(mean))
+            line = _line(axis, i, name, values, step, run_away=_run_away(figure, data))
+            low.append(np.nanmin(line))
+            high.append(np.nanmax(line))
         axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axis.set_xlabel("generation" if figure.over == "generations" else "rollouts")
         axis.set_ylabel(label)
-        _scale(axis, panel, figure, min(low, default=0.0), max(high, default=1.0))
+        _scale(axis, panel, min(low, default=0.0), max(high, default=1.0), run_away=_run_away(figure, data))
     if len(data.series) > 1 and axes[-1].lines:
         axes[-1].legend(loc="best", fontsize=8)
     return canvas
 
 
-def _scale(axis: Axes, panel: Panel, figure: Curves, low: float, high: float) -> None:
-    if panel in _RETURNS and figure.scale == "symlog" and low < _FALLEN:
+def _run_away(figure: Curves, data: Data) -> bool:
+    """Whether a trial's returns fell so far that a mean would say nothing of the others."""
+    drawn = (series for series in data.series.values() if not series.empty)
+    return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in drawn)
+
+
+def _scale(axis: Axes, panel: Panel, low: float, high: float, *, run_away: bool) -> None:
+    if panel in _RETURNS and run_away:
         axis.set_yscale("symlog", linthresh=10)
+        few = SymmetricalLogLocator(base=10, linthresh=10)
+        few.set_params(numticks=6)
+        axis.yaxis.set_major_locator(few)
     if panel in ("sigma", "sigma_2", "action"):
         axis.set_yscale("log")
     if panel == "success":
         axis.set_ylim(-3, 103)
-    elif panel in _RETURNS and low >= _FALLEN:
+    elif panel in _RETURNS and not run_away:
         room = 0.08 * (high - low)
         axis.set_ylim(low - 3 * room, high + room)
 
 
-def _line(axis: Axes, i: int, name: str, values: FloatArray, step: int = 1) -> FloatArray:
-    """The i-th line of a panel, its spread shaded: values (trials, generations), `step` apart; its mean.
+def _line(axis: Axes, i: int, name: str, values: FloatArray, step: int = 1, *, run_away: bool = False) -> FloatArray:
+    """The i-th line of a panel, its spread shaded: values (trials, generations), `step` apart; the line.
 
-    Generations that no trial reached are left out.
+    Generations that no trial reached are left out. The mean and the standard deviation, where nothing has run away.
     """
     there = ~np.isnan(values)
-    mean, spread = _spread(values[:, : int(there.any(axis=0).sum())])
-    x, began = step * np.arange(1, len(mean) + 1), int(there[:, 0].sum())
+    values = values[:, : int(there.any(axis=0).sum())]
+    if run_away:
+        low, line, high = np.nanmin(values, axis=0), np.nanmedian(values, axis=0), np.nanmax(values, axis=0)
+    else:
+        line, spread = _spread(values)
+        low, high = line - spread, line + spread
+    x, began = step * np.arange(1, len(line) + 1), int(there[:, 0].sum())
     axis.plot(
-        x, mean, color=_COLOURS[i], linestyle=_DASHES[i], marker=_MARKERS[i], ms=4, lw=1.5,
+        x, line, color=_COLOURS[i], linestyle=_DASHES[i], marker=_MARKERS[i], ms=4, lw=1.5,
         markevery=(len(x) // 20 + i, max(len(x) // 6, 1)), label=name if began == len(values) else f"{name} ({began})",
     )  # fmt: skip
-    axis.fill_between(x, mean - spread, mean + spread, color=_COLOURS[i], alpha=0.15, lw=0)
-    return mean
+    axis.fill_between(x, low, high, color=_COLOURS[i], alpha=0.15, lw=0)
+    return line
 
 
 def _spread(values: FloatArray) -> tuple[FloatArray, FloatArray]:
