@@ -64,7 +64,7 @@ def _canvas(panels: int, caption: str) -> tuple[Canvas, list[Axes]]:
     canvas = Canvas(figsize=(4.0 * max(panels, 2), height))
     axes = canvas.subplots(1, panels, squeeze=False)[0].tolist()
     bottom = 0.16 * len(lines) + 0.62
-    canvas.subplots_adjust(left=0.08, right=0.985, top=1 - 0.45 / height, bottom=bottom / height, wspace=0.26)
+    canvas.subplots_adjust(left=0.105, right=0.985, top=1 - 0.45 / height, bottom=bottom / height, wspace=0.3)
     canvas.text(0.01, 0.06 / height, "\n".join(lines), va="bottom", fontsize=8, color="0.3")
     return canvas, axes
 
