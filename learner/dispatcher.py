@@ -109,8 +109,8 @@ class Dispatcher:
 
     @property
     def workers(self) -> tuple[str, ...]:
-        """Workers that take part."""
-        return self._ledger.workers
+        """Workers that take part, sorted."""
+        return tuple(sorted(self._ledger.workers))
 
     def census(self) -> tuple[WorkerStatus, ...]:
         """Workers that take part, with what they did lately."""

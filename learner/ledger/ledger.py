@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Sequence, Set
 from typing import Literal, NamedTuple, TypeAlias
 
 from learner.ledger.books import Books, Worker
@@ -59,9 +59,9 @@ class Ledger:
         return len(self._books.open)
 
     @property
-    def workers(self) -> tuple[str, ...]:
-        """Names of the known workers, sorted."""
-        return tuple(sorted(self._books.workers))
+    def workers(self) -> Set[str]:
+        """Names of the known workers."""
+        return self._books.workers.keys()
 
     @property
     def reissued(self) -> int:

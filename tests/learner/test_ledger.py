@@ -36,7 +36,7 @@ def test_a_round_from_begin_to_complete():
     ledger = started(3, ["a"], seconds=0.01)
     assert not ledger.complete
     assert given(ledger.assign(0.0)) == {"a": [0, 1, 2]}
-    assert (ledger.remaining, ledger.workers) == (3, ("a",))
+    assert (ledger.remaining, ledger.workers) == (3, {"a"})
     assert ledger.results("a", [1, 0], 0.02) == ["new", "new"]
     assert ledger.remaining == 1
     assert ledger.results("a", [2], 0.03) == ["new"]
@@ -159,7 +159,7 @@ def test_a_lost_worker_s_jobs_go_back_in_order():
     ledger.results("a", [1], 0.001)
     assert ledger.lost("a") == 3
     assert ledger.lost("a") == 0
-    assert (ledger.workers, ledger.reissued) == ((), 3)
+    assert (ledger.workers, ledger.reissued) == (set(), 3)
     ledger.want("b", 6, 0.2)
     assert given(ledger.assign(0.2)) == {"b": [0, 2, 3, 4, 5]}
 
