@@ -141,9 +141,9 @@ class Recorder:
         if sample is not None:
             wall = now + (sample.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
             end = start + self._horizon - SEAM
-            self._held.append(_Held(progress.generation, np.minimum(start + sample.times, end), wall, sample))
+            self._held.append(_Held(now, progress.generation, np.minimum(start + sample.times, end), wall, sample))
         self._last = now
-        if self._held and now - self._held[0].wall[-1] >= HOLD:
+        if self._held and now - self._held[0].since >= HOLD:
             self._draw()
         self._flush()
 
@@ -266,6 +266,8 @@ def record_replay(
 class _Held:
     """A rollout that waits to be written."""
 
+    since: float
+    """When it came [s since the epoch]."""
     generation: int
     sim: FloatArray
     """Where its frames stand on sim_time [s], (F,)"""
