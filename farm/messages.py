@@ -177,10 +177,15 @@ class Jobs:
         return len(self.jobs)
 
     def take(self, chosen: Sequence[int]) -> "Jobs":
-        """Some of these jobs, by their places here."""
-        at = np.array(chosen)
-        explores = self.explores[at]
-        rows = at[explores] if len(self.eps) == len(self.jobs) else (np.cumsum(self.explores) - 1)[at[explores]]
+        """Some of these jobs, by their places here; views where they stand side by side."""
+        if list(chosen) == list(range(chosen[0], chosen[-1] + 1)):
+            at: IntArray | slice = slice(chosen[0], chosen[-1] + 1)
+            explores, before = self.explores[at], np.count_nonzero(self.explores[: chosen[0]])
+            rows: IntArray | slice = slice(before, before + np.count_nonzero(explores))
+        else:
+            at = np.array(chosen)
+            explores = self.explores[at]
+            rows = (np.cumsum(self.explores) - 1)[at[explores]]
         return Jobs(
             jobs=self.jobs[at], around=self.around[at], signs=self.signs[at], seeds=self.seeds[at],
             rates=self.rates[at], explores=explores, eps=self.eps[rows],

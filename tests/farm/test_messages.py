@@ -327,6 +327,11 @@ def test_jobs_that_explore_are_as_those_put_together_one_by_one(signs, seeds, re
     assert_same(Jobs.exploring(eps, signs, seeds, then), Jobs.of([*one_by_one, *then]))
 
 
+@pytest.mark.parametrize("chosen", [[0], [3], [1, 2], [2, 3], [0, 1, 2, 3], [0, 2], [3, 1], [2, 1, 3, 0]])
+def test_some_jobs_are_as_those_put_together(chosen):
+    assert_same(Jobs.of(JOBS).take(chosen), Jobs.of([JOBS[i] for i in chosen]))
+
+
 def test_results_stand_in_the_jobs_order():
     parts = [result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)]
     back = codec.decode(codec.encode(results(*parts)), Results)
