@@ -59,10 +59,12 @@ class Sleeper:
         """Make results up, and sleep for what is left of the time that simulating would take.
 
         A round's further chunks begin where the one before ended: they lie ready, and what a dozen emulated workers
-        on one core take to send their results must not delay them.
+        on one core take to send their results must not delay them. Making up is done halfway, when the learner, whose
+        cores these are, has least to do.
         """
         begin = self._until if mu is self._mu else time.monotonic()
         self._mu, self._until = mu, begin + self.pair * sum(len(job.signs) for job in jobs) / 2
+        time.sleep(max(0.0, self._until - time.monotonic()) / 2)
         results = [self._result(job) for job in jobs]
         time.sleep(max(0.0, self._until - time.monotonic()))
         return results

@@ -24,7 +24,7 @@ class Worker:
     """When it last spoke of its work [s]."""
 
 
-@dataclass
+@dataclass(slots=True)
 class Job:
     """A job that is not done."""
 
