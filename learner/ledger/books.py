@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import Counter, defaultdict
 from collections.abc import Container
 from dataclasses import dataclass, field
 
@@ -24,16 +25,6 @@ class Worker:
     """When it last spoke of its work [s]."""
 
 
-@dataclass(slots=True)
-class Job:
-    """A job that is not done."""
-
-    holders: list[str] = field(default_factory=list[str])
-    """Workers that are expected to answer, in the order of issue."""
-    errors: dict[str, int] = field(default_factory=dict[str, int])
-    """Error answers by worker."""
-
-
 class Books:
     """Jobs, workers, and the queues the jobs are in."""
 
@@ -45,7 +36,9 @@ class Books:
     def begin(self, jobs: int) -> None:
         """Forget every job; 0..jobs-1 are pending, and no worker holds anything."""
         self.size = jobs
-        self.open = {index: Job() for index in range(jobs)}  # not done
+        # Jobs that are not done, and who is expected to answer, in the order of issue.
+        self.open: dict[int, list[str]] = {index: [] for index in range(jobs)}
+        self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)  # answers to a job, by worker
         self._pending = list(range(jobs))  # a heap; jobs done meanwhile leave it at the top
         # Job and since when [s]; oldest first, as the clock is monotonic.
         self.out: dict[int, float] = {}  # may have one more copy
@@ -72,14 +65,14 @@ class Books:
         while len(taken) < count and self.any_pending():
             index = heapq.heappop(self._pending)
             taken.append(index)
-            self.open[index].holders.append(worker)  # the first: who is pending has none, and is in no queue
+            self.open[index].append(worker)  # the first: who is pending has none, and is in no queue
             held[index] = queue[index] = now
         return tuple(taken)
 
     def give(self, index: int, worker: str, now: float) -> None:
         """Give a worker a job that is in no queue, or out elsewhere as well."""
         self._unqueue(index)
-        holders = self.open[index].holders
+        holders = self.open[index]
         if len(holders) >= self.copies:  # given up at the oldest, which keeps it as held
             del holders[0]
         holders.append(worker)
@@ -96,11 +89,11 @@ class Books:
 
     def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
         """Note an error; return whether it counts, and whether nobody holds the job any more."""
-        known, job = self.workers.get(worker), self.open.get(index)
+        known = self.workers.get(worker)
         held = known is not None and known.held.pop(index, None) is not None
-        if job is None or (not held and worker in job.errors):
+        if index not in self.open or (not held and worker in self.errors[index]):
             return False, False  # done meanwhile, or a doubled message
-        job.errors[worker] = job.errors.get(worker, 0) + 1
+        self.errors[index][worker] += 1
         if not self._leave(worker, index, now):
             return True, False
         self.failed[index] = now
@@ -144,7 +137,7 @@ class Books:
 
     def _leave(self, worker: str, index: int, now: float) -> bool:
         """Strike a holder off; return whether it was the last one, the job then in no queue."""
-        holders = self.open[index].holders
+        holders = self.open[index]
         if worker not in holders:
             return False
         holders.remove(worker)

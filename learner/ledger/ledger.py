@@ -122,15 +122,15 @@ class Ledger:
         where there are fewer workers. Until then the job is issued again, elsewhere if possible.
         """
         self._tick(now)
-        job = self._books.open.get(index)
         counts, again = self._books.fail(worker, index, self._now)
         self._reissued += again
         if worker in self._books.workers:
             self._books.workers[worker].answered = self._now
-        if job is None or not counts:
+        if not counts:
             return False
         few = len(self._books.workers) < self._config.max_errors
-        return (sum(job.errors.values()) if few else len(job.errors)) >= self._config.max_errors
+        errors = self._books.errors[index]
+        return (errors.total() if few else len(errors)) >= self._config.max_errors
 
     def assign(self, now: float) -> list[Assignment]:
         """Return the chunks to send now, within the credits, and count them as sent.
@@ -234,7 +234,7 @@ class Ledger:
 
     def _avoided(self, index: int) -> Container[str]:
         """Return the workers that failed at a job, as long as another one may get to it soon."""
-        failed = self._books.open[index].errors
+        failed = self._books.errors[index]
         since = self._books.failed.get(index, -math.inf)
         if since + self._wait(self._books.failed) <= self._now:
             return ()
