@@ -61,12 +61,13 @@ class Books:
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
         taken: list[int] = []
-        held, queue = self.workers[worker].held, self.full if self.copies == 1 else self.out
-        while len(taken) < count and self.any_pending():
-            index = heapq.heappop(self._pending)
-            taken.append(index)
-            self.open[index].append(worker)  # the first: who is pending has none, and is in no queue
-            held[index] = queue[index] = now
+        pending, held, queue = self._pending, self.workers[worker].held, self.full if self.copies == 1 else self.out
+        while pending and len(taken) < count:
+            index = heapq.heappop(pending)
+            if index in self.open:
+                taken.append(index)
+                self.open[index].append(worker)  # the first: who is pending has none, and is in no queue
+                held[index] = queue[index] = now
         return tuple(taken)
 
     def give(self, index: int, worker: str, now: float) -> None:
