@@ -77,6 +77,8 @@ class Recording(logging.Handler):
     def generation(self, report: Report) -> None:
         """Show a generation; the best rollout at physics rate goes into replay.rrd when there is a new one."""
         self._thread.generation(report.progress, report.sample, report.traces, report.rate)
+        if report.progress.return_max >= report.progress.best:
+            self._thread.log(f"new best rollout: return {report.progress.best:.3f}")
         if report.replay is not None:
             self._best = (f"best rollout, generation {report.replay_generation}", report.replay)
             self._show([self._best])

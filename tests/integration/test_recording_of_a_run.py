@@ -62,6 +62,19 @@ def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
     assert state.mu.tobytes() == folder.parameters()["mu"][-1].tobytes()
 
 
+def test_new_bests_are_in_the_log(recorded: Farm) -> None:
+    told = {line["generation"]: line["best"] for line in recorded.progress("r") if line["return_max"] == line["best"]}
+    found = {}
+    for batch in read(recorded.folder / "runs/r/run.rrd")["/log"]:
+        [text] = [name for name in batch.schema.names if name.endswith(":text")]
+        numbers = batch.column("generation").cast("int64").to_pylist()
+        for generation, [line] in zip(numbers, batch.column(text).to_pylist(), strict=True):
+            if "new best" in line:
+                found[generation] = line
+    assert told
+    assert found == {generation: f"new best rollout: return {best:.3f}" for generation, best in told.items()}
+
+
 def tensor_of(value: dict[str, Any]) -> np.ndarray[Any, Any]:
     """A Rerun tensor as an array of float32."""
     buffer = value["buffer"]
