@@ -101,8 +101,11 @@ def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[
         crowd = Crowd(place.listen, every)
         try:
             for report in run.learn():
-                if report.progress.generation % 20 == 0:
+                if (generation := report.progress.generation) % 20 == 0:
                     learner.append(_megabytes(os.getpid()))
+                if generation % 100 == 0:
+                    left = (until - time.monotonic()) / 60
+                    print(f"generation {generation}, killed {crowd.killed}, {left:.1f} min left", file=sys.stderr)
         finally:
             crowd.close()
     return run.summary, crowd, learner
