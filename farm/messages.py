@@ -337,7 +337,7 @@ class Results:
         seen = np.array([r.trajectory is not None for r in results])
         rollouts = np.array([len(r.returns) for r in results])
         felt = traced(traces, returns, rollouts, seen)
-        flags = [np.stack([r.success, r.dropped, r.failed, r.clamped], axis=1) for r in results]
+        flags = [(r.success, r.dropped, r.failed, r.clamped) for r in results]
         return cls(
             run=run, incarnation=incarnation, round=round, worker=worker,
             trajectories=tuple(r.trajectory for r in results if r.trajectory),
@@ -346,7 +346,7 @@ class Results:
             seen=seen,
             returns=returns,
             steps=np.concatenate([r.steps for r in results]),
-            flags=np.concatenate(flags),
+            flags=np.concatenate(flags, axis=1).T,
             traced=felt,
             traces=np.concatenate([r.traces for r in results])[felt],
         )  # fmt: skip
