@@ -30,8 +30,10 @@ import numpy as np
 from farm import session
 from farm.arrays import FloatArray
 from farm.commands.status import ask
+from farm.jobs import Job
 from farm.local import free_endpoint
-from farm.messages import Job, Result, Spec, WireTrajectory
+from farm.messages import Spec
+from farm.results import Result, WireTrajectory
 from farm.scene import load
 from workers.backends import BACKENDS
 from workers.worker import Worker, WorkerConfig

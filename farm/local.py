@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any, Final
 import assets
 from farm import keys, session, tasks
 from farm.errors import CheckpointError, ConfigError, RunError
-from farm.messages import Job, Result
+from farm.jobs import Job
 from farm.reports import WorkerStatus
+from farm.results import Result
 from farm.scene import Scene
 from farm.session import Session
 from farm.tls import Bundle

@@ -6,7 +6,7 @@ from typing import Any
 from farm.arrays import AnyArray
 from farm.codec import array
 from farm.hand import FINGERS
-from farm.messages import WireTrajectory
+from farm.results import WireTrajectory
 from farm.tactile import TAXELS
 
 

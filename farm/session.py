@@ -9,26 +9,22 @@ well, but who waits for one wakes up ten times a second.)
 import ipaddress
 import json
 import logging
-import queue
 import resource
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 import zenoh
 
 from farm.errors import ConfigError, FarmError, Interrupted
+from farm.events import Event, Events
 from farm.tls import Bundle, access_control
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
-_AT_ONCE: Final = 10_000  # events that are taken in before anything else is done
-_BACKLOG: Final = 256 * 1024 * 1024  # [bytes] of events that wait; what comes on top is lost, as on a bad network
-_OVERHEAD: Final = 500  # [bytes] that an event takes besides its payload
 _TOKENS: Final = 65_536  # that one question for them may bring; a router takes 4096 sessions
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _DESCRIPTORS: Final = 65_536
@@ -52,19 +48,6 @@ _ROUTER: Final = {
 }
 _RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
 _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that came over a subscription."""
-
-    topic: str
-    """Which subscription, as named by its maker."""
-    key: str
-    payload: bytes
-    """Empty for liveliness."""
-    alive: bool = True
-    """For liveliness: whether the token appeared or went."""
 
 
 def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
@@ -94,48 +77,6 @@ def _reachable(host: str) -> bool:
         return not ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return host != "localhost"
-
-
-class Events:
-    """What came in, first come first served; a flood is dropped rather than kept."""
-
-    def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._lock, self._bytes, self.dropped = threading.Lock(), 0, 0
-
-    def put(self, event: Event) -> None:
-        """Append an event, unless those that wait take up too much."""
-        size = len(event.payload) + _OVERHEAD
-        with self._lock:
-            if self._bytes + size > _BACKLOG:
-                self.dropped += 1
-                return
-            self._bytes += size
-        self._queue.put(event)
-
-    def get(self, timeout: float = 0.0) -> Event:
-        """The next event.
-
-        Raises:
-          queue.Empty: none came in time [s].
-        """
-        event = self._queue.get(timeout=timeout) if timeout > 0.0 else self._queue.get_nowait()
-        with self._lock:
-            self._bytes -= len(event.payload) + _OVERHEAD
-        return event
-
-    def waiting(self, timeout: float) -> list[Event]:
-        """What waits, after waiting for the first [s]."""
-        events = []
-        with suppress(queue.Empty):
-            events.append(self.get(timeout))
-            while len(events) < _AT_ONCE:
-                events.append(self.get())
-        return events
-
-    def __len__(self) -> int:
-        """How many wait."""
-        return self._queue.qsize()
 
 
 class Session:

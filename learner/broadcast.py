@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any, Final
 
 from farm import codec, keys
-from farm.messages import WireTrajectory
 from farm.reports import Line, RunEnd, RunHistory, RunReport
+from farm.results import WireTrajectory
 from farm.session import Session
 from learner import config as configs
 from learner.evaluation import Evaluation

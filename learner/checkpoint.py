@@ -10,7 +10,7 @@ from farm import codec
 from farm.arrays import FloatArray
 from farm.codec import array
 from farm.errors import CheckpointError, MessageError
-from farm.messages import Job
+from farm.jobs import Job
 
 _MAGIC: Final = b"rolloutfarm checkpoint 1\n"
 _SCHEMA: Final = 1  # of what follows, whichever version messages have

@@ -17,10 +17,13 @@ from farm import codec, keys
 from farm.arrays import FloatArray
 from farm.codec import M
 from farm.errors import MessageError, RunError
+from farm.events import Event
 from farm.hand import FINGERS
-from farm.messages import Chunk, Failure, Generation, Jobs, Refusal, Results, Spec, Want
+from farm.jobs import Chunk, Generation, Jobs
+from farm.messages import Refusal, Spec, Want
 from farm.reports import RunStatus, WorkerStatus
-from farm.session import Event, Session
+from farm.results import Failure, Results
+from farm.session import Session
 from farm.tactile import TAXELS
 from learner.admission import Admission
 from learner.attendance import Attendance

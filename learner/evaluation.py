@@ -6,7 +6,8 @@ from typing import Final
 import numpy as np
 
 from farm import randomness
-from farm.messages import Job, Result
+from farm.jobs import Job
+from farm.results import Result
 from farm.trajectory import Trajectory
 
 EVALUATION_ROLLOUTS: Final = 100

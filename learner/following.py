@@ -7,8 +7,9 @@ from typing import Final
 
 from farm import codec, keys
 from farm.errors import ConfigError, Interrupted, MessageError, RunError
+from farm.events import Event
 from farm.reports import RunEnd, RunHistory, RunReport
-from farm.session import Event, Session
+from farm.session import Session
 from learner import config as configs
 from learner.config import RunConfig
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Final
 
 from farm import codec
-from farm.messages import WireTrajectory
 from farm.reports import RunReport, Trace
+from farm.results import WireTrajectory
 
 MEMORY: Final = 32 << 20
 """What rollouts and traces may take in memory [bytes]; the oldest go first."""

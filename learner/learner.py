@@ -12,7 +12,9 @@ import numpy as np
 from farm import randomness, tasks
 from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import CheckpointError, RunError
-from farm.messages import Job, Jobs, Result, Spec
+from farm.jobs import Job, Jobs
+from farm.messages import Spec
+from farm.results import Result
 from farm.trajectory import Trajectory
 from learner import config as configs
 from learner.algorithms import SearchState

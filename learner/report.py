@@ -7,8 +7,8 @@ import numpy as np
 
 from farm.arrays import AnyArray
 from farm.errors import MessageError
-from farm.messages import WireTrajectory
 from farm.reports import Line, RunReport, Trace
+from farm.results import WireTrajectory
 from farm.trajectory import Trajectory
 from learner.progress import Progress
 

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.messages import RATES, Jobs, Result, Results, WireTrajectory, traced
+from farm.jobs import RATES, Jobs
+from farm.results import Result, Results, WireTrajectory, traced
 
 
 class Round:

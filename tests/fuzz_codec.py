@@ -11,8 +11,10 @@ import atheris
 with atheris.instrument_imports(include=["farm"]):
     from farm import codec
     from farm.errors import MessageError
-    from farm.messages import Chunk, Failure, Generation, Refusal, Results, Spec, Want
+    from farm.jobs import Chunk, Generation
+    from farm.messages import Refusal, Spec, Want
     from farm.reports import RunStatus
+    from farm.results import Failure, Results
 
 KINDS = (Chunk, Failure, Generation, Refusal, Results, RunStatus, Spec, Want)
 

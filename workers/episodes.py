@@ -8,8 +8,9 @@ import numpy as np
 
 from farm import tasks
 from farm.arrays import FloatArray
-from farm.messages import Job, Result, WireTrajectory
+from farm.jobs import Job
 from farm.policy import Policy
+from farm.results import Result, WireTrajectory
 from farm.scene import Scene
 from farm.tactile import TAXELS
 from farm.tasks.finger_gait import TaskConfig

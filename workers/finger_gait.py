@@ -6,8 +6,9 @@ import numpy as np
 
 from farm import tactile
 from farm.arrays import FloatArray
-from farm.messages import Job, Result, WireTrajectory
+from farm.jobs import Job
 from farm.policy import Policy
+from farm.results import Result, WireTrajectory
 from farm.tasks.finger_gait import SUBSTEPS, TIMESTEP, Frames, Perturbation, TaskConfig
 from farm.trajectory import Trajectory
 from workers.jobs import parameters

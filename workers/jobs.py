@@ -7,7 +7,8 @@ import numpy as np
 from farm import tasks
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.messages import Job, Spec
+from farm.jobs import Job
+from farm.messages import Spec
 from farm.policy import Features, Policy, PolicyConfig
 from farm.tasks.finger_gait import TaskConfig
 

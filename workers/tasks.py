@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from farm.arrays import FloatArray
-from farm.messages import Job, Result
+from farm.jobs import Job
 from farm.policy import Policy
+from farm.results import Result
 from farm.tasks.finger_gait import TaskConfig
 from workers.finger_gait import Gait
 from workers.gym import Environment

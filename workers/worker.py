@@ -18,8 +18,11 @@ from typing import Final
 
 from farm import __version__, codec, keys, scene
 from farm.errors import ConfigError, FarmError, MessageError
-from farm.messages import Chunk, Failure, Generation, Refusal, Results, Spec, Want
-from farm.session import Event, Session, check_endpoint, connect
+from farm.events import Event
+from farm.jobs import Chunk, Generation
+from farm.messages import Refusal, Spec, Want
+from farm.results import Failure, Results
+from farm.session import Session, check_endpoint, connect
 from farm.tls import Bundle, find
 from workers import canary
 from workers.backends import BACKENDS, Backend

@@ -11,10 +11,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from farm import codec, messages
+from farm import codec
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.codec import array
 from farm.errors import MessageError
+from farm.jobs import Chunk, Generation, Job
+from farm.messages import Spec, Want
+from farm.results import Result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -404,7 +407,7 @@ def test_bombs_take_no_memory(payload):
 
 # ---------------------------------------------------------------- any bytes
 
-KINDS = [Sample, Inner, *(getattr(messages, name) for name in ("Want", "Spec", "Generation", "Job", "Chunk", "Result"))]
+KINDS = [Sample, Inner, Want, Spec, Generation, Job, Chunk, Result]
 
 wild = st.recursive(
     st.none()

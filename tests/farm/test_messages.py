@@ -11,21 +11,10 @@ from hypothesis import strategies as st
 
 from farm import codec
 from farm.errors import MessageError
-from farm.messages import (
-    RATES,
-    Chunk,
-    Failure,
-    Generation,
-    Job,
-    Jobs,
-    Refusal,
-    Result,
-    Results,
-    Spec,
-    Want,
-    WireTrajectory,
-)
+from farm.jobs import RATES, Chunk, Generation, Job, Jobs
+from farm.messages import Refusal, Spec, Want
 from farm.reports import Line, RunEnd, RunHistory, RunReport, RunStatus, Trace, WorkerStatus
+from farm.results import Failure, Result, Results, WireTrajectory
 from farm.trajectory import Trajectory
 
 RNG = np.random.default_rng(0)

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from processes import Farm, children
 
 from farm import codec, session
+from farm.jobs import Generation
 from farm.local import free_endpoint
-from farm.messages import Failure, Generation, Refusal, Want
+from farm.messages import Refusal, Want
+from farm.results import Failure
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 

@@ -14,7 +14,7 @@ from recordings import generations, read, rows
 from rerun.chunk import RrdReader
 
 from farm import randomness
-from farm.messages import Job
+from farm.jobs import Job
 from learner.beginning import specification, start
 from learner.folder import RunFolder
 from workers.backends.cpu import CpuBackend

@@ -16,7 +16,8 @@ from farm import codec, keys, session
 from farm.commands import certificates
 from farm.errors import ConfigError, FarmError
 from farm.local import free_endpoint
-from farm.messages import Result, Results, Want
+from farm.messages import Want
+from farm.results import Result, Results
 from farm.session import Session
 from farm.tls import Bundle, find
 

@@ -14,8 +14,10 @@ import pytest
 
 from farm import codec, keys
 from farm.errors import RunError
+from farm.jobs import Chunk, Generation, Job, Jobs
 from farm.local import free_endpoint
-from farm.messages import Chunk, Failure, Generation, Job, Jobs, Result, Results, Spec, Want, WireTrajectory
+from farm.messages import Spec, Want
+from farm.results import Failure, Result, Results, WireTrajectory
 from farm.session import Session, connect, listen
 from learner import attendance
 from learner import dispatcher as dispatchers

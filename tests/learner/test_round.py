@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from farm.messages import Job, Jobs, Result, Results, WireTrajectory
+from farm.jobs import Job, Jobs
+from farm.results import Result, Results, WireTrajectory
 from learner.round import Round
 
 TRACE = (3, 54)

@@ -7,8 +7,10 @@ import pytest
 
 from farm import codec, tactile
 from farm.errors import ConfigError
-from farm.messages import Job, Result, Results, Spec, WireTrajectory
+from farm.jobs import Job
+from farm.messages import Spec
 from farm.policy import Features, PolicyConfig
+from farm.results import Result, Results, WireTrajectory
 from farm.states import STATES
 from farm.tasks import TASKS
 from farm.tasks.finger_gait import TIMESTEP, Perturbation, TaskConfig

@@ -10,8 +10,10 @@ import pytest
 
 from farm import codec, randomness, tasks
 from farm.errors import ConfigError
-from farm.messages import Job, Result, Results, Spec
+from farm.jobs import Job
+from farm.messages import Spec
 from farm.policy import Features, Policy, PolicyConfig
+from farm.results import Result, Results
 from farm.rewards import RETURN_FLOOR
 from farm.tasks.finger_gait import TaskConfig
 from workers.backends.cpu import CpuBackend

@@ -17,8 +17,10 @@ import pytest
 from farm import codec, keys
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
+from farm.jobs import Chunk, Generation, Job, Jobs
 from farm.local import free_endpoint
-from farm.messages import Chunk, Failure, Generation, Job, Jobs, Result, Results, Spec, Want
+from farm.messages import Spec, Want
+from farm.results import Failure, Result, Results
 from farm.session import Session, connect, listen
 from farm.tasks.finger_gait import TaskConfig
 from workers import worker as workers

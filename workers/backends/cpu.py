@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from farm.arrays import FloatArray
-from farm.messages import Job, Result, Spec
+from farm.jobs import Job
+from farm.messages import Spec
+from farm.results import Result
 from workers.jobs import specified
 from workers.simulation import CAPACITY
 from workers.tasks import SIMULATES
