@@ -30,6 +30,8 @@ _DTYPES: Final = ("<f8", "<f4", "<i8", "|b1")
 _LENGTH: Final = 10_000  # items of one list or map
 _ITEMS: Final = 500_000  # of all lists and maps of a message: outside of arrays there is little to say
 
+_TEXT: Final = 1000  # characters of a name or a line
+
 M = TypeVar("M")
 C = TypeVar("C", bound=Sized)
 
@@ -189,9 +191,11 @@ def _check(name: str, hint: Any, metadata: Mapping[str, Any]) -> Check:  # noqa:
 
 
 def _exactly(name: str, hint: Any, kind: type, value: object) -> object:  # noqa: ANN401
-    if type(value) is kind:
-        return value
-    raise _mismatch(name, hint, value)
+    if type(value) is not kind:
+        raise _mismatch(name, hint, value)
+    if type(value) is str and len(value) > _TEXT:
+        raise MessageError(f"{name}: a text of {len(value)} characters, at most {_TEXT} are taken", "large")
+    return value
 
 
 def _float(name: str, value: Any) -> float:  # noqa: ANN401

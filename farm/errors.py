@@ -3,10 +3,21 @@
 FarmError                 anything we can say in one line
   ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
     CheckpointError       a run folder that cannot be continued or read
+    UnservedError         a run that this machine's workers do not know, lack something for, or may not serve
   MessageError            bytes from the network that are not what they should be
   RunError                a run that cannot go on (exit status 1)
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
+
+from typing import Final
+
+_LINE: Final = 500  # characters
+
+
+def brief(text: str) -> str:
+    """One printable line of at most 500 characters, of whatever text: for logs, and for what others are told."""
+    line = " ".join(text[: 2 * _LINE].split())[:_LINE]
+    return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
 class FarmError(Exception):
@@ -27,6 +38,10 @@ class MessageError(FarmError):
 
 class CheckpointError(ConfigError):
     """A run folder that cannot be continued or read."""
+
+
+class UnservedError(ConfigError):
+    """A run that this machine's workers do not know, lack something for, or may not serve; others may."""
 
 
 class RunError(FarmError):

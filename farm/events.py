@@ -32,10 +32,13 @@ class Events:
         self._lock, self._bytes, self.dropped = threading.Lock(), 0, 0
 
     def put(self, event: Event) -> None:
-        """Append an event, unless those that wait take up too much."""
-        size = len(event.payload) + _OVERHEAD
+        """Append an event, unless those that wait take up too much.
+
+        There is twice the room for who comes and goes: nobody would say that again.
+        """
+        size = _size(event)
         with self._lock:
-            if self._bytes + size > _BACKLOG:
+            if self._bytes + size > (_BACKLOG if event.payload else 2 * _BACKLOG):
                 self.dropped += 1
                 return
             self._bytes += size
@@ -49,7 +52,7 @@ class Events:
         """
         event = self._queue.get(timeout=timeout) if timeout > 0.0 else self._queue.get_nowait()
         with self._lock:
-            self._bytes -= len(event.payload) + _OVERHEAD
+            self._bytes -= _size(event)
         return event
 
     def waiting(self, timeout: float) -> list[Event]:
@@ -64,3 +67,7 @@ class Events:
     def __len__(self) -> int:
         """How many wait."""
         return self._queue.qsize()
+
+
+def _size(event: Event) -> int:
+    return len(event.payload) + len(event.key) + _OVERHEAD

@@ -172,6 +172,8 @@ class Chunk(Jobs):
     def __post_init__(self) -> None:
         """Check that all speak of as many jobs, and of such that there are."""
         count = len(self.jobs)
+        if not count or len(set(self.jobs.tolist())) < count:
+            raise ValueError("no jobs, or one of them twice")
         if self.signs.shape != (count, 2) or self.seeds.shape != (count, 4):
             raise ValueError(f"signs of shape {self.signs.shape}, seeds of shape {self.seeds.shape} of {count} jobs")
         if not len(self.around) == len(self.rates) == len(self.explores) == count:

@@ -16,7 +16,7 @@
 import re
 from typing import Final
 
-from farm.errors import ConfigError
+from farm.errors import ConfigError, MessageError
 
 _NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,100}")  # dots alone would be a folder above
 
@@ -88,5 +88,12 @@ def refused(farm: str, worker: str) -> str:
 
 
 def tail(key: str, prefix: str) -> str:
-    """What follows the prefix in a key: `tail(key, worker_token(farm, ""))` is the worker."""
-    return key.removeprefix(prefix)
+    """What follows the prefix in a key: `tail(key, worker_token(farm, ""))` is the worker.
+
+    Raises:
+      MessageError: there are no names behind it; who publishes on a pattern speaks for nobody.
+    """
+    behind = key.removeprefix(prefix)
+    if not key.startswith(prefix) or not all(_NAME.fullmatch(part) for part in behind.split("/")):
+        raise MessageError("a key without a name", "foreign")
+    return behind

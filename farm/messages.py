@@ -4,13 +4,15 @@ Everything on the wire is soft state: any message may be lost, doubled or late. 
 `farm.results`) carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from farm.arrays import FloatArray
 from farm.codec import array
 
 _SHORT: Final = 250  # characters; names have up to 100, a worker's is two of them
+_KINDS: Final = 20  # of messages that a worker ignores
+_RUNS: Final = 1000  # that a worker serves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +34,19 @@ class Want:
     host: str
     cores: int
     """That its machine has."""
+    ignored: dict[str, int] = field(default_factory=dict)
+    """Messages that did not count, by kind."""
 
     def __post_init__(self) -> None:
         """Check the number, and that what is remembered of a worker is short."""
         for said in (self.worker, self.version, self.assets, self.canary, self.host):
             if len(said) > _SHORT or not said.isprintable():
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
+        if len(self.idle) > _RUNS:
+            raise ValueError(f"{len(self.idle)} runs")
+        kinds = len(self.ignored) <= _KINDS and all(type(kind) is str for kind in self.ignored)
+        if not kinds or any(len(kind) > _SHORT or type(n) is not int for kind, n in self.ignored.items()):
+            raise ValueError("ignored messages that are not a few numbers by kind")
         if not 0 <= self.credits <= 100_000:
             raise ValueError(f"{self.credits} credits")
 

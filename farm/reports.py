@@ -1,6 +1,6 @@
 """What learners tell people who look on: how a run is doing, and what was recorded of it. Pure, as `farm.messages`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from farm.arrays import AnyArray
@@ -25,6 +25,8 @@ class WorkerStatus:
     """Rollouts a second, over the last ten."""
     seen: float
     """Since it was last heard of [s]."""
+    ignored: dict[str, int] = field(default_factory=dict)
+    """Messages that it ignored, by kind."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -125,13 +125,14 @@ def traced(traces: str, returns: FloatArray, rollouts: IntArray, seen: BoolArray
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """A job that could not be run: an exception, not a bad rollout."""
+    """A job that could not be run: an exception, not a bad rollout. Or a worker that does not serve the run at all."""
 
     run: str
     incarnation: str
     round: int
     worker: str
-    index: int
+    index: int | None
+    """None where it is not the job: no job of this run can be run there."""
     error: str
     """One line."""
 

@@ -14,7 +14,7 @@ class Admission:
           canary: digest of the numbers that the run's machines give; None until the first worker says it.
           mixed: admit machines whose numbers differ: the run's numbers are then not to be had again.
         """
-        self._assets, self._mixed = assets, mixed
+        self._assets, self._mixed, self._settled = assets, mixed, canary is not None
         self.canary = canary
         """The digest that the run's numbers belong to, None as long as nobody has worked."""
 
@@ -30,3 +30,12 @@ class Admission:
                 "take a machine like them, or start the learner with --mixed and do without repeatable numbers"
             )
         return None
+
+    def counted(self) -> None:
+        """A result counted: the run has its numbers for good."""
+        self._settled = True
+
+    def deserted(self) -> None:
+        """Nobody is left; as long as no result counted, whoever comes next decides."""
+        if not self._settled:
+            self.canary = None

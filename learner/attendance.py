@@ -4,6 +4,7 @@ A name alone is cheap: whoever reaches the network can make up as many as he lik
 goes with it, and there are bounds to both.
 """
 
+from itertools import islice
 from typing import Final
 
 from farm.errors import MessageError
@@ -32,10 +33,12 @@ class Attendance:
         self._there.add(worker)
         return self._early.pop(worker, (None, 0.0))[0]
 
-    @property
-    def waiting(self) -> bool:
-        """Whether somebody has asked whose token has not come."""
-        return bool(self._early)
+    def early(self, most: int) -> list[str]:
+        """Some that have asked and whose token has not come, those of whom that was said longest ago first."""
+        names = list(islice(self._early, most))
+        for name in names:
+            self._early[name] = self._early.pop(name)
+        return names
 
     def left(self, worker: str) -> None:
         """A token is gone."""

@@ -55,6 +55,7 @@ class Census:
                 rollouts=known.rollouts,
                 rate=sum(count for at, count in known.recent if at >= now - _WINDOW) / _over(now - known.since),
                 seen=now - known.seen,
+                ignored=known.want.ignored,
             )
             for name, known in sorted(self._known.items())
         )

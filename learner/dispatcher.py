@@ -16,7 +16,7 @@ import numpy as np
 from farm import codec, keys
 from farm.arrays import FloatArray
 from farm.codec import M
-from farm.errors import MessageError, RunError
+from farm.errors import MessageError, RunError, brief
 from farm.events import Event
 from farm.hand import FINGERS
 from farm.jobs import Chunk, Generation, Jobs
@@ -36,7 +36,8 @@ log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] between two looks at whether to stop
 _STATUS: Final = 0.5  # [s] between two refreshments of the status
-_ASK: Final = 0.5  # [s] for the tokens that are there
+_ASK: Final = 0.5  # [s] for a token that may be there
+_LOOKS: Final = 5  # tokens that are asked for at a time: with all of them at once Zenoh needs minutes for a crowd
 _REFUSED: Final = 10_000  # workers that are remembered to be refused
 _PATIENCE: Final = 3.0  # [s] without workers before the user is told
 
@@ -92,6 +93,7 @@ class Dispatcher:
         self._told: set[str] = set()
         self._attendance = Attendance()
         self._refused: dict[str, str] = {}
+        self._declined: set[str] = set()
         self._census = Census()
         self._progress: Progress | None = None
         self._generations, self._status, self._status_due = generations, b"", 0.0
@@ -168,7 +170,7 @@ class Dispatcher:
     def _take(self, event: Event) -> None:
         try:
             if event.topic == "want":
-                self._want(_decode(event, Want), keys.tail(event.key, keys.want(self._farm, "")))
+                self._asked(event)
             elif event.topic == "worker":
                 self._liveliness(event)
             else:
@@ -176,7 +178,14 @@ class Dispatcher:
         except MessageError as error:
             self._ignore(error.kind, f"on {event.key}: {error}")
 
-    def _want(self, want: Want, sender: str) -> None:
+    def _asked(self, event: Event) -> None:
+        sender = keys.tail(event.key, keys.want(self._farm, ""))
+        try:
+            want = _decode(event, Want)
+        except MessageError as error:
+            if error.kind == "version":  # it cannot read why either, but will say that it cannot
+                self._refuse(sender, str(error))
+            raise
         if want.worker != sender:
             self._ignore("foreign", f"of {want.worker} from {sender}")
             return
@@ -187,6 +196,9 @@ class Dispatcher:
         refusal = self.admission.refusal(want)
         if refusal is not None:
             self._refuse(want.worker, refusal)
+            return
+        self._refused.pop(want.worker, None)
+        if want.worker in self._declined:
             return
         if want.worker not in self._ledger.workers:
             log.info("worker %s joined (release %s)", want.worker, want.version)
@@ -210,9 +222,9 @@ class Dispatcher:
             return
         self._attendance.left(worker)
         self._refused.pop(worker, None)
-        self._census.left(worker)
+        self._declined.discard(worker)
         if worker in self._ledger.workers:
-            again = self._ledger.lost(worker)
+            again = self._forget(worker)
             log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
 
     def _came(self, worker: str) -> None:
@@ -222,13 +234,12 @@ class Dispatcher:
 
     def _look_who_is_there(self, now: float) -> None:
         """Of who asks without a token, ask Zenoh: its word that a token came is now and then missed."""
-        if not self._attendance.waiting:
-            return
-        for token in self._session.tokens(keys.worker_token(self._farm, "**"), _ASK):
-            try:
-                self._came(keys.tail(token, keys.worker_token(self._farm, "")))
-            except MessageError as error:
-                self._ignore(error.kind, f"on {token}: {error}")
+        for worker in self._attendance.early(_LOOKS):
+            if self._session.present(keys.worker_token(self._farm, worker), _ASK):
+                try:
+                    self._came(worker)
+                except MessageError as error:
+                    self._ignore(error.kind, f"of {worker}: {error}")
         for worker in self._attendance.absent(now):
             self._ignore("absent", f"of {worker}, whose liveliness token is not there")
 
@@ -260,21 +271,42 @@ class Dispatcher:
             self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
             return
         verdicts = self._ledger.results(message.worker, message.jobs.tolist(), time.monotonic())
-        self._round.put(message, np.array([verdict == "new" for verdict in verdicts]))
+        new = np.array([verdict == "new" for verdict in verdicts])
+        self._round.put(message, new)
+        if new.any():
+            self.admission.counted()
         self.ignored.update(verdict for verdict in verdicts if verdict != "new")
         self._census.did(message.worker, len(message.returns), time.monotonic())
 
     def _failed(self, failure: Failure) -> None:
+        if failure.index is None:
+            self._does_not_serve(failure.worker, failure.error)
+            return
         if self._round is None or not 0 <= failure.index < len(self._round):
             self.ignored["bad"] += 1
             return
-        log.warning("job %d failed on worker %s: %s", failure.index, failure.worker, failure.error)
+        self._warn(f"worker {failure.worker} failed at a job: {failure.error}")
         if self._ledger.error(failure.worker, failure.index, time.monotonic()):
             [job] = self._round.jobs.take([failure.index]).split()
             raise RunError(
                 f"pair {failure.index} of generation {self._header.generation} (perturbation seed {job.perturbation}) "
                 f"failed wherever it was tried, last with {failure.error}"
             )
+
+    def _does_not_serve(self, worker: str, reason: str) -> None:
+        """A worker that is here but does not serve this run: others may."""
+        if worker in self._ledger.workers:
+            self._warn(f"worker {worker} does not serve this run: {reason}")
+            self._declined.add(worker)
+            self._forget(worker)
+
+    def _forget(self, worker: str) -> int:
+        """It takes part no longer; how many of its jobs go to others."""
+        again = self._ledger.lost(worker)
+        self._census.left(worker)
+        if not self._ledger.workers:
+            self.admission.deserted()
+        return again
 
     def _hand_out(self) -> None:
         assert self._round is not None
@@ -306,7 +338,7 @@ class Dispatcher:
             mean_policy_return=last.mean_policy_return if last else None,
             open=self._ledger.remaining,
             reissued=self._ledger.reissued,
-            refused=len(self._refused),
+            refused=len(self._refused) + len(self._declined),
             ignored=dict(self.ignored),
             workers=self.census(),
         )
@@ -322,9 +354,14 @@ class Dispatcher:
 
     def _ignore(self, kind: str, text: str) -> None:
         self.ignored[kind] += 1
+        self._warn(f"ignored a message {text}")
+
+    def _warn(self, text: str) -> None:
+        """Say something once."""
+        text = brief(text)
         if text not in self._told and len(self._told) < 1000:
             self._told.add(text)
-            log.warning("ignored a message %s", text)
+            log.warning("%s", text)
 
 
 _NOTHING: Final = np.empty(0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from farm import tasks
 from farm.arrays import FloatArray
-from farm.errors import ConfigError
+from farm.errors import ConfigError, UnservedError
 from farm.jobs import Job
 from farm.messages import Spec
 from farm.policy import Features, Policy, PolicyConfig
@@ -17,19 +17,21 @@ def specified(spec: Spec) -> tuple[TaskConfig, Policy]:
     """The task and the controller of a run.
 
     Raises:
-      ConfigError: it names something this release does not know, or this machine does not have.
+      UnservedError: it names something this release does not know, or this machine does not have.
     """
     try:
         settings: dict[str, Any] = {**spec.task_config, "task": spec.task}
         config = TaskConfig(**settings)
         controller = PolicyConfig(**spec.policy_config)
+        sizes = tasks.sizes(config)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"a specification that this release does not understand: {error}") from None
-    sizes = tasks.sizes(config)
+        raise UnservedError(f"a specification that this release does not understand: {error}") from None
+    except ConfigError as error:
+        raise UnservedError(str(error)) from None
     if sizes.release != spec.release:
-        raise ConfigError(f"the run has {spec.task} of gymnasium {spec.release}, here is {sizes.release}")
+        raise UnservedError(f"the run has {spec.task} of gymnasium {spec.release}, here is {sizes.release}")
     if spec.frequencies.shape != (len(spec.phases), sizes.observation):
-        raise ConfigError(f"features of shape {spec.frequencies.shape} for {sizes.observation} state components")
+        raise UnservedError(f"features of shape {spec.frequencies.shape} for {sizes.observation} state components")
     features = Features(frequencies=spec.frequencies, phases=spec.phases)
     return config, Policy(controller, sizes.observation, features, (sizes.lower, sizes.upper))
 

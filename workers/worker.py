@@ -10,16 +10,16 @@ import os
 import secrets
 import socket
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from farm import __version__, codec, keys, scene
-from farm.errors import ConfigError, FarmError, MessageError
+from farm.errors import ConfigError, FarmError, MessageError, UnservedError, brief
 from farm.events import Event
-from farm.jobs import Chunk, Generation
+from farm.jobs import Chunk, Generation, Job
 from farm.messages import Refusal, Spec, Want
 from farm.results import Failure, Results
 from farm.session import Session, check_endpoint, connect
@@ -37,6 +37,7 @@ _KEEP: Final = 32  # runs whose tasks are kept built: as many learners may share
 _RUNS: Final = 1000  # that are served side by side
 _HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below
 _TELL: Final = 1000  # different lines that are said once
+_MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +122,7 @@ class Worker:
         self._assets, self._canary = scene.digest(), canary.digest()
         self._spoke = time.monotonic()
         self._told: set[str] = set()
+        self._ignored: Counter[str] = Counter()
 
     def join(self) -> None:
         """Subscribe, then show up: in that order, or the first jobs are lost."""
@@ -137,6 +139,7 @@ class Worker:
             try:
                 self._take(event)
             except MessageError as error:
+                self._ignored[error.kind] += 1
                 self._tell(logging.WARNING, f"ignored a message on {event.key}: {error}")
         self._tell_idle()
         chunk = self._next()
@@ -186,6 +189,7 @@ class Worker:
 
     def _tell(self, level: int, text: str) -> None:
         """Say something once."""
+        text = brief(text)
         if text not in self._told and len(self._told) < _TELL:
             self._told.add(text)
             log.log(level, "%s", text)
@@ -194,8 +198,9 @@ class Worker:
         """A new round: work of older ones is void."""
         run = self._served(header.run)
         old = run.header
-        if old and (old.incarnation, old.round) == (header.incarnation, header.round):
+        if old and old.incarnation == header.incarnation and old.round >= header.round:
             return
+        self._make_room(header)
         run.header, run.busy = header, time.monotonic()
         run.chunks.clear()
 
@@ -206,9 +211,10 @@ class Worker:
             if payload is not None:
                 self._begin(codec.decode(payload, Generation))
         if _belongs(chunk, run.header) and len(run.chunks) < _HELD:
+            self._make_room(chunk)
             run.chunks.append(chunk)
         else:
-            log.debug("dropped a chunk of round %s of run %s", chunk.round, chunk.run)
+            self._ignored["stale"] += 1
 
     def _served(self, run: str) -> _Served:
         """What we know of a run.
@@ -223,6 +229,19 @@ class Worker:
         if run not in self._runs and len(self._runs) >= _RUNS:
             raise MessageError(f"run {run[:40]}: {_RUNS} runs are served already", "large")
         return self._runs.setdefault(run, _Served())
+
+    def _make_room(self, message: Generation | Chunk) -> None:
+        """See that there is memory for it.
+
+        Raises:
+          MessageError: with what is kept it would be more than anybody honest sends.
+        """
+        kept = [message]
+        for run in self._runs.values():
+            kept += [run.header] if run.header else []
+            kept += run.chunks
+        if sum(_bytes(one) for one in kept) > _MEMORY:
+            raise MessageError(f"what runs want kept is more than {_MEMORY >> 20} MiB", "large")
 
     def _next(self) -> Chunk | None:
         """A chunk of the run that has waited longest."""
@@ -240,7 +259,7 @@ class Worker:
         if backend is None:
             return
         if isinstance(backend, Exception):
-            for index in chunk.jobs.tolist():
+            for index in [None] if isinstance(backend, UnservedError) else chunk.jobs.tolist():
                 self._fail(chunk, index, backend)
             return
         jobs = chunk.split()
@@ -248,19 +267,21 @@ class Worker:
             log.warning("ignored jobs of run %s: not %d parameters", chunk.run, backend.parameters)
             return
         try:
-            results = backend.run(header.mu, jobs)
+            self._do(chunk, backend, header, jobs)
         except Exception:  # whatever it was, others may be able to, and the learner decides
             log.exception("a chunk of run %s failed; trying its jobs one by one", chunk.run)
-            results = []
             for job in jobs:
                 try:
-                    results += backend.run(header.mu, [job])
+                    self._do(chunk, backend, header, [job])
                 except Exception as error:
                     self._fail(chunk, job.index, error)
         self._runs[chunk.run].busy = time.monotonic()
-        if results:
-            head = {"incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
-            self._answer(chunk, Results.of(results, run=chunk.run, traces=header.traces, **head))
+
+    def _do(self, chunk: Chunk, backend: Backend, header: Generation, jobs: Sequence[Job]) -> None:
+        """Run some of a chunk's jobs and say what they gave."""
+        results = backend.run(header.mu, jobs)
+        head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
+        self._answer(chunk, Results.of(results, traces=header.traces, **head))
 
     def _backend(self, header: Generation) -> Backend | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
@@ -272,11 +293,13 @@ class Worker:
             try:
                 spec = codec.decode(payload, Spec)
                 if spec.task.startswith("gym") and not self._config.allow_gym:
-                    raise ConfigError(f"this worker serves no {spec.task[:80]}: start it with --allow-gym")
+                    raise UnservedError(f"this worker serves no {spec.task[:80]}: start it with --allow-gym")
                 self._backends[header.spec] = BACKENDS[self._config.backend](spec)
                 log.info("serving run %s", header.run)
             except Exception as error:  # the learner is told, and decides
                 log.error("cannot serve run %s: %s", header.run, error, exc_info=not isinstance(error, FarmError))
+                if not isinstance(error, FarmError):
+                    return error  # short of memory, say: another time it may go
                 self._backends[header.spec] = error
         self._backends.move_to_end(header.spec)
         while len(self._backends) > _KEEP:
@@ -285,15 +308,10 @@ class Worker:
                 oldest.close()
         return self._backends[header.spec]
 
-    def _fail(self, chunk: Chunk, index: int, error: Exception) -> None:
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:500]
-        text = "".join(letter if letter.isprintable() else "?" for letter in said)
-        self._answer(
-            chunk,
-            Failure(
-                run=chunk.run, incarnation=chunk.incarnation, round=chunk.round, worker=self.id, index=index, error=text
-            ),
-        )
+    def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
+        text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
+        head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
+        self._answer(chunk, Failure(index=index, error=brief(text), **head))
 
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
         self._session.publish(keys.result(self._config.farm, chunk.run, self.id), codec.encode(message))
@@ -309,9 +327,14 @@ class Worker:
             canary=self._canary,
             host=socket.gethostname(),
             cores=os.cpu_count() or 1,
+            ignored=dict(self._ignored),
         )
         self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=not idle)
 
 
 def _belongs(chunk: Chunk, header: Generation | None) -> bool:
     return header is not None and (chunk.incarnation, chunk.round) == (header.incarnation, header.round)
+
+
+def _bytes(message: Generation | Chunk) -> int:
+    return sum(getattr(value, "nbytes", 0) for value in vars(message).values())

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,13 +85,19 @@ def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> N
 
 
 def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
-    """What the farm's learners say, by run; or one run's learner."""
-    runs = []
+    """What the farm's learners say, by run; or one run's learner.
+
+    Raises:
+      FarmError: the only ones that answer are of another release.
+    """
+    runs, foreign = [], None
     for payload in session.ask_all(keys.status(farm, run), _ANSWER):
         try:
             runs.append(codec.decode(payload, RunStatus))
-        except MessageError:
-            continue  # another release; its own side says so
+        except MessageError as error:
+            foreign = foreign or error
+    if foreign and not runs:
+        raise FarmError(f"a learner answers, but what it says cannot be read: {foreign}")
     return sorted(runs, key=lambda run: run.run)
 
 
@@ -110,10 +116,11 @@ def _tables(runs: list[RunStatus]) -> Group:
     for name in ("run", "generation", "return", "mean policy", "jobs open", "re-issued", "ignored", "refused"):
         table.add_column(name, justify="left" if name in ("run", "ignored") else "right")
     workers = Table(title="workers")
-    for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "rollouts/s", "last seen"):
-        workers.add_column(name, justify="right" if name.startswith(("cores", "rollouts", "last")) else "left")
+    for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "a second", "seen", "ignored"):
+        right = name in ("cores", "rollouts", "a second", "seen")
+        workers.add_column(name, justify="right" if right else "left", overflow="fold")
     for run in runs:
-        ignored = ", ".join(f"{kind} {count}" for kind, count in sorted(run.ignored.items())) or "-"
+        ignored = _counts(run.ignored)
         figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
         what = run.run, generation, *figures, str(run.open), str(run.reissued), ignored, str(run.refused)
@@ -121,5 +128,9 @@ def _tables(runs: list[RunStatus]) -> Group:
         for worker in run.workers:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
-            workers.add_row(*map(Text, (worker.worker, *machine, run.run, *did)))
+            workers.add_row(*map(Text, (worker.worker, *machine, run.run, *did, _counts(worker.ignored))))
     return Group(table, workers)
+
+
+def _counts(ignored: Mapping[str, int]) -> str:
+    return ", ".join(f"{kind} {count}" for kind, count in sorted(ignored.items())) or "-"

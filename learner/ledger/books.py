@@ -23,6 +23,11 @@ class Worker:
     """Job and when it was sent [s]; done or given-up jobs stay until the worker speaks of them."""
     answered: float = -math.inf
     """When it last spoke of its work [s]."""
+    proven: bool = False
+    """It has brought a result."""
+    benched: bool = False
+    """It failed at a job, or was late when its round ended: as long as others are there, it gets nothing until it
+    speaks again."""
 
 
 class Books:
@@ -33,8 +38,11 @@ class Books:
         self.workers: dict[str, Worker] = {}
         self.begin(0)
 
-    def begin(self, jobs: int) -> None:
-        """Forget every job; 0..jobs-1 are pending, and no worker holds anything."""
+    def begin(self, jobs: int, late: float = math.inf) -> None:
+        """Forget every job; 0..jobs-1 are pending, and no worker holds anything.
+
+        Who held a job out since before `late` [s] is benched.
+        """
         self.size = jobs
         # Jobs that are not done, and who is expected to answer, in the order of issue.
         self.open: dict[int, list[str]] = {index: [] for index in range(jobs)}
@@ -45,6 +53,7 @@ class Books:
         self.full: dict[int, float] = {}  # all copies are out
         self.failed: dict[int, float] = {}  # nobody holds it after an error
         for worker in self.workers.values():
+            worker.benched |= min(worker.held.values(), default=math.inf) <= late
             worker.held.clear()
 
     @property
@@ -83,15 +92,20 @@ class Books:
 
     def finish(self, worker: str, index: int) -> bool:
         """Note a result; return whether the job was not done before."""
-        if worker in self.workers:
-            self.workers[worker].held.pop(index, None)
+        known = self.workers.get(worker)
+        if known is not None:
+            known.held.pop(index, None)
+            known.proven, known.benched = True, False
         self._unqueue(index)
         return self.open.pop(index, None) is not None
 
     def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
         """Note an error; return whether it counts, and whether nobody holds the job any more."""
         known = self.workers.get(worker)
-        held = known is not None and known.held.pop(index, None) is not None
+        if known is None:
+            return False, False
+        known.benched = True
+        held = known.held.pop(index, None) is not None
         if index not in self.open or (not held and worker in self.errors[index]):
             return False, False  # done meanwhile, or a doubled message
         self.errors[index][worker] += 1
@@ -111,11 +125,12 @@ class Books:
         return count
 
     def free(self, most: int) -> list[tuple[int, str]]:
-        """Return a heap of (jobs held, worker) over the workers that may hold one more."""
+        """Return a heap of (jobs held, worker) over the workers that may hold one more; benched ones if all are."""
+        all_benched = all(known.benched for known in self.workers.values())
         free = [
             (len(known.held), name)
             for name, known in self.workers.items()
-            if len(known.held) < min(known.credits, most)
+            if len(known.held) < min(known.credits, most) and (all_benched or not known.benched)
         ]
         heapq.heapify(free)
         return free
@@ -135,6 +150,13 @@ class Books:
         for entry in passed:
             heapq.heappush(free, entry)
         return picked
+
+    def hopeless(self, index: int, most: int) -> bool:
+        """Say whether a job has failed at proven workers of `most` hosts, or so often and nobody is left to try."""
+        errors = self.errors[index]
+        hosts = {name.partition("/")[0] for name in errors if name in self.workers and self.workers[name].proven}
+        nobody = all(name in errors or known.benched for name, known in self.workers.items())
+        return len(hosts) >= most or (nobody and errors.total() >= most)
 
     def _leave(self, worker: str, index: int, now: float) -> bool:
         """Strike a holder off; return whether it was the last one, the job then in no queue."""

@@ -73,7 +73,7 @@ class Ledger:
         if jobs < 0:
             raise ValueError(f"jobs is {jobs}, expected 0 or more")
         self._begun = True
-        self._books.begin(jobs)
+        self._books.begin(jobs, self._now - self._pace.patience)
         self._seen = -math.inf
 
     def want(self, worker: str, credits: int, now: float, *, idle: bool = False) -> None:
@@ -90,7 +90,7 @@ class Ledger:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
         self._tick(now)
         known = self._books.workers.setdefault(worker, Worker(credits))
-        known.credits = credits
+        known.credits, known.benched = credits, False
         if idle:
             known.answered = self._now
             self._reissued += self._books.release(worker, self._now)
@@ -118,19 +118,16 @@ class Ledger:
     def error(self, worker: str, index: int, now: float) -> bool:
         """Note that a worker answered an error; return whether the run has to stop.
 
-        It has to when `max_errors` different workers failed at the job, or after as many answers
-        where there are fewer workers. Until then the job is issued again, elsewhere if possible.
+        It has to when the job failed on `max_errors` hosts that brought results before, or as often and
+        there is nobody left to try: what some machines lack must not end a run that others serve. Until
+        then it is issued again, elsewhere if possible. Who is not known counts for nothing.
         """
         self._tick(now)
         counts, again = self._books.fail(worker, index, self._now)
         self._reissued += again
         if worker in self._books.workers:
             self._books.workers[worker].answered = self._now
-        if not counts:
-            return False
-        few = len(self._books.workers) < self._config.max_errors
-        errors = self._books.errors[index]
-        return (errors.total() if few else len(errors)) >= self._config.max_errors
+        return counts and self._books.hopeless(index, self._config.max_errors)
 
     def assign(self, now: float) -> list[Assignment]:
         """Return the chunks to send now, within the credits, and count them as sent.

@@ -214,7 +214,14 @@ def test_a_mutated_message_is_a_message_or_a_message_error(name, where, length, 
 # ---------------------------------------------------------------- what messages refuse
 
 REFUSED = {
-    "want": [{"credits": -1}, {"credits": 100_001}],
+    "want": [
+        {"credits": -1},
+        {"credits": 100_001},
+        {"idle": ("r",) * 1001},
+        {"ignored": {"stale": "many"}},
+        {"ignored": {"s" * 251: 1}},
+        {"ignored": dict.fromkeys("abcdefghijklmnopqrstuvwxyz", 1)},
+    ],
     "job": [
         {"origin": "sigma"},
         {"origin": ""},
@@ -232,6 +239,7 @@ REFUSED = {
     ],
     "chunk": [
         {"jobs": np.zeros(3, dtype=np.int64)},
+        {"jobs": np.array([0, 1, 2, 2])},
         {"jobs": np.array([0, 1, 2, -1])},
         {"jobs": np.array([0, 1, 2, 2**31])},
         {"around": np.zeros(5, dtype=bool)},
@@ -293,6 +301,19 @@ def test_values_that_make_no_sense_are_refused(name, change):
     plain = msgpack.unpackb(codec.encode(message), ext_hook=msgpack.ExtType) | packed
     with pytest.raises(MessageError, match=f"^{type(message).__name__}: "):
         codec.decode(msgpack.packb(plain, default=codec._pack), type(message))
+
+
+@pytest.mark.parametrize(("name", "field"), [("refusal", "reason"), ("results", "worker"), ("failure", "worker")])
+def test_texts_have_an_end(name, field):
+    said = dataclasses.replace(MESSAGES[name], **{field: "x" * 1001})
+    with pytest.raises(MessageError, match=r"a text of 1001 characters, at most 1000 are taken"):
+        codec.decode(codec.encode(said), type(said))
+
+
+def test_a_chunk_has_jobs():
+    nothing = {name: value[:0] for name, value in vars(Jobs.of(JOBS)).items()}
+    with pytest.raises(ValueError, match="no jobs, or one of them twice"):
+        Chunk(**nothing, **HEAD)
 
 
 def test_jobs_are_split_as_they_were_put_together():

@@ -106,16 +106,21 @@ def test_the_recording_shows_the_scene(learnt: Farm) -> None:
     assert "/world/object" in replays
 
 
-def test_a_worker_serves_it_only_if_allowed(farm: Farm) -> None:
-    endpoint = free_endpoint()
+def test_a_worker_serves_it_only_if_allowed(farm: Farm, learnt: Farm) -> None:
+    """Others are told, and the run goes on with those that may."""
+    endpoint, log = free_endpoint(), farm.folder / "runs/r/log.txt"
     learner = farm.start("learner", "--listen", endpoint, "--name", "r", "--no-record", *SMALL)
-    worker = farm.start("worker", "--connect", endpoint, "--processes", "1")
-    said, _ = learner.communicate(timeout=60)
-    assert learner.returncode == 1, said
+    others = farm.start("worker", "--connect", endpoint, "--processes", "3", "--name", "other")
+    declined = "does not serve this run: this worker serves no gym:Pusher-v5: start it with --allow-gym"
+    farm.wait_for(lambda: log.exists() and log.read_text().count(declined) == 3)
+    farm.start("worker", "--connect", endpoint, "--processes", "1", "--allow-gym")
+    said, _ = learner.communicate(timeout=120)
+    assert learner.returncode == 0, said
     assert f"workers join with: farm worker --connect {endpoint} --allow-gym" in said
-    assert "this worker serves no gym:Pusher-v5: start it with --allow-gym" in said.splitlines()[-1]
-    worker.send_signal(signal.SIGTERM)
-    assert worker.wait(10) == 0
+    assert said.count(declined) == 3, "once each"
+    same(farm.summary("r"), learnt)
+    others.send_signal(signal.SIGTERM)
+    assert others.wait(10) == 0
 
 
 def test_allowed_workers_and_a_recorder_elsewhere(farm: Farm, learnt: Farm) -> None:

@@ -20,6 +20,16 @@ def test_the_first_worker_decides_whose_numbers_count() -> None:
     assert admission.canary == "bits"
 
 
+def test_who_did_nothing_and_left_decides_nothing() -> None:
+    admission = Admission("hand", None)
+    admission.refusal(want(canary="odd"))
+    admission.deserted()
+    assert admission.refusal(want()) is None
+    admission.counted()
+    admission.deserted()
+    assert admission.canary == "bits"
+
+
 def test_a_resumed_run_knows_whose_numbers_count() -> None:
     admission = Admission("hand", "bits")
     assert "--mixed" in str(admission.refusal(want(canary="others")))

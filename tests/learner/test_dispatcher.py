@@ -16,7 +16,7 @@ from farm import codec, keys
 from farm.errors import RunError
 from farm.jobs import Chunk, Generation, Job, Jobs
 from farm.local import free_endpoint
-from farm.messages import Spec, Want
+from farm.messages import Refusal, Spec, Want
 from farm.results import Failure, Result, Results, WireTrajectory
 from farm.session import Session, connect, listen
 from learner import attendance
@@ -436,6 +436,79 @@ def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:
         worker.answer(Failure(**_head(chunk), worker="a/1", index=0, error="once"))  # type: ignore[arg-type]
     worker.work(1)
     assert indices(collected.result(WAIT)) == [0]
+
+
+def test_who_does_not_serve_the_run_gets_none_of_it(
+    learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture
+) -> None:
+    farm = learner.show()
+    idle, worker = hire("a/1"), hire("b/1")
+    collected = learner.collect(jobs(6))
+    idle.want(3)
+    chunk = idle.chunk()
+    for _ in range(2):
+        idle.answer(Failure(**_head(chunk), worker="a/1", index=None, error="not allowed here"))  # type: ignore[arg-type]
+    idle.want(3, idle=True)
+    worker.want(2)
+    worker.work(6)
+    assert indices(collected.result(WAIT)) == [0, 1, 2, 3, 4, 5]
+    assert farm.workers == ("b/1",)
+    assert [text for text in caplog.messages if "not allowed" in text] == [
+        "worker a/1 does not serve this run: not allowed here"
+    ]
+
+
+def test_another_release_hears_why_it_gets_nothing(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    farm = learner.show()
+    other, worker = hire("a/1"), hire("b/1")
+    other.session.subscribe("refused", keys.refused(FARM, "a/1"))
+    collected = learner.collect(jobs(2))
+    with monkeypatch.context() as newer:
+        newer.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
+        said = codec.encode(
+            Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
+        )
+    other.say(keys.want(FARM, "a/1"), said)
+    assert "run the same release on both" in codec.decode(other.next("refused"), Refusal).reason
+    worker.want(2)
+    worker.work(2)
+    collected.result(WAIT)
+    assert farm.ignored == {"version": 1}
+
+
+def test_numbers_of_a_worker_that_did_nothing_bind_nobody(endpoint: str, learner: Learner, hire: Hire) -> None:
+    farm = learner.show()
+    worker = hire("b/1")
+    with connect((endpoint,), WAIT, lambda: False) as session:
+        odd = Worker(session, "a/1")
+        want = Want(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="odd", host="h", cores=2)
+        collected = learner.collect(jobs(2))
+        odd.say(keys.want(FARM, "a/1"), want)
+        odd.chunk()
+        assert farm.admission.canary == "odd"
+    worker.want(2)
+    until = time.monotonic() + WAIT
+    while not farm.workers or farm.admission.canary != "c":
+        assert time.monotonic() < until
+        worker.want(2)
+        time.sleep(0.05)
+    worker.work(2)
+    collected.result(WAIT)
+
+
+def test_patterns_are_nobodys_name(learner: Learner, hire: Hire) -> None:
+    farm = learner.show()
+    worker = hire("a/1")
+    collected = learner.collect(jobs(1))
+    for name in ("**", "*/*", "a/**"):
+        want = Want(worker=name, credits=1, idle=(), version="0", assets="b", canary="c", host="h", cores=2)
+        worker.say(keys.want(FARM, name), want)
+    worker.want(1)
+    worker.work(1)
+    collected.result(WAIT)
+    assert farm.ignored == {"foreign": 3}
 
 
 def test_nobody_there_is_said_once(

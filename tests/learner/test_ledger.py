@@ -259,10 +259,90 @@ def test_with_fewer_workers_the_answers_count():
         assert ledger.error("a", 0, 0.1 * answer) == (answer == 2)
 
 
+def test_machines_that_lack_something_do_not_end_a_run_that_others_serve():
+    ledger = started(30, ["a/1", "b/1", "c/1", "good/1"], credits=2)
+    for now in range(1, 60):
+        for name, indices in given(ledger.assign(0.01 * now)).items():
+            for index in indices:
+                if name == "good/1":
+                    ledger.results(name, [index], 0.01 * now)
+                else:
+                    assert not ledger.error(name, index, 0.01 * now)
+        for name in ("a/1", "b/1", "c/1"):
+            ledger.want(name, 2, 0.01 * now, idle=True)
+    assert ledger.complete
+
+
+def test_processes_of_one_host_are_one_opinion():
+    names = ["h/1", "h/2", "h/3", "i/1"]
+    ledger = started(5, names, credits=1)
+    for name, [index] in given(ledger.assign(0.0)).items():
+        ledger.results(name, [index], 0.1)  # all can, in principle
+    for now in (0.2, 0.3, 0.4):
+        [(name, [index])] = given(ledger.assign(now)).items()
+        assert name.startswith("h/")
+        assert not ledger.error(name, index, now)
+    assert given(ledger.assign(0.5)) == {"i/1": [4]}
+    assert ledger.error("i/1", 4, 0.6), "nobody is left to try"
+
+
+def test_three_hosts_that_brought_results_are_enough():
+    ledger = started(6, ["a/1", "b/1", "c/1", "d/1", "e/1"], credits=1)
+    for name, [index] in given(ledger.assign(0.0)).items():
+        ledger.results(name, [index], 0.1)
+    failed = []
+    for now in (0.2, 0.3, 0.4):
+        [(name, [index])] = given(ledger.assign(now)).items()
+        failed.append(ledger.error(name, index, now))
+    assert failed == [False, False, True]
+
+
+def test_who_failed_gets_nothing_until_it_speaks():
+    ledger = started(8, ["a", "b"], credits=1)
+    assert given(ledger.assign(0.0)) == {"a": [0], "b": [1]}
+    ledger.error("a", 0, 0.1)
+    ledger.results("b", [1], 0.1)
+    assert given(ledger.assign(0.1)) == {"b": [0]}
+    ledger.results("b", [0], 0.2)
+    assert given(ledger.assign(0.2)) == {"b": [2]}
+    ledger.want("a", 1, 0.3, idle=True)
+    assert given(ledger.assign(0.3)) == {"a": [3]}
+
+
+def test_strangers_failures_count_for_nothing():
+    ledger = started(1, ["a"])
+    ledger.assign(0.0)
+    assert not any(ledger.error(name, 0, 0.1) for name in ("x", "y", "z"))
+    assert ledger.reissued == 0
+
+
+def test_who_hung_when_a_round_ended_is_not_waited_for_again():
+    ledger = started(2, ["a", "b"], credits=1)
+    assert given(ledger.assign(0.0)) == {"a": [0], "b": [1]}
+    ledger.results("b", [1], 0.1)
+    assert given(ledger.assign(1.0)) == {"b": [0]}  # a is late
+    ledger.results("b", [0], 1.1)
+    ledger.begin(2)
+    assert given(ledger.assign(1.1)) == {"b": [0]}
+    ledger.results("b", [0], 1.2)
+    assert given(ledger.assign(1.2)) == {"b": [1]}
+    ledger.results("a", [0], 1.3)  # of the round gone by, perhaps: it lives
+    ledger.begin(2)
+    assert given(ledger.assign(1.4)) == {"a": [0], "b": [1]}
+
+
+def test_who_alone_is_left_is_asked_again():
+    ledger = started(1, ["a"])
+    ledger.assign(0.0)
+    ledger.error("a", 0, 5.0)
+    assert given(ledger.assign(5.0)) == {"a": [0]}
+
+
 def test_a_failed_job_waits_for_another_worker_but_not_for_ever():
     ledger = started(3, ["a", "b"], credits=1)
     assert given(ledger.assign(0.0)) == {"a": [0], "b": [1]}
     ledger.error("a", 0, 0.1)
+    ledger.want("a", 1, 0.1)
     assert given(ledger.assign(0.1)) == {"a": [2]}
     ledger.results("a", [2], 0.2)
     assert ledger.assign(0.2) == []  # b has no room, a failed at it

@@ -331,9 +331,9 @@ def test_a_task_it_does_not_know(stage: Stage, caplog: pytest.LogCaptureFixture)
     worker = stage.hire("cpu")
     for _ in range(2):
         learner.send(worker.id, 4, 5)
-        answers = [stage.failure(), stage.failure()]
-        assert [said.index for said in answers] == [4, 5]
-        assert all("unknown task 'juggling'; known are finger-gait" in said.error for said in answers)
+        said = stage.failure()
+        assert said.index is None, "it is not the job"
+        assert said.error == "unknown task 'juggling'; known are finger-gait, gym:NAME"
     assert caplog.messages == ["cannot serve run r: unknown task 'juggling'; known are finger-gait, gym:NAME"]
     assert caplog.records[0].exc_info in (None, False)
 
@@ -351,10 +351,11 @@ def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytes
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.send(worker.id, 12, 13, 14)
+    assert indices(stage.results()) == [12]
     failed = stage.failure()
     assert (failed.index, failed.error) == (13, "ArithmeticError: thirteen")
     assert (failed.run, failed.incarnation, failed.round, failed.worker) == ("r", "first", 2, worker.id)
-    assert indices(stage.results()) == [12, 14]
+    assert indices(stage.results()) == [14]
     assert [r.levelno for r in caplog.records] == [logging.ERROR]
 
 
@@ -380,7 +381,38 @@ def test_messages_it_cannot_read(
     learner.announce()
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]
-    assert sum("schema version 3, this side speaks 2" in line for line in caplog.messages) == 2
+    until(lambda: sum("schema version 3, this side speaks 2" in line for line in caplog.messages) == 2)
+
+
+def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    Backend.go.clear()
+    learner.send(worker.id, 1)
+    until(lambda: Backend.ran)
+    learner.send(worker.id, 2)
+    learner.header = replace(learner.header, round=learner.header.round - 1)
+    learner.announce()
+    Backend.go.set()
+    assert [indices(stage.results()) for _ in range(2)] == [[1], [2]]
+
+
+def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_MEMORY", 10_000)
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    for i in range(20):
+        header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200))
+        stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1]
+    until(lambda: worker._ignored["large"] == 14)
+    monkeypatch.setattr(workers, "IDLE", 0.0)
+    while True:
+        _, want = stage.next("want")
+        assert isinstance(want, Want)
+        if want.ignored == {"large": 14}:
+            break
 
 
 def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:

@@ -17,7 +17,7 @@ class Backend(Protocol):
     """Jobs that are worth holding at a time."""
 
     def __init__(self, spec: Spec) -> None:
-        """Build the run's task; ConfigError when it is not known here."""
+        """Build the run's task; UnservedError when it is not known here, ConfigError when it cannot be built."""
 
     @property
     def parameters(self) -> int:

@@ -22,7 +22,8 @@ class CpuBackend:
         """Build the run's task from its specification.
 
         Raises:
-          ConfigError: it names something this release does not know, or this machine does not have.
+          UnservedError: it names something this release does not know, or this machine does not have.
+          ConfigError: it cannot be built.
         """
         config, policy = specified(spec)
         self._size = policy.size
