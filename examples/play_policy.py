@@ -96,7 +96,12 @@ class Policy:
 
 def main() -> None:
     """Play it once and say how it went."""
-    policy = Policy(sys.argv[1])
+    if len(sys.argv) != 2:
+        sys.exit("usage: python play_policy.py POLICY.npz")
+    try:
+        policy = Policy(sys.argv[1])
+    except (OSError, ValueError, KeyError) as error:
+        sys.exit(f"{sys.argv[1]} is no policy that farm export wrote: {error}")
     policy.reset()
     total, held, t = 0.0, True, 0
     while held and t < policy.p["steps"]:

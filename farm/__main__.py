@@ -1,6 +1,7 @@
 """The front door: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
 
 import importlib
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Final
@@ -42,8 +43,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if name not in COMMANDS:
             raise ConfigError(f"unknown command {name!r}; known are {', '.join(COMMANDS)} (see farm --help)")
+        if arguments is None:  # where a command has no better idea, SIGTERM is as Ctrl-C
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
         return int(importlib.import_module(f"farm.commands.{name}").main(words[1:]))
-    except (KeyboardInterrupt, Interrupted):
+    except (KeyboardInterrupt, Interrupted) as end:
+        if isinstance(end, KeyboardInterrupt):
+            sys.stderr.write("farm: stopped before the end\n")
         return 130
     except FarmError as error:
         sys.stderr.write(f"farm: {error}\n")

@@ -77,6 +77,8 @@ def sizes(config: TaskConfig) -> Sizes:
 
     own = gymnasium.spec(config.environment).max_episode_steps
     steps = min(config.steps or STEPS_LIMIT, own or STEPS_LIMIT)
+    if own and config.steps > own:
+        raise ConfigError(f"--steps {config.steps}: task {config.task} ends after {own}")
     if not (own or config.steps):
         raise ConfigError(f"task {config.task} ends at no number of steps: give it one with --steps")
     low, high = env.action_space.low.astype(float), env.action_space.high.astype(float)  # type: ignore[attr-defined]

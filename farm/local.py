@@ -113,6 +113,11 @@ class Run:
         return self._farm.census()
 
     @property
+    def recorded(self) -> bool:
+        """Whether there is a recording."""
+        return self._recording is not None
+
+    @property
     def dropped(self) -> int:
         """Generations that were recorded without their rollout, because the recorder could not keep up."""
         return self._recording.dropped if self._recording else 0

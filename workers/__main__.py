@@ -12,6 +12,10 @@ from farm.errors import ConfigError, FarmError
 from workers.worker import WorkerConfig, work
 
 
+BROKEN = 70
+"""Exit status after an error of the software itself, as sysexits.h has it: whoever started this may start another."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Process:
     """One worker process."""
@@ -41,6 +45,9 @@ def main() -> int:
         if not stop.is_set():
             sys.stderr.write(f"farm worker: {error}\n")
             return 1
+    except Exception:
+        logging.exception("this worker failed")
+        return BROKEN
     return 0
 
 

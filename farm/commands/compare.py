@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from farm import arguments
-from farm.commands import view
+from farm.commands import recordings, view
 from farm.errors import ConfigError, RunError
 from farm.finished import again
 from farm.local import check_rerun
@@ -36,8 +36,7 @@ def main(words: Sequence[str]) -> int:
 
     if not 2 <= len(command.runs) <= len(COLOURS):
         raise ConfigError(f"{len(command.runs)} runs to compare; expected 2 to {len(COLOURS)}")
-    if command.view:
-        view.check_display(command.to)
+    recordings.target(command.to)
     folders = [RunFolder.open(path) for path in command.runs]
     runs = comparison.read(folders)
     shown = []
@@ -50,4 +49,7 @@ def main(words: Sequence[str]) -> int:
         raise RunError(f"cannot write {command.to}: {error.strerror}") from None
     sys.stdout.write(f"written to {command.to}; look at it with: farm view {command.to}\n")
     sys.stdout.flush()
-    return view.show([command.to]) if command.view else 0
+    if command.view:
+        view.check_display(str(command.to))
+        return view.show([str(command.to)])
+    return 0

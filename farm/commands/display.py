@@ -191,8 +191,11 @@ class LiveDisplay:
             table.add_row("", f"{worker.rate:.0f}", Text(name(worker)))
         if len(workers) > _WORKERS:
             table.add_row("", f"{sum(w.rate for w in workers[_WORKERS:]):.0f}", f"{len(workers) - _WORKERS} more")
-        if dropped:
-            table.add_row("recording", "", f"{dropped} rollouts left out: it could not keep up")
+        if self._run.recorded:
+            left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
+            table.add_row("recording", "", Text(f"farm view {self._run.learner.folder.path}{left_out}"))
+        if self._run.live is not None:
+            table.add_row("live", "", f"farm view {self._run.live}")
         return table
 
 

@@ -3,7 +3,7 @@
 import gc
 from dataclasses import replace
 
-from farm.commands import display, logs, options
+from farm.commands import display, logs, options, recordings
 from farm.commands.options import LearnerOptions
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError
@@ -54,7 +54,7 @@ def _announcement(run: Run, place: Place) -> list[str]:
     if not place.workers:
         lines.append(f"workers join with: {how_to_join(place, run.learner.config)}")
     if run.live is not None:
-        lines.append(f"live: rerun {run.live}   (in a browser: rerun --web-viewer {run.live})")
+        lines += recordings.look_on(run.live)
     kept = folder.every(run.learner.state.mu.size, run.learner.config.generations)
     if kept > 1:
         lines.append(f"parameters: one generation in {kept} is kept, to stay below 100 MB")

@@ -88,7 +88,7 @@ def address(serve: str) -> tuple[str, int]:
     host, _, port = serve.rpartition(":")
     if not port.isdigit() or not 0 < int(port) < 65536:
         raise ConfigError(f"--serve {serve!r} is not of the form [HOST:]PORT, for example 9876")
-    return host or "127.0.0.1", int(port)
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:

@@ -47,6 +47,7 @@ def main(words: Sequence[str]) -> int:
     from learner.folder import RunFolder
 
     folder = RunFolder.open(command.run)
+    policy = stored(folder, command.generation, command.object)
     if not display():
         raise ConfigError(
             f"no display to open a window on: farm replay {command.run} --video gait.gif draws without one"
@@ -54,7 +55,6 @@ def main(words: Sequence[str]) -> int:
     from farm.playing import Player, watch
     from farm.rendering import lit
 
-    policy = stored(folder, command.generation, command.object)
     simulation = policy.simulation
     start = simulation.start
     scene = lit(simulation.scene.object_name)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from farm import arguments, keys, session
-from farm.commands import logs, options
+from farm.commands import logs, options, recordings
 from farm.commands.learning import INTERRUPTED
 from farm.commands.screen import display
 from farm.commands.signals import stop_flag
@@ -108,7 +108,7 @@ def _announce(run: str, remote: "Remote", *, spawn: bool) -> None:
     into = "" if remote.folder is None else f" into {remote.folder.path}"
     sys.stdout.write(f"recording run {run}{into}{done}\n")
     if remote.recording.uri is not None:
-        sys.stdout.write(f"live: rerun {remote.recording.uri}\n")
+        sys.stdout.write("".join(f"{line}\n" for line in recordings.look_on(remote.recording.uri)))
     sys.stdout.flush()
     if spawn and remote.recording.uri is not None:
         # In a session of its own: the window stays when this ends, whoever looks closes it. A viewer listens, too.

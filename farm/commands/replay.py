@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from farm import arguments
+from farm.commands import recordings
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError
 
@@ -60,8 +61,8 @@ def main(words: Sequence[str]) -> int:
     folder = RunFolder.open(command.run)
     if folder.read_config().task.kind != "finger-gait":
         return _environment(command, folder)
+    path = recordings.target(command.to or folder.path / "gait.rrd")
     shown = again(folder, conditions, command.generation)
-    path = command.to or folder.path / "gait.rrd"
     _record(shown, folder, path, str(conditions))
     success = "the gait succeeds" if shown.trajectory.success else "the gait does not succeed"
     sys.stdout.write(f"return {shown.trajectory.value:.3f}, {success}\n")
@@ -88,10 +89,10 @@ def _environment(command: ReplayCommand, folder: "RunFolder") -> int:
     for name in ("generation", "object", "friction", "video"):
         if getattr(command, name) is not None:
             raise ConfigError(f"--{name} is for runs of finger-gait, and this one is of {config.task.task}")
+    path = recordings.target(command.to or folder.path / "gait.rrd")
     generation, [result] = simulate(folder, evaluation_jobs(0, 0))
     if result.trajectory is None:
         raise RunError("the simulation gave no trajectory")
-    path = command.to or folder.path / "gait.rrd"
     rollout = (f"mean policy after generation {generation}", result.trajectory.trajectory())
     try:
         scene = tasks.scene(config.task)

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from farm import arguments
+from farm.commands.tables import compact, wide
 from farm.errors import ConfigError
 from learner.folder import RunFolder
 
@@ -35,10 +34,12 @@ def main(words: Sequence[str]) -> int:
     if command.json:
         sys.stdout.write(json.dumps(rows, indent=2) + "\n")
         return 0
-    table = Table()
-    for name in ("run", "state", "generation", "return", "success", "robust", "hash"):
+    table = compact()
+    for name in ("run", "state", "done", "return", "success", "robust", "hash"):
         left = name in ("run", "state", "hash")
-        table.add_column(name, justify="left" if left else "right", no_wrap=name != "run", overflow="fold")
+        table.add_column(
+            name, justify="left" if left else "right", no_wrap=name not in ("run", "state"), overflow="fold"
+        )
     for row in rows:
         robust = row["robust_success_rate"]
         value = row["mean_policy_return"]
@@ -49,7 +50,7 @@ def main(words: Sequence[str]) -> int:
             "" if robust is None else f"{robust:.0%}",
             (row["parameters_sha256"] or "")[:8],
         )  # fmt: skip
-    Console().print(table)
+    wide().print(table)
     return 0
 
 

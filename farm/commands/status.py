@@ -10,12 +10,12 @@ from pathlib import Path
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from farm import arguments, codec, keys
 from farm.commands import logs
 from farm.commands.signals import stop_flag
+from farm.commands.tables import compact, wide
 from farm.errors import FarmError, MessageError
 from farm.local import LISTEN
 from farm.reports import RunStatus
@@ -63,7 +63,7 @@ def main(words: Sequence[str]) -> int:
         if command.json:
             sys.stdout.write(json.dumps([dataclasses.asdict(run) for run in runs], indent=2) + "\n")
             return 0
-        console = Console()
+        console = wide()
         if not console.is_terminal:
             console.print(_tables(runs))
             return 0
@@ -112,18 +112,18 @@ def _watch(
 def _tables(runs: list[RunStatus]) -> Group:
     if not runs:
         return Group("no runs: no learner answers")
-    table = Table(title=time.strftime("runs at %H:%M:%S"))
-    for name in ("run", "generation", "return", "mean policy", "jobs open", "re-issued", "ignored", "refused"):
-        table.add_column(name, justify="left" if name in ("run", "ignored") else "right")
-    workers = Table(title="workers")
-    for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "a second", "seen", "ignored"):
-        right = name in ("cores", "rollouts", "a second", "seen")
+    table = compact(time.strftime("runs at %H:%M:%S"))
+    for name in ("run", "generation", "return", "mean policy", "open", "re-issued", "refused", "ignored"):
+        table.add_column(name, justify="left" if name in ("run", "ignored") else "right", overflow="fold")
+    workers = compact("workers")
+    for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "1/s", "seen", "ignored"):
+        right = name in ("cores", "rollouts", "1/s", "seen")
         workers.add_column(name, justify="right" if right else "left", overflow="fold")
     for run in runs:
         ignored = _counts(run.ignored)
         figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
-        what = run.run, generation, *figures, str(run.open), str(run.reissued), ignored, str(run.refused)
+        what = run.run, generation, *figures, str(run.open), str(run.reissued), str(run.refused), ignored
         table.add_row(*map(Text, what))  # as they are: a name in brackets is no style
         for worker in run.workers:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]

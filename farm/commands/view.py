@@ -1,18 +1,23 @@
 """`farm view`: recordings of runs in the Rerun viewer."""
 
+import logging
+import socket
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
 from farm import arguments
+from farm.commands import logs, recordings
 from farm.commands.screen import display
 from farm.commands.signals import stop_flag
-from farm.errors import ConfigError, Interrupted
+from farm.errors import ConfigError, Interrupted, RunError
 from farm.local import check_rerun
 
+log = logging.getLogger(__name__)
+
+_PAGE = 9090  # where a browser finds the viewer, if nobody else is there
 _LOOK = 0.1  # [s] between two looks at the viewer
 _CLOSING = 5.0  # [s] that it has to end
 
@@ -21,8 +26,8 @@ _CLOSING = 5.0  # [s] that it has to end
 class ViewCommand:
     """Opens the recordings of runs in the Rerun viewer; those of several runs with a table of the runs."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of runs, or recordings (.rrd)."""
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of runs, recordings (.rrd), or the address of a live stream."""
     web: bool = False
     """Serve the viewer to a browser on this machine instead of opening a window."""
 
@@ -30,41 +35,49 @@ class ViewCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ViewCommand, words, "farm view")
+    logs.set_up("WARNING")
     check_rerun()
     if not command.runs:
         raise ConfigError("nothing to look at: give a run's folder or a .rrd file")
-    files = [_files(path) for path in command.runs]
+    found = [recordings.sources(what) for what in command.runs]
     if not command.web:
-        check_display(files[0][0])
-    return show([file for some in files for file in some], web=command.web, table=len(files) > 1)
+        check_display(command.runs[0])
+    return show([source for some in found for source in some], web=command.web, table=len(found) > 1)
 
 
-def check_display(file: Path) -> None:
+def check_display(what: str) -> None:
     """Whether a window can be opened.
 
     Raises:
       ConfigError: it cannot; says what to do.
     """
     if not display():
-        raise ConfigError(f"no display to open a window on: --web serves a browser, or copy {file} to another machine")
+        raise ConfigError(
+            f"no display to open a window on: farm view {what} --web serves a browser, or copy the recording elsewhere"
+        )
 
 
-def show(files: Sequence[Path], *, web: bool = False, table: bool = False) -> int:
-    """Open recordings and wait until the viewer is closed; its exit status.
+def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> int:
+    """Open recordings and wait until the viewer is closed.
 
     Args:
-      files: the recordings.
+      sources: files of recordings, or addresses of live streams.
       web: serve a browser instead of opening a window.
       table: begin with the table of the recordings.
 
     Raises:
+      RunError: the viewer failed.
       Interrupted: Ctrl-C or SIGTERM, which end the viewer as well.
     """
     from learner.recording.viewing import free_port, program, show_table
 
     port = free_port()
-    flags = ["--web-viewer"] if web else ["--port", str(port)]
-    command = [program(), *map(str, files), "--bind", "127.0.0.1", *flags]
+    command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
+    if web:
+        page = free_port(_PAGE)
+        command += ["--web-viewer", "--web-viewer-port", str(page)]
+        tunnels = " ".join(f"-L {number}:127.0.0.1:{number}" for number in (page, port))
+        log.warning("over ssh: ssh %s %s, and open the page there", tunnels, socket.gethostname())
     with stop_flag("closing the viewer") as stop, subprocess.Popen(command) as viewer:
         try:
             if table and not web:
@@ -75,7 +88,13 @@ def show(files: Sequence[Path], *, web: bool = False, table: bool = False) -> in
             _end(viewer)
     if stop.is_set():
         raise Interrupted("the viewer is closed")
-    return viewer.returncode
+    if viewer.returncode:
+        raise RunError(f"Rerun's viewer ended with status {viewer.returncode}: {_hint(web=web)}")
+    return 0
+
+
+def _hint(*, web: bool) -> str:
+    return "see above" if web else "is the display there? --web serves a browser instead"
 
 
 def _end(viewer: "subprocess.Popen[bytes]") -> None:
@@ -85,17 +104,3 @@ def _end(viewer: "subprocess.Popen[bytes]") -> None:
         viewer.wait(_CLOSING)
     except subprocess.TimeoutExpired:
         viewer.kill()
-
-
-def _files(path: Path) -> list[Path]:
-    """The recording's files.
-
-    Raises:
-      ConfigError: there are none.
-    """
-    from learner.recording.files import parts
-
-    files = [path] if path.is_file() else parts(path / "run.rrd")
-    if not files:
-        raise ConfigError(f"no recording in {path}: give a run's folder or a .rrd file")
-    return files

@@ -42,10 +42,10 @@ TERM_COLOURS: Final = (YELLOW, BLUE, GREY, ORANGE, VERMILLION)
 TOP_FORCE: Final = 2.0
 """Force on a taxel that is drawn in the brightest colour [N]."""
 
-ARROW: Final = 0.012
+ARROW: Final = 0.006
 """Length of a contact's arrow [m/N]."""
 
-LONGEST: Final = 0.1
+LONGEST: Final = 0.05
 """Arrows are cut here: one hard blow must not fill the scene [m]."""
 
 ENDLESS: Final = 50.0
@@ -54,7 +54,7 @@ ENDLESS: Final = 50.0
 _THIN: Final = 0.001  # [m]
 _SHADES: Final = (1.25, 0.95, 0.65)
 _TAXEL_RADIUS: Final = 0.0014
-_GLASS: Final = 120  # fingertips are see-through: taxels and arrows start where they touch
+_GLASS: Final = 120  # last links are see-through: taxels and arrows start where they touch, and lie inside
 _FELT: Final = ("free", "contact")
 
 
@@ -183,7 +183,8 @@ class Drawing:
         """RGBA of 0 to 255: a fingertip's is its finger's, all else has its own."""
         if geometry in self._tips:
             return [*FINGER_COLOURS[FINGERS[self._tips.index(geometry)]], _GLASS]
-        return [round(255 * value) for value in geometry.colour]
+        own = [round(255 * value) for value in geometry.colour]
+        return [*own[:3], _GLASS] if geometry.body in {tip.body for tip in self._tips} else own
 
     def _touch(self, rollout: Trajectory) -> Iterator[Columns]:
         force, number = rollout.images.sum(axis=-1), np.cumsum(rollout.times == 0.0)

@@ -23,10 +23,13 @@ def program() -> str:
     return os.environ.get("RERUN_CLI_PATH") or str(Path(rerun_cli.__file__).with_name("rerun"))
 
 
-def free_port() -> int:
-    """A port on this machine that nobody uses."""
+def free_port(rather: int = 0) -> int:
+    """A port on this machine that nobody uses: this one if it is free."""
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        try:
+            probe.bind(("127.0.0.1", rather))
+        except OSError:
+            probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 

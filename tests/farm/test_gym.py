@@ -32,9 +32,14 @@ def test_sizes_of_the_hand_are_as_ever():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("steps", "expected"), [(0, 1000), (7, 7), (STEPS_LIMIT, 1000)])
+@pytest.mark.parametrize(("steps", "expected"), [(0, 1000), (7, 7), (1000, 1000)])
 def test_steps_may_shorten_a_rollout(steps, expected):
     assert tasks.sizes(TaskConfig(task="gym:Swimmer-v5", steps=steps)).steps == expected
+
+
+def test_steps_lengthen_no_rollout():
+    with pytest.raises(ConfigError, match="--steps 1001: task gym:Swimmer-v5 ends after 1000"):
+        tasks.sizes(TaskConfig(task="gym:Swimmer-v5", steps=1001))
 
 
 @pytest.mark.parametrize(

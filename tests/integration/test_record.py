@@ -158,7 +158,7 @@ def test_stopped_and_gone_on(farm: Farm, number: signal.Signals) -> None:
     learning = learner(farm, endpoint, 100_000)
     hire(farm, endpoint)
     process = recorder(farm, endpoint, "--serve", str(free_port()))
-    until(process, "live: rerun rerun+http://127.0.0.1:")
+    until(process, "live: farm view rerun+http://127.0.0.1:")
     farm.wait_for(lambda: (farm.folder / FILE).stat().st_size > 50_000)
     process.send_signal(number)
     begun = time.monotonic()

@@ -117,7 +117,7 @@ def test_a_window_needs_a_display(recorded: Farm, monkeypatch: pytest.MonkeyPatc
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     said = recorded.call("view", "runs/r", status=2)
-    assert "no display to open a window on: --web serves a browser, or copy runs/r/run.rrd" in said
+    assert "no display to open a window on: farm view runs/r --web serves a browser, or copy" in said
     assert len(said.splitlines()) == 1
 
 
@@ -172,7 +172,8 @@ def test_the_stream_stays_on_this_machine(farm: Farm) -> None:
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     process.terminate()
     said, _ = process.communicate(timeout=30)
-    assert f"live: rerun rerun+http://127.0.0.1:{port}/proxy" in said
+    assert f"live: farm view rerun+http://127.0.0.1:{port}/proxy   (--web for a browser)" in said
+    assert f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}" in said
     assert listeners(port) == set()
 
 

@@ -2,12 +2,15 @@
 
 import json
 
+import pytest
 from processes import SMALL, Farm
 from rich.console import Console
 
+from farm import codec, keys
 from farm.commands import status
 from farm.local import free_endpoint
 from farm.reports import RunStatus, WorkerStatus
+from farm.session import listen
 
 
 def test_runs_and_workers_are_seen(farm: Farm) -> None:
@@ -20,25 +23,39 @@ def test_runs_and_workers_are_seen(farm: Farm) -> None:
     assert 0 < run["generation"] <= run["generations"] == 100000
     assert len(run["workers"]) == 2
     assert all(worker["rollouts"] > 0 and worker["rate"] > 0 for worker in run["workers"])
-    assert run["ignored"] == {}
+    assert run["ignored"].keys() <= {"stale", "doubled"}, "copies of jobs that took long on a busy machine"
+    assert all(worker["ignored"].keys() <= {"stale"} for worker in run["workers"])
     said = farm.call("status", "--connect", endpoint)
     assert "100000" in said
     assert "workers" in said
 
 
-def test_names_in_brackets_are_shown_as_they_are() -> None:
-    worker = WorkerStatus(
-        worker="w/1", host="[/red]", cores=2, version="[bold]", canary="c", rollouts=1, rate=1.0, seen=0.0
-    )
-    run = RunStatus(
-        run="r", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0,
-        refused=0, ignored={}, workers=(worker,),
-    )  # fmt: skip
-    console = Console(width=200)
+STATUS = RunStatus(
+    run="r", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0, refused=0,
+    ignored={}, workers=(
+        WorkerStatus(
+            worker="w/12345-abcdef", host="[/red]", cores=2, version="[bold]", canary="c", rollouts=1, rate=1.0,
+            seen=0.0, ignored={"stale": 7},
+        ),
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_names_in_brackets_are_shown_as_they_are(width: int) -> None:
+    console = Console(width=width)
     with console.capture() as shown:
-        console.print(status._tables([run]))
-    assert "[/red]" in shown.get()
-    assert "[bold]" in shown.get()
+        console.print(status._tables([STATUS]))
+    for word in ("[/red]", "[bold]", "w/12345-", "rollouts", "stale 7"):
+        assert word in shown.get()
+
+
+def test_learners_of_another_release(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    with listen(endpoint, "farm") as session:
+        session.answer(keys.status("farm", "r"), lambda: codec.encode(STATUS, codec.SCHEMA + 1))
+        said = farm.call("status", "--connect", endpoint, status=1)
+    assert "a learner answers, but what it says cannot be read: schema version 3, this side speaks 2" in said
 
 
 def test_nobody_there(farm: Farm) -> None:

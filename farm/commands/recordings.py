@@ -1,0 +1,60 @@
+"""What several commands say of recordings: how to look on, which files they are, where one may be written."""
+
+import socket
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from farm.errors import ConfigError
+
+_MAGIC: Final = b"RRF"  # what a recording begins with, whichever release of Rerun wrote it
+
+
+def look_on(uri: str) -> list[str]:
+    """How to open a live stream: here, and from elsewhere where it listens on this machine alone."""
+    address = urlsplit(uri)
+    lines = [f"live: farm view {uri}   (--web for a browser)"]
+    if address.hostname in ("127.0.0.1", "::1", "localhost"):
+        tunnel = f"ssh -L {address.port}:127.0.0.1:{address.port} {socket.gethostname()}"
+        lines.append(f"from another machine: {tunnel}, and the same there")
+    return lines
+
+
+def sources(what: str) -> list[str]:
+    """What a viewer opens for a run's folder, a recording, or the address of a live stream.
+
+    Raises:
+      ConfigError: it is none of them.
+    """
+    from learner.recording.files import parts
+
+    if urlsplit(what).scheme in ("rerun", "rerun+http", "rerun+https"):
+        return [what]
+    path = Path(what)
+    if not path.is_file():
+        files = parts(path / "run.rrd")
+        if not files:
+            raise ConfigError(f"no recording in {path}: give a run's folder or a .rrd file")
+        return [str(file) for file in files]
+    try:
+        with path.open("rb") as file:
+            begin = file.read(len(_MAGIC))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    if begin != _MAGIC:
+        raise ConfigError(f"{path} is no recording: give a run's folder or a .rrd file")
+    return [what]
+
+
+def target(path: Path) -> Path:
+    """A file that a recording may be written to.
+
+    Raises:
+      ConfigError: it does not end in .rrd, or is a recording that its run goes on with.
+    """
+    if path.suffix != ".rrd":
+        raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
+    own = path.name == "replay.rrd" or path.name.startswith("run.")
+    if own and (path.parent / "config.json").exists():
+        raise ConfigError(f"--to {path} would replace the run's own recording: take another name")
+    return path
