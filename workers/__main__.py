@@ -11,7 +11,6 @@ from farm import arguments
 from farm.errors import ConfigError, FarmError
 from workers.worker import WorkerConfig, work
 
-
 BROKEN = 70
 """Exit status after an error of the software itself, as sysexits.h has it: whoever started this may start another."""
 

@@ -10,7 +10,7 @@ import pytest
 from farm import gym, tasks
 from farm.errors import ConfigError
 from farm.scene import Scene
-from farm.tasks.finger_gait import STEPS_LIMIT, TaskConfig
+from farm.tasks.finger_gait import TaskConfig
 
 
 def test_sizes_are_the_environments():

@@ -35,9 +35,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check:
-    """Every pair once, the same hash, and no longer a standstill than allowed [s]."""
+    """Every pair once, the same hash, no longer a standstill than allowed [s]; and signs that there was a fault.
 
-    def done(what: str, allowed: float, away: float = 0.0) -> None:
+    Those are a least standstill [s], jobs given out again, or a word in the run's log.
+    """
+
+    def done(
+        what: str, allowed: float, away: float = 0.0, *, least: float = 0.0, reissued: int = 0, said: str = ""
+    ) -> None:
         lines = farm.progress("r")
         assert [line["generation"] for line in lines] == list(range(1, GENERATIONS + 1))
         assert [line["rollouts"] for line in lines] == [12 * g for g in range(1, GENERATIONS + 1)]
@@ -48,7 +53,9 @@ def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check
         if path:
             with Path(path).open("a") as file:
                 file.write(f"| {what} | {lines[-1]['reissued']} | {still:.1f} | {allowed:g} |\n")
-        assert still <= allowed
+        assert least <= still <= allowed
+        assert lines[-1]["reissued"] >= reissued
+        assert said in (farm.folder / "runs/r/log.txt").read_text()
 
     return done
 
@@ -61,6 +68,7 @@ def finish(process: "subprocess.Popen[str]") -> None:
 def resume(farm: Farm, *flags: str) -> float:
     """Start a killed learner again and see it finish; how long until its first generation [s]."""
     done, begun = len(farm.progress("r")), time.monotonic()
+    assert done < GENERATIONS
     learner = farm.start("learner", "--resume", "runs/r", "--no-record", *flags)
     farm.wait_for(lambda: len(farm.progress("r")) > done)
     away = time.monotonic() - begun
@@ -87,7 +95,7 @@ def test_a_worker_killed(farm: Farm, check: Check) -> None:
     running(farm)
     os.kill(children(workers.pid)[0], signal.SIGKILL)
     finish(learner)
-    check("worker killed", 5)
+    check("worker killed", 5, said=" left")
 
 
 def test_a_worker_frozen_and_thawed(farm: Farm, check: Check) -> None:
@@ -98,7 +106,7 @@ def test_a_worker_frozen_and_thawed(farm: Farm, check: Check) -> None:
     farm.wait_for(lambda: len(farm.progress("r")) >= 40)
     os.kill(frozen, signal.SIGCONT)
     finish(learner)
-    check("worker stopped (SIGSTOP), later continued", 10)
+    check("worker stopped (SIGSTOP), later continued", 10, least=0.9, reissued=1)
 
 
 def test_a_worker_slow_by_a_hundred_times(farm: Farm, check: Check) -> None:
@@ -121,7 +129,7 @@ def test_a_worker_slow_by_a_hundred_times(farm: Farm, check: Check) -> None:
         over.set()
         thread.join()
         os.kill(slow, signal.SIGCONT)
-    check("worker slow by 100 times", 15)
+    check("worker slow by 100 times", 15, least=0.9, reissued=1)
 
 
 def test_a_learner_killed_and_back_at_another_address(farm: Farm, check: Check) -> None:
@@ -131,6 +139,7 @@ def test_a_learner_killed_and_back_at_another_address(farm: Farm, check: Check) 
     running(farm)
     learner.kill()
     learner.communicate(timeout=10)
+    assert learner.returncode == -signal.SIGKILL
     away = resume(farm, "--listen", second)
     check("learner killed, back at a second --connect", 15, away)
 
@@ -143,6 +152,7 @@ def test_a_learner_behind_a_router_killed_and_back(farm: Farm, check: Check) -> 
     running(farm)
     learner.kill()
     learner.communicate(timeout=10)
+    assert learner.returncode == -signal.SIGKILL
     away = resume(farm, "--connect", endpoint)
     check("learner behind a router killed and back", 15, away)
 
@@ -167,7 +177,7 @@ def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:
     router.communicate(timeout=10)
     farm.start("router", "--listen", endpoint)
     finish(learner)
-    check("router killed and back", 15)
+    check("router killed and back", 15, said=" left")
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["dialled", "dialling"])
@@ -182,7 +192,7 @@ def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: 
     routers[which].communicate(timeout=10)
     farm.start_router(*flags[which])
     finish(learner)
-    check(f"router of two sites killed and back ({('dialled', 'dialling')[which]})", 15)
+    check(f"router of two sites killed and back ({('dialled', 'dialling')[which]})", 15, said=" left")
 
 
 def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:
@@ -205,6 +215,10 @@ def test_clocks_that_jump(farm: Farm, check: Check) -> None:
     os.environ |= {"LD_PRELOAD": str(library), "FAKETIME_TIMESTAMP_FILE": str(clock), "FAKETIME_NO_CACHE": "1"}
     os.environ["FAKETIME_DONT_FAKE_MONOTONIC"] = "1"
     try:
+        clock.write_text("+3600\n")
+        shown = farm.start_python("-c", "import time; print(time.time())").communicate(timeout=30)[0]
+        assert float(shown) - time.time() > 3000, "the clock does not jump"
+        clock.write_text("+0\n")
         learner, _ = start(farm)
     finally:
         for name in ("LD_PRELOAD", "FAKETIME_TIMESTAMP_FILE", "FAKETIME_NO_CACHE", "FAKETIME_DONT_FAKE_MONOTONIC"):
@@ -233,7 +247,7 @@ def test_a_link_that_is_cut(farm: Farm, check: Check, seconds: int) -> None:
         threading.Event().wait(seconds)  # the fault itself lasts so long
         network.heal(1)
         finish(learner)
-    check(f"link cut for {seconds} s", seconds + 15)
+    check(f"link cut for {seconds} s", seconds + 15, least=0.8 * seconds)
 
 
 def test_a_link_that_loses_and_delays(farm: Farm, check: Check) -> None:
