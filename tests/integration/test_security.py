@@ -112,6 +112,42 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
 
 
+def test_a_worker_cannot_pose_as_a_learner(
+    farm: Farm, certs: Path, place: tuple[str, list[str]], reference: dict[str, object]
+) -> None:
+    endpoint, learner_flags = place
+    own, lie, mine = certs / "own", b"a lie", keys.want("farm", "w2/1")
+    learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
+    farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
+    with intruder(endpoint, find(own, "worker", "w2")) as w2, intruder(endpoint, find(own, "learner")) as witness:
+        witness.subscribe("heard", "farm/**")
+        witness.watch("token", "farm/live/**")
+        w2.token(keys.learner_token("farm", "fake"))
+        w2.token(keys.worker_token("farm", "w1/fake"))
+        w2.answer(keys.spec("farm", "r"), lambda: lie)
+        for key in (
+            keys.generation("farm", "r"), keys.generation("farm", "*"), keys.report("farm", "r"),
+            keys.history("farm", "r"), keys.inbox("farm", "w1/1"), keys.inbox("farm", "**"),
+            keys.refused("farm", "w1/1"), keys.refused("farm", "**"), keys.want("farm", "**"),
+            keys.want("farm", "w1/1"), keys.result("farm", "r", "**"), keys.result("farm", "r", "w1/1"), "farm/**",
+            "**",
+        ):  # fmt: skip
+            w2.publish(key, lie)
+        w2.publish(mine, lie)  # this one may, and comes after all others
+        heard = []
+        while mine not in heard:
+            event = witness.events.get(timeout=20)
+            heard.append(event.key)
+        assert [key for key in heard if "live" not in key] == [mine]
+        assert not [key for key in heard if "fake" in key]
+        worker = farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "1")
+        said, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, said
+    worker.terminate()
+    assert "ignored" not in worker.communicate(timeout=20)[0]
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
 def test_a_viewer_records_and_a_worker_cannot_look(farm: Farm, certs: Path, place: tuple[str, list[str]]) -> None:
     endpoint, learner_flags = place
     own = certs / "own"
