@@ -42,10 +42,10 @@ TERM_COLOURS: Final = (YELLOW, BLUE, GREY, ORANGE, VERMILLION)
 TOP_FORCE: Final = 2.0
 """Force on a taxel that is drawn in the brightest colour [N]."""
 
-ARROW: Final = 0.006
+ARROW: Final = 0.009
 """Length of a contact's arrow [m/N]."""
 
-LONGEST: Final = 0.05
+LONGEST: Final = 0.075
 """Arrows are cut here: one hard blow must not fill the scene [m]."""
 
 ENDLESS: Final = 50.0
@@ -55,6 +55,7 @@ _THIN: Final = 0.001  # [m]
 _SHADES: Final = (1.25, 0.95, 0.65)
 _TAXEL_RADIUS: Final = 0.0014
 _GLASS: Final = 120  # last links are see-through: taxels and arrows start where they touch, and lie inside
+_PUSH: Final = (255, 255, 255)  # its finger's colour would not be seen inside the finger
 _FELT: Final = ("free", "contact")
 
 
@@ -204,12 +205,12 @@ class Drawing:
         """What pushes each finger that touches: from the centre of force into the finger."""
         origins, vectors = self.contacts(rollout.bodies, rollout.points, force)
         touching = force > 0
-        colours = np.broadcast_to(np.array([pack(c) for c in FINGER_COLOURS.values()], np.uint32), force.shape)
+        count = int(touching.sum())
         columns = rr.Arrows3D.columns(
             origins=origins[touching],
             vectors=vectors[touching],
-            colors=colours[touching],
-            radii=np.full(int(touching.sum()), 0.0016),
+            colors=np.full(count, pack(_PUSH), np.uint32),
+            radii=np.full(count, 0.002),
         )
         return columns.partition(touching.sum(axis=1))
 
