@@ -208,8 +208,7 @@ class Dispatcher:
 
     def _refuse(self, worker: str, reason: str) -> None:
         """Tell both sides; the worker every time it asks, or it may never hear it."""
-        if worker not in self._refused:
-            log.warning("worker %s is refused: %s", worker, reason)
+        self._warn(f"worker {worker} is refused: {reason}")
         if len(self._refused) < _REFUSED:
             self._refused[worker] = reason
         message = codec.encode(Refusal(run=self.run, reason=reason))
