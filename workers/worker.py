@@ -231,17 +231,23 @@ class Worker:
         return self._runs.setdefault(run, _Served())
 
     def _make_room(self, message: Generation | Chunk) -> None:
-        """See that there is memory for it.
+        """See that there is memory for it: what was kept longest for other runs goes, and is asked for again.
 
         Raises:
-          MessageError: with what is kept it would be more than anybody honest sends.
+          MessageError: with what its own run keeps it is more than anybody honest sends.
         """
-        kept = [message]
-        for run in self._runs.values():
-            kept += [run.header] if run.header else []
-            kept += run.chunks
-        if sum(_bytes(one) for one in kept) > _MEMORY:
-            raise MessageError(f"what runs want kept is more than {_MEMORY >> 20} MiB", "large")
+        sizes = {
+            name: sum(map(_bytes, [*run.chunks, *([run.header] if run.header else [])]))
+            for name, run in self._runs.items()
+        }
+        total = sum(sizes.values()) + _bytes(message)
+        for name, run in self._runs.items():
+            if total > _MEMORY and name != message.run:
+                total -= sizes[name]
+                run.header = None
+                run.chunks.clear()
+        if total > _MEMORY:
+            raise MessageError(f"run {message.run} wants more than {_MEMORY >> 20} MiB kept", "large")
 
     def _next(self) -> Chunk | None:
         """A chunk of the run that has waited longest."""

@@ -401,12 +401,19 @@ def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(workers, "_MEMORY", 10_000)
     learner = Learner(stage.session, "r")
     worker = stage.hire()
-    for i in range(20):
-        header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200))
+    learner.announce()
+    for i in range(20):  # together three times as much, and each of the last ones too much by itself
+        header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200 if i < 6 else 2000))
         stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
-    learner.send(worker.id, 1)
-    assert indices(stage.results()) == [1]
     until(lambda: worker._ignored["large"] == 14)
+    for i in range(20):
+        header = replace(learner.header, run=f"another-{i}", mu=np.ones(200))
+        stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
+    until(lambda: "another-19" in worker._runs)
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1], "what was crowded out is asked for again"
+    kept = [run.header for run in worker._runs.values() if run.header]
+    assert sum(header.mu.nbytes for header in kept) <= 10_000
     monkeypatch.setattr(workers, "IDLE", 0.0)
     while True:
         _, want = stage.next("want")
