@@ -2,38 +2,42 @@
 
     python benchmarks/scaling.py [--workers 1,4,16,64,256,1000] [--pair 0.02] [--seconds 12]
 
-A worker is the farm's own `Worker` on a session of its own, whose backend sleeps instead of
-simulating. A learner process learns from made-up returns. All share this machine, so the emulation
-takes processor time that a real farm's learner would not have to share; the table has both. Beyond 64
-workers a pair takes longer, so that there are not more pairs a second than at 64: what is measured
-is then what so many workers cost, not so many rollouts.
+A worker is the farm's own `Worker` on a session of its own; instead of simulating it makes returns up, and what
+it has to say waits until simulating would be over. A learner process learns from them. All share this machine, so
+the emulation takes processor time that a real farm's learner would not have to share; the table has both. Beyond 64
+workers a pair takes longer, so that there are not more pairs a second than at 64: what is measured is then what so
+many workers cost, not so many rollouts.
 """
 
 import argparse
+import heapq
+import itertools
 import json
 import os
 import platform
+import queue
 import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from farm import session
+from farm import codec, keys, session
 from farm.arrays import FloatArray
 from farm.commands.status import ask
-from farm.jobs import Job
+from farm.events import Event, Events
+from farm.jobs import Chunk, Job
 from farm.local import free_endpoint
 from farm.messages import Spec
-from farm.results import Result, WireTrajectory
+from farm.results import Failure, Result, Results, WireTrajectory
 from farm.scene import load
 from workers.backends import BACKENDS
 from workers.worker import Worker, WorkerConfig
@@ -42,34 +46,22 @@ TOGETHER = 32  # emulated workers a process
 MOST = 3200  # pairs a second that are tried
 PAIRS = 1000  # a generation; beyond 64 workers as many a worker as there
 PARAMETERS = 64
+LOOK = 0.2  # [s] between two looks at whether a worker has nothing to do
 
 
-class Sleeper:
-    """A backend that takes its time for every job and makes its returns up."""
+class MadeUp:
+    """A backend whose returns are made up, at once."""
 
     capacity: ClassVar[int] = 64
-    pair: ClassVar[float] = 0.02
 
     def __init__(self, spec: Spec) -> None:
         """Know the shapes that a learner expects."""
         self.steps, self.bodies = spec.task_config["steps"], len(load(spec.task_config["object"]).bodies)
         self.parameters = PARAMETERS
-        self._mu: FloatArray | None = None
-        self._until = 0.0
 
-    def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
-        """Make results up, and sleep for what is left of the time that simulating would take.
-
-        A round's further chunks begin where the one before ended: they lie ready, and what a dozen emulated workers
-        on one core take to send their results must not delay them. Making up is done halfway, when the learner, whose
-        cores these are, has least to do.
-        """
-        begin = self._until if mu is self._mu else time.monotonic()
-        self._mu, self._until = mu, begin + self.pair * sum(len(job.signs) for job in jobs) / 2
-        time.sleep(max(0.0, self._until - time.monotonic()) / 2)
-        results = [self._result(job) for job in jobs]
-        time.sleep(max(0.0, self._until - time.monotonic()))
-        return results
+    def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:  # noqa: ARG002  as all backends
+        """Make results up."""
+        return [self._result(job) for job in jobs]
 
     def close(self) -> None:
         """Nothing to give back."""
@@ -81,7 +73,7 @@ class Sleeper:
             index=job.index,
             trajectory=None if job.rate == "none" else self._trajectory(frames),
             returns=np.array([sign * job.eps.sum() if job.eps.size else 0.0 for sign in job.signs]),
-            success=no, steps=np.full(count, self.steps), dropped=no, failed=no, clamped=no,
+            success=no, dropped=no, failed=no, clamped=no,
             traces=np.zeros((count, self.steps, 54), "<f4"),
         )  # fmt: skip
 
@@ -89,6 +81,82 @@ class Sleeper:
         shapes = {"bodies": (self.bodies, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3)}
         arrays = {name: np.zeros((frames + 1, *shape), "<f4") for name, shape in {**shapes, "terms": (5,)}.items()}
         return WireTrajectory(value=0.0, success=False, times=np.arange(frames + 1) * 0.1, **arrays)
+
+
+class Emulated(Worker):
+    """A worker that answers when one with a core of its own would have.
+
+    A pair takes it so long, and what it does besides as long as it takes the processor: that dozens of workers wait for
+    each other on one core is not theirs.
+    """
+
+    pair: ClassVar[float] = 0.02
+
+    def __init__(self, config: WorkerConfig, link: session.Session, agenda: "Agenda") -> None:
+        """Work as the agenda says."""
+        super().__init__(config, link)
+        link.events = Noted(lambda: agenda.came.put((time.monotonic(), self)))
+        self._agenda, self._until = agenda, 0.0
+        self._arrived = self._cpu = 0.0
+
+    def turn_at(self, arrived: float) -> None:
+        """One turn, because something came then [s]."""
+        self._arrived, self._cpu = arrived, time.thread_time()
+        self.turn()
+
+    def _events(self) -> list[Event]:
+        return sorted(self._session.events.waiting(0.0), key=lambda event: event.topic == "inbox")
+
+    def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
+        key, payload = keys.result(self._config.farm, chunk.run, self.id), codec.encode(message)
+        took = self.pair * chunk.rollouts.sum() / 2 + time.thread_time() - self._cpu
+        self._until = max(self._until, self._arrived) + took
+        self._agenda.add(self._until, lambda: self._session.publish(key, payload))
+
+
+class Noted(Events):
+    """Events that somebody is told of; not of a round's mean, which is of use with jobs alone."""
+
+    def __init__(self, tell: Callable[[], None]) -> None:
+        """Know how to tell."""
+        super().__init__()
+        self._tell = tell
+
+    def put(self, event: Event) -> None:
+        """Append, and tell."""
+        super().put(event)
+        if event.topic != "generation":
+            self._tell()
+
+
+class Agenda:
+    """What a process full of workers has to do: on one thread, as dozens would fight for the interpreter."""
+
+    def __init__(self) -> None:
+        self.came: queue.SimpleQueue[tuple[float, Emulated]] = queue.SimpleQueue()
+        """For whom something came, and when [s]"""
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = itertools.count()  # of equals the first
+
+    def add(self, at: float, send: Callable[[], None]) -> None:
+        """Have something sent then [s]."""
+        heapq.heappush(self._due, (at, next(self._number), send))
+
+    def follow(self, workers: Sequence[Emulated], over: threading.Event) -> None:
+        """Let them work."""
+        look = 0.0
+        while not over.is_set():
+            now = time.monotonic()
+            while self._due and self._due[0][0] <= now:
+                heapq.heappop(self._due)[2]()
+            if now >= look:
+                look = now + LOOK
+                for worker in workers:
+                    worker.turn_at(now)
+            next_due = self._due[0][0] if self._due else look
+            with suppress(queue.Empty):
+                arrived, worker = self.came.get(timeout=max(1e-6, min(look, next_due) - time.monotonic()))
+                worker.turn_at(arrived)
 
 
 @dataclass
@@ -167,23 +235,20 @@ def _measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
     """A process full of workers, until its standard input closes."""
-    Sleeper.pair, over = pair, threading.Event()
-    BACKENDS["sleeper"] = Sleeper
+    Emulated.pair, over, agenda = pair, threading.Event(), Agenda()
+    BACKENDS["made-up"] = MadeUp
     with ExitStack() as stack:
+        emulated: list[Emulated] = []
         for i in range(workers):
-            config = WorkerConfig(connect=(endpoint,), name=f"e{i}", backend="sleeper")
+            config = WorkerConfig(connect=(endpoint,), name=f"e{i}", backend="made-up")
             link = stack.enter_context(session.connect(config.connect, None, over.is_set))
-            thread = threading.Thread(target=_work, args=(Worker(config, link), over))
-            stack.callback(thread.join)
-            thread.start()
+            emulated.append(Emulated(config, link, agenda))
+            emulated[-1].join()
+        thread = threading.Thread(target=agenda.follow, args=(emulated, over))
+        stack.callback(thread.join)
+        thread.start()
         sys.stdin.read()
         over.set()
-
-
-def _work(worker: Worker, over: threading.Event) -> None:
-    worker.join()
-    while not over.is_set():
-        worker.turn()
 
 
 @contextmanager

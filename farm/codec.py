@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Version of everything on the wire; stands in every message."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -85,7 +85,12 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None) -> M:
 
 
 def _plain(value: Any) -> dict[str, Any]:  # noqa: ANN401
-    return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return {name: getattr(value, name) for name in _names(type(value))}
+
+
+@functools.cache
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 def _pack(value: object) -> object:

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray, IntArray, within
+from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.codec import array
 
 RATES: Final = ("none", "control", "physics")
@@ -70,36 +71,26 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Jobs:
-    """Jobs as one array of each kind over all of them: a map or an object for each would take ten times as long."""
+    """Jobs as one table: a map or an object for each would take ten times as long to send and to read."""
 
-    jobs: IntArray = array("<i8", 1)
-    """Indices, (J,)"""
-    around: BoolArray = array("|b1", 1)
-    """Whether the origin is the generation's mean, (J,)"""
-    signs: IntArray = array("<i8", 2)
-    """(J, 2), the second 0 for a single rollout"""
-    seeds: IntArray = array("<i8", 2)
-    """Of the perturbations, (J, 4), -1 for nominal conditions"""
-    rates: IntArray = array("<i8", 1)
-    """Positions in RATES, (J,)"""
-    explores: BoolArray = array("|b1", 1)
-    """Which jobs have eps, (J,)"""
+    table: IntArray = array("<i8", 2)
+    """(J, 10): index; whether the origin is the mean of the generation; whether there are eps; place of the rate in RATES;
+    two signs, the second 0 for a single rollout; four words of the perturbation's seed, -1 for nominal conditions"""
     eps: FloatArray = array("<f8", 2)
-    """Of those that have, one after the other (K, P)"""
+    """Of those jobs that have some, one after the other (K, P)"""
 
     @staticmethod
     def of(jobs: Sequence[Job]) -> "Jobs":
         """At least one job."""
         eps = [job.eps for job in jobs if job.eps.size]
-        return Jobs(
-            jobs=np.array([job.index for job in jobs]),
-            around=np.array([job.origin == "mu" for job in jobs]),
-            signs=np.array([(*job.signs, 0)[:2] for job in jobs]),
-            seeds=np.array([_NOMINAL if job.perturbation is None else job.perturbation for job in jobs]),
-            rates=np.array([RATES.index(job.rate) for job in jobs]),
-            explores=np.array([job.eps.size > 0 for job in jobs]),
-            eps=np.stack(eps) if eps else np.empty((0, 0)),
-        )
+        rows = [
+            (
+                job.index, job.origin == "mu", job.eps.size > 0, RATES.index(job.rate), *(*job.signs, 0)[:2],
+                *(_NOMINAL if job.perturbation is None else job.perturbation),
+            )
+            for job in jobs
+        ]  # fmt: skip
+        return Jobs(table=np.array(rows, dtype="<i8"), eps=np.stack(eps) if eps else np.empty((0, 0)))
 
     @staticmethod
     def exploring(
@@ -114,51 +105,62 @@ class Jobs:
           then: what comes behind them, with the indices from N on.
         """
         count, others = len(eps), Jobs.of(then)
-        every = np.ones(count, dtype=bool)
+        table = np.empty((count, _COLUMNS), dtype="<i8")
+        table[:] = (0, True, True, RATES.index("none"), *(*signs, 0)[:2], *_NOMINAL)
+        table[:, _INDEX] = np.arange(count)
+        if seeds is not None:
+            table[:, _SEED] = seeds
         return Jobs(
-            jobs=np.append(np.arange(count), others.jobs),
-            around=np.append(every, others.around),
-            signs=np.concatenate([np.tile((*signs, 0)[:2], (count, 1)), others.signs]),
-            seeds=np.concatenate([np.tile(_NOMINAL, (count, 1)) if seeds is None else np.array(seeds), others.seeds]),
-            rates=np.append(np.full(count, RATES.index("none")), others.rates),
-            explores=np.append(every, others.explores),
+            table=np.concatenate([table, others.table]),
             eps=np.concatenate([eps, others.eps]) if others.eps.size else eps,
         )
 
     def __len__(self) -> int:
         """How many."""
-        return len(self.jobs)
+        return len(self.table)
+
+    @property
+    def indices(self) -> IntArray:
+        """Of each job, (J,)."""
+        return self.table[:, _INDEX]
+
+    @property
+    def rollouts(self) -> IntArray:
+        """How many each job has, (J,)."""
+        return np.count_nonzero(self.table[:, _SIGN], axis=1)
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which jobs want a trajectory, (J,)."""
+        return self.table[:, _RATE] != RATES.index("none")
 
     def take(self, chosen: Sequence[int]) -> "Jobs":
         """Some of these jobs, by their places here; views where they stand side by side."""
-        if list(chosen) == list(range(chosen[0], chosen[-1] + 1)):
-            at: IntArray | slice = slice(chosen[0], chosen[-1] + 1)
-            explores, before = self.explores[at], np.count_nonzero(self.explores[: chosen[0]])
-            rows: IntArray | slice = slice(before, before + np.count_nonzero(explores))
-        else:
-            at = np.array(chosen)
-            explores = self.explores[at]
-            rows = (np.cumsum(self.explores) - 1)[at[explores]]
-        return Jobs(
-            jobs=self.jobs[at], around=self.around[at], signs=self.signs[at], seeds=self.seeds[at],
-            rates=self.rates[at], explores=explores, eps=self.eps[rows],
-        )  # fmt: skip
+        first, end = chosen[0], chosen[-1] + 1
+        if list(chosen) == list(range(first, end)):
+            return Jobs(table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]])
+        table, before = self.table[list(chosen)], np.array(self._before)[list(chosen)]
+        return Jobs(table=table, eps=self.eps[before[table[:, _EXPLORES] != 0]])
 
     def split(self) -> list[Job]:
         """Job by job again; the arrays are views."""
-        eps, around, explores = iter(self.eps), self.around.tolist(), self.explores.tolist()
-        signs, seeds, rates = self.signs.tolist(), self.seeds.tolist(), self.rates.tolist()
+        rows = iter(self.eps)
         return [
             Job(
                 index=index,
-                origin="mu" if around[i] else "zero",
-                signs=tuple(sign for sign in signs[i] if sign),
-                perturbation=None if seeds[i][0] < 0 else tuple(seeds[i]),
-                rate=RATES[rates[i]],
-                eps=next(eps) if explores[i] else _NO_EPS,
+                origin="mu" if around else "zero",
+                signs=(first, second) if second else (first,),
+                perturbation=None if seed[0] < 0 else tuple(seed),
+                rate=RATES[rate],
+                eps=next(rows) if explores else _NO_EPS,
             )
-            for i, index in enumerate(self.jobs.tolist())
+            for index, around, explores, rate, first, second, *seed in self.table.tolist()
         ]
+
+    @cached_property
+    def _before(self) -> list[int]:
+        """How many rows of eps stand before each job's, and how many there are, J + 1."""
+        return [0, *np.cumsum(self.table[:, _EXPLORES]).tolist()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,30 +172,33 @@ class Chunk(Jobs):
     round: int
 
     def __post_init__(self) -> None:
-        """Check that all speak of as many jobs, and of such that there are."""
-        count = len(self.jobs)
-        if not count or len(set(self.jobs.tolist())) < count:
-            raise ValueError("no jobs, or one of them twice")
-        if self.signs.shape != (count, 2) or self.seeds.shape != (count, 4):
-            raise ValueError(f"signs of shape {self.signs.shape}, seeds of shape {self.seeds.shape} of {count} jobs")
-        if not len(self.around) == len(self.rates) == len(self.explores) == count:
-            raise ValueError("arrays over different jobs")
-        if len(self.eps) != np.count_nonzero(self.explores):
-            raise ValueError(f"{len(self.eps)} rows of eps of {np.count_nonzero(self.explores)} jobs")
-        if not within(self.jobs, 0, 2**31) or not within(self.rates, 0, len(RATES)):
-            raise ValueError("indices or rates out of range")
-        if not within(self.signs, -1, 2) or np.count_nonzero(self.signs[:, 0]) < count:
-            raise ValueError("signs other than 1 and -1")
-        if not within(self.seeds, 0, 2**32):  # then some jobs' conditions are nominal
-            nominal = (self.seeds == -1).all(axis=1)
-            if not within(self.seeds[~nominal], 0, 2**32):
-                raise ValueError("seeds out of range")
+        """Check that there are such jobs."""
+        if not self.table.size or self.table.shape[1] != _COLUMNS:
+            raise ValueError(f"jobs in a table of shape {self.table.shape}")
+        columns = list(zip(*self.table.tolist(), strict=True))
+        for name, column, (least, most) in zip(_NAMES, columns, _BOUNDS, strict=True):
+            if min(column) < least or max(column) > most:
+                raise ValueError(f"{name} out of range")
+        if len(set(columns[_INDEX])) < len(self):
+            raise ValueError("a job twice")
+        if 0 in columns[_FIRST]:
+            raise ValueError("jobs without rollouts")
+        seeds = self.table[:, _SEED]
+        if min(columns[-1]) < 0 and ((seeds < 0).any(axis=1) != (seeds < 0).all(axis=1)).any():
+            raise ValueError("half a seed")
+        if len(self.eps) != sum(columns[_EXPLORES]):
+            raise ValueError(f"{len(self.eps)} rows of eps of {sum(columns[_EXPLORES])} jobs")
 
     @classmethod
     def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
         """At least one job, ready to send."""
-        return cls(run=run, incarnation=incarnation, round=round, **vars(jobs))
+        return cls(run=run, incarnation=incarnation, round=round, table=jobs.table, eps=jobs.eps)
 
+
+_COLUMNS: Final = 10
+_INDEX, _EXPLORES, _RATE, _FIRST, _SIGN, _SEED = 0, 2, 3, 4, slice(4, 6), slice(6, 10)
+_NAMES: Final = ("index", "origin", "eps", "rate", "sign", "sign", "seed", "seed", "seed", "seed")
+_BOUNDS: Final = ((0, 2**31 - 1), (0, 1), (0, 1), (0, len(RATES) - 1), *[(-1, 1)] * 2, *[(-1, 2**32 - 1)] * 4)
 
 _SIGNS: Final = ((1, -1), (1,), (-1,), (-1, 1), (1, 1), (-1, -1))
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, within
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.codec import array
 from farm.trajectory import Trajectory
 
@@ -23,8 +23,6 @@ class Result:
     """(R,)"""
     success: BoolArray
     """(R,)"""
-    steps: IntArray
-    """Control steps until the end, (R,)"""
     dropped: BoolArray
     """(R,)"""
     failed: BoolArray
@@ -39,7 +37,8 @@ class Result:
 class Results:
     """What a chunk gave, worker to learner: one array of each kind over the rollouts of all its jobs.
 
-    A map for each job would take the learner ten times as long to read.
+    How many rollouts a job has, and which have a trajectory or a trace, whoever gave the jobs knows (`traced`). A map
+    for each job would take the learner ten times as long to read.
     """
 
     run: str
@@ -50,35 +49,20 @@ class Results:
     """Of the jobs that are seen, in their order."""
     jobs: IntArray = array("<i8", 1)
     """Indices, rising (J,)"""
-    rollouts: IntArray = array("<i8", 1)
-    """Of each job, (J,), S in all"""
-    seen: BoolArray = array("|b1", 1)
-    """Which jobs have a trajectory, (J,)"""
     returns: FloatArray = array("<f8", 1)
-    """(S,)"""
-    steps: IntArray = array("<i8", 1)
     """(S,)"""
     flags: BoolArray = array("|b1", 2)
     """success, dropped, failed, clamped, (S, 4)"""
-    traced: IntArray = array("<i8", 1)
-    """Which rollouts have a trace here, rising (K,)"""
     traces: AnyArray = array("<f4", 3)
-    """(K, T, 54)"""
+    """Tactile traces [N] that are wanted, (K, T, 54)"""
 
     def __post_init__(self) -> None:
-        """Check that all speak of as many jobs and rollouts."""
-        if not len(self.jobs) == len(self.rollouts) == len(self.seen) >= 1:
-            raise ValueError("no jobs, or arrays over different ones")
-        if not _rising(self.jobs) or not within(self.rollouts, 1, 3):
-            raise ValueError("jobs that do not rise, or of other than one or two rollouts")
-        count = self.rollouts.sum()
-        if not len(self.returns) == len(self.steps) == count or self.flags.shape != (count, 4):
-            raise ValueError("arrays over different rollouts")
-        rising = within(self.traced, 0, count) and _rising(self.traced)
-        if len(self.traced) != len(self.traces) or not rising:
-            raise ValueError(f"{len(self.traces)} traces of {len(self.traced)} rollouts, which do not rise")
-        if len(self.trajectories) != np.count_nonzero(self.seen):
-            raise ValueError(f"{len(self.trajectories)} trajectories of {np.count_nonzero(self.seen)} jobs")
+        """Check that all speak of as many rollouts."""
+        jobs = self.jobs.tolist()
+        if not jobs or jobs != sorted(set(jobs)):
+            raise ValueError("no jobs, or such that do not rise")
+        if self.flags.shape != (len(self.returns), 4):
+            raise ValueError(f"flags of shape {self.flags.shape} of {len(self.returns)} rollouts")
 
     @classmethod
     def of(
@@ -87,40 +71,33 @@ class Results:
         """Make at least one result ready to send, with those of its traces that are wanted, one of TRACES."""
         results = sorted(results, key=lambda result: result.index)
         returns = np.concatenate([r.returns for r in results])
-        seen = np.array([r.trajectory is not None for r in results])
-        rollouts = np.array([len(r.returns) for r in results])
-        felt = traced(traces, returns, rollouts, seen)
+        exploring = np.repeat([r.trajectory is None for r in results], [len(r.returns) for r in results])
         flags = [(r.success, r.dropped, r.failed, r.clamped) for r in results]
         return cls(
             run=run, incarnation=incarnation, round=round, worker=worker,
             trajectories=tuple(r.trajectory for r in results if r.trajectory),
             jobs=np.array([r.index for r in results]),
-            rollouts=rollouts,
-            seen=seen,
             returns=returns,
-            steps=np.concatenate([r.steps for r in results]),
             flags=np.concatenate(flags, axis=1).T,
-            traced=felt,
-            traces=np.concatenate([r.traces for r in results])[felt],
+            traces=np.concatenate([r.traces for r in results])[traced(traces, returns, exploring)],
         )  # fmt: skip
 
 
-def traced(traces: str, returns: FloatArray, rollouts: IntArray, seen: BoolArray) -> IntArray:
+def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
     """Which rollouts of a message have a trace, rising (K,).
 
     Args:
       traces: one of TRACES.
       returns: (S,).
-      rollouts: of each job, (J,), S in all.
-      seen: which jobs have a trajectory and so do not explore, (J,).
+      exploring: which are of jobs that have no trajectory and so explore, (S,).
     """
-    exploring = np.flatnonzero(~np.repeat(seen, rollouts))
+    among = np.flatnonzero(exploring)
     if traces == "all":
-        return exploring
-    if traces == "none" or not exploring.size:
-        return exploring[:0]
-    theirs = returns[exploring]
-    return exploring[sorted({int(theirs.argmax()), int(theirs.argmin())})]
+        return among
+    if traces == "none" or not among.size:
+        return among[:0]
+    theirs = returns[among]
+    return among[sorted({int(theirs.argmax()), int(theirs.argmin())})]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,8 +166,3 @@ class WireTrajectory:
             value=self.value,
             success=self.success,
         )
-
-
-def _rising(values: IntArray) -> bool:
-    listed = values.tolist()
-    return listed == sorted(set(listed))

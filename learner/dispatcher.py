@@ -266,12 +266,13 @@ class Dispatcher:
 
     def _count(self, message: Results) -> None:
         assert self._round is not None
-        if not self._round.fits(message):
+        place = self._round.place(message)
+        if place is None:
             self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
             return
         verdicts = self._ledger.results(message.worker, message.jobs.tolist(), time.monotonic())
         new = np.array([verdict == "new" for verdict in verdicts])
-        self._round.put(message, new)
+        self._round.put(message, place, new)
         if new.any():
             self.admission.counted()
         self.ignored.update(verdict for verdict in verdicts if verdict != "new")

@@ -1,11 +1,12 @@
 """A round's jobs, and what came of them: one array of each kind over all rollouts, in the jobs' order. Pure."""
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.jobs import RATES, Jobs
+from farm.jobs import Jobs
 from farm.results import Result, Results, WireTrajectory, traced
 
 
@@ -22,16 +23,13 @@ class Round:
           shapes: of a trajectory's frames.
         """
         self.jobs, self._traces, self._trace, self._shapes = jobs, traces, trace, shapes
-        self._rollouts = np.count_nonzero(jobs.signs, axis=1)
-        self._ends = np.cumsum(self._rollouts)
-        self._starts = self._ends - self._rollouts
-        self._seen = jobs.rates != RATES.index("none")
+        self._rollouts, self._seen = jobs.rollouts, jobs.seen
+        self._exploring = np.repeat(~self._seen, self._rollouts)
+        self._starts = [0, *np.cumsum(self._rollouts).tolist()]  # of each job's rows, and the end
         self._trajectories: dict[int, WireTrajectory] = {}
-        count = int(self._rollouts.sum())
+        count = len(self._exploring)
         self.returns: FloatArray = np.zeros(count)
         """(S,)"""
-        self.steps = np.zeros(count, dtype="<i8")
-        """Control steps until the end, (S,)"""
         self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
         """success, dropped, failed, clamped, (S, 4)"""
         self.traces: dict[int, AnyArray] = {}
@@ -44,11 +42,11 @@ class Round:
     def __getitem__(self, index: int) -> Result:
         """One job's result, without traces; the arrays are views."""
         at = index + len(self) if index < 0 else index
-        rows = slice(int(self._starts[at]), int(self._ends[at]))
+        rows = slice(self._starts[at], self._starts[at + 1])
         success, dropped, failed, clamped = self.flags[rows].T
         return Result(
             index=at, trajectory=self._trajectories.get(at), returns=self.returns[rows], success=success,
-            steps=self.steps[rows], dropped=dropped, failed=failed, clamped=clamped,
+            dropped=dropped, failed=failed, clamped=clamped,
             traces=np.empty((rows.stop - rows.start, 0, self._trace[1]), "<f4"),
         )  # fmt: skip
 
@@ -56,39 +54,50 @@ class Round:
         """Job by job."""
         return (self[index] for index in range(len(self)))
 
-    def fits(self, results: Results) -> bool:
-        """Whether these are of jobs of this round, have their shapes, and the traces that are wanted of them."""
-        jobs = results.jobs  # they rise
-        if jobs[0] < 0 or jobs[-1] >= len(self) or (results.rollouts != self._rollouts[jobs]).any():
-            return False
-        if (results.seen != self._seen[jobs]).any():
-            return False
-        wanted = traced(self._traces, results.returns, results.rollouts, results.seen)
-        if not np.array_equal(results.traced, wanted) or (len(wanted) and results.traces.shape[1:] != self._trace):
-            return False
-        return all(trajectory.fits(self._shapes) for trajectory in results.trajectories)
+    def place(self, results: Results) -> "Place | None":
+        """Where these belong.
 
-    def put(self, results: Results, chosen: BoolArray) -> None:
-        """Write down some (J,) of results that fit."""
-        rows, new = self._rows(results), np.repeat(chosen, results.rollouts)
-        some = slice(None) if new.all() else new
-        for mine, theirs in (
-            (self.returns, results.returns),
-            (self.steps, results.steps),
-            (self.flags, results.flags),
-        ):
-            mine[rows[some]] = theirs[some]
-        for at, trace in zip(results.traced.tolist(), results.traces, strict=True):
+        None unless they are of jobs of this round, have their shapes, and the traces that are wanted of them.
+        """
+        jobs = results.jobs
+        first, last = int(jobs[0]), int(jobs[-1])  # they rise
+        if first < 0 or last >= len(self):
+            return None
+        rows = np.arange(self._starts[first], self._starts[last + 1])
+        seen = self._seen[first : last + 1]
+        if len(jobs) <= last - first:  # rare: some in between are missing
+            mine = np.isin(np.arange(first, last + 1), jobs)
+            rows, seen = rows[np.repeat(mine, self._rollouts[first : last + 1])], seen[mine]
+        if len(results.returns) != len(rows) or len(results.trajectories) != np.count_nonzero(seen):
+            return None
+        wanted = traced(self._traces, results.returns, self._exploring[rows])
+        if len(results.traces) != len(wanted) or (len(wanted) and results.traces.shape[1:] != self._trace):
+            return None
+        if not all(trajectory.fits(self._shapes) for trajectory in results.trajectories):
+            return None
+        return Place(rows, wanted, jobs[seen])
+
+    def put(self, results: Results, place: "Place", chosen: BoolArray) -> None:
+        """Write down some of results that belong here; `chosen` (J,) says of which jobs."""
+        rows, new = place.rows, np.repeat(chosen, self._rollouts[results.jobs])
+        some = slice(None) if chosen.all() else new
+        self.returns[rows[some]] = results.returns[some]
+        self.flags[rows[some]] = results.flags[some]
+        for at, trace in zip(place.traced.tolist(), results.traces, strict=True):
             if new[at]:
                 self.traces[int(rows[at])] = trace
-        for at, trajectory in zip(np.flatnonzero(results.seen).tolist(), results.trajectories, strict=True):
-            if chosen[at]:
-                self._trajectories[int(results.jobs[at])] = trajectory
+        wanted = set(results.jobs[chosen].tolist())
+        for job, trajectory in zip(place.seen.tolist(), results.trajectories, strict=True):
+            if job in wanted:
+                self._trajectories[job] = trajectory
 
-    def _rows(self, results: Results) -> IntArray:
-        """Where each of these rollouts belongs, (S,)."""
-        first, last = results.jobs[0], results.jobs[-1]
-        if last - first == len(results.jobs) - 1:  # nearly always
-            return np.arange(self._starts[first], self._ends[last])
-        before = np.cumsum(results.rollouts) - results.rollouts
-        return np.repeat(self._starts[results.jobs] - before, results.rollouts) + np.arange(len(results.returns))
+
+class Place(NamedTuple):
+    """Where results belong."""
+
+    rows: IntArray
+    """Of their rollouts, in the round, (S,)"""
+    traced: IntArray
+    """Which of their rollouts have a trace, (K,)"""
+    seen: IntArray
+    """The jobs that their trajectories are of."""

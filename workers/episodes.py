@@ -61,7 +61,6 @@ class Episodes(ABC):
             trajectory=None if job.rate == "none" else WireTrajectory.of(self._trajectory(episodes[0])),
             returns=np.array([e.value for e in episodes]),
             success=no,
-            steps=np.array([len(e.rewards) for e in episodes], dtype="<i8"),
             dropped=no,
             failed=failed,
             clamped=failed,

@@ -64,7 +64,6 @@ def result(simulation: Simulation, job: Job, rollouts: Rollouts, rows: slice, su
         trajectory=WireTrajectory.of(trajectory(simulation, rollouts, rows.start, substeps)) if wanted else None,
         returns=outcome.returns[rows],
         success=outcome.success[rows],
-        steps=outcome.steps[rows].astype("<i8"),
         dropped=outcome.dropped[rows],
         failed=outcome.failed[rows],
         clamped=outcome.clamped[rows],

@@ -265,7 +265,7 @@ class Worker:
         if backend is None:
             return
         if isinstance(backend, Exception):
-            for index in [None] if isinstance(backend, UnservedError) else chunk.jobs.tolist():
+            for index in [None] if isinstance(backend, UnservedError) else chunk.indices.tolist():
                 self._fail(chunk, index, backend)
             return
         jobs = chunk.split()

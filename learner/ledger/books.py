@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter, defaultdict
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
 
@@ -90,14 +90,19 @@ class Books:
         queue = self.full if len(holders) >= self.copies else self.out
         queue[index] = now
 
-    def finish(self, worker: str, index: int) -> bool:
-        """Note a result; return whether the job was not done before."""
+    def finish(self, worker: str, indices: Sequence[int]) -> list[bool]:
+        """Note results of jobs of this round; return for each whether it was not done before."""
+        held: dict[int, float] = {}
         known = self.workers.get(worker)
-        if known is not None:
-            known.held.pop(index, None)
+        if known is not None and indices:
+            held = known.held
             known.proven, known.benched = True, False
-        self._unqueue(index)
-        return self.open.pop(index, None) is not None
+        done: list[bool] = []
+        for index in indices:
+            held.pop(index, None)
+            self._unqueue(index)
+            done.append(self.open.pop(index, None) is not None)
+        return done
 
     def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
         """Note an error; return whether it counts, and whether nobody holds the job any more."""

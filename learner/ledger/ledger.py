@@ -113,7 +113,9 @@ class Ledger:
         """
         self._tick(now)
         self._learn(worker, indices)
-        return [self._verdict(worker, index) for index in indices]
+        ours = [0 <= index < self._books.size for index in indices]
+        new = iter(self._books.finish(worker, [index for index, our in zip(indices, ours, strict=True) if our]))
+        return ["stale" if not our else "new" if next(new) else "doubled" for our in ours]
 
     def error(self, worker: str, index: int, now: float) -> bool:
         """Note that a worker answered an error; return whether the run has to stop.
@@ -170,11 +172,6 @@ class Ledger:
         if sent:
             self._pace.learn((self._now - max(known.answered, min(sent))) / len(sent))
             known.answered = self._now
-
-    def _verdict(self, worker: str, index: int) -> Verdict:
-        if not 0 <= index < self._books.size:
-            return "stale"
-        return "new" if self._books.finish(worker, index) else "doubled"
 
     def _first_time(self, size: int) -> list[Assignment]:
         """Hand out pending jobs in chunks, lowest index first; where there are too few for two chunks each, evenly."""

@@ -52,23 +52,25 @@ class Pace:
     def __init__(self, config: LedgerConfig) -> None:
         self._config = config
         self._samples: deque[float] = deque(maxlen=_SAMPLES)
-        self._median: float | None = None
+        self._median: float | None = None  # until it is asked for
 
     def learn(self, seconds: float) -> None:
         """Take in one answer's time per job [s]."""
         self._samples.append(max(seconds, 0.0))
-        self._median = median(self._samples)
+        self._median = None
 
     @property
     def median(self) -> float | None:
         """Running median [s], None before the first answer."""
+        if self._median is None and self._samples:
+            self._median = median(self._samples)
         return self._median
 
     @property
     def patience(self) -> float:
         """Time after which a job that is out counts as a straggler [s]."""
         factor = self._config.straggler_factor
-        return max(self._config.straggler_seconds, factor * (self._median or 0.0))
+        return max(self._config.straggler_seconds, factor * (self.median or 0.0))
 
     def chunk(self, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.
@@ -77,9 +79,9 @@ class Pace:
         chunks shrink towards the end and all workers end together; never below `least_seconds`,
         unless a worker's whole share is less. One job as long as nothing is known about its duration.
         """
-        if self._median is None:
+        if self.median is None:
             return 1
-        seconds = max(self._median, 1e-9)  # a median of 0 (a coarse clock) only says that the share decides
+        seconds = max(self.median, 1e-9)  # a median of 0 (a coarse clock) only says that the share decides
         share, half = (-(-waiting // (parts * max(workers, 1))) for parts in (1, 2))
         least = min(share, math.floor(self._config.least_seconds / seconds))
         return max(1, least, min(half, math.floor(self._config.chunk_seconds / seconds + 0.5)))

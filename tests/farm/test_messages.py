@@ -14,7 +14,7 @@ from farm.errors import MessageError
 from farm.jobs import RATES, Chunk, Generation, Job, Jobs
 from farm.messages import Refusal, Spec, Want
 from farm.reports import Line, RunEnd, RunHistory, RunReport, RunStatus, Trace, WorkerStatus
-from farm.results import Failure, Result, Results, WireTrajectory
+from farm.results import Failure, Result, Results, WireTrajectory, traced
 from farm.trajectory import Trajectory
 
 RNG = np.random.default_rng(0)
@@ -53,7 +53,6 @@ def result(rollouts=2, steps=15, **changes):
         "trajectory": None,
         "returns": RNG.normal(size=rollouts),
         "success": np.array([True, False])[:rollouts],
-        "steps": np.array([15, 3])[:rollouts],
         "dropped": np.array([False, True])[:rollouts],
         "failed": np.zeros(rollouts, dtype=bool),
         "clamped": np.zeros(rollouts, dtype=bool),
@@ -89,6 +88,26 @@ JOBS = [
     job(index=0, signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),
     job(index=2**31 - 1, rate="physics"),
 ]
+
+TABLE = Jobs.of(JOBS).table
+
+
+def changed(column, value):
+    """The table with another value in its last row."""
+    table = TABLE.copy()
+    table[-1, column] = value
+    return table
+
+
+STRANGE = {  # by column
+    0: (TABLE[0, 0], -1, 2**31, -(2**63)),  # a job twice
+    1: (-1, 2),
+    2: (-1, 2),
+    3: (-1, len(RATES)),
+    4: (0, 2, -2, -(2**63)),
+    5: (2, -2),
+    **{column: (-1, -2, 2**32) for column in range(6, 10)},  # half a seed
+}
 
 MESSAGES = {
     "refusal": Refusal(run="first", reason="its hand is another"),
@@ -238,47 +257,23 @@ REFUSED = {
         {"perturbation": (1, 2, 2**32, 3)},
     ],
     "chunk": [
-        {"jobs": np.zeros(3, dtype=np.int64)},
-        {"jobs": np.array([0, 1, 2, 2])},
-        {"jobs": np.array([0, 1, 2, -1])},
-        {"jobs": np.array([0, 1, 2, 2**31])},
-        {"around": np.zeros(5, dtype=bool)},
-        {"signs": np.ones((4, 3), dtype=np.int64)},
-        {"signs": np.zeros((4, 2), dtype=np.int64)},
-        {"signs": np.full((4, 2), 2)},
-        {"signs": np.full((4, 2), -(2**63))},
-        {"seeds": np.zeros((4, 3), dtype=np.int64)},
-        {"seeds": np.full((4, 4), -2)},
-        {"seeds": np.full((4, 4), 2**32)},
-        {"seeds": np.tile([-1, 0, 0, 0], (4, 1))},
-        {"rates": np.full(4, 3)},
-        {"rates": np.full(4, -1)},
-        {"explores": np.ones(4, dtype=bool)},
-        {"explores": np.zeros(3, dtype=bool)},
+        {"table": np.zeros((0, 10), dtype=np.int64)},
+        {"table": np.zeros((4, 0), dtype=np.int64)},
+        {"table": TABLE[:3]},
+        {"table": TABLE[:, :9]},
+        {"table": np.hstack([TABLE, TABLE[:, :1]])},
+        *({"table": changed(column, value)} for column, values in STRANGE.items() for value in values),
         {"eps": np.zeros((1, 64))},
+        {"eps": np.zeros((4, 64))},
     ],
     "results": [
         {"jobs": np.zeros(2, dtype=np.int64)},
+        {"jobs": np.zeros(0, dtype=np.int64)},
         {"jobs": np.array([0, 9, 3])},
         {"jobs": np.array([0, 3, 3])},
-        {"rollouts": np.array([2, 1])},
-        {"rollouts": np.array([2, 1, 3])},
-        {"rollouts": np.array([2, 1, 0])},
-        {"rollouts": np.array([2**62, 2**62, 2**62])},
-        {"rollouts": np.array([2, 4, 4])},
-        {"seen": np.array([True, True, False])},
-        {"seen": np.zeros(3, dtype=bool)},
-        {"seen": np.zeros(2, dtype=bool)},
-        {"trajectories": ()},
         {"returns": np.zeros(1)},
-        {"steps": np.zeros(1, dtype=np.int64)},
         {"flags": np.zeros((3, 4), dtype=bool)},
         {"flags": np.zeros((5, 3), dtype=bool)},
-        {"traces": np.zeros((3, 15, 54), dtype="<f4")},
-        {"traced": np.array([0, 1, 2])},
-        {"traced": np.array([0, 1, 1, 2])},
-        {"traced": np.array([0, 1, 2, 5])},
-        {"traced": np.array([-1, 0, 1, 2])},
     ],
     "trajectory": [
         *(
@@ -311,9 +306,8 @@ def test_texts_have_an_end(name, field):
 
 
 def test_a_chunk_has_jobs():
-    nothing = {name: value[:0] for name, value in vars(Jobs.of(JOBS)).items()}
-    with pytest.raises(ValueError, match="no jobs, or one of them twice"):
-        Chunk(**nothing, **HEAD)
+    with pytest.raises(ValueError, match=r"jobs in a table of shape \(0, 10\)"):
+        Chunk(table=TABLE[:0], eps=np.empty((0, 0)), **HEAD)
 
 
 def test_jobs_are_split_as_they_were_put_together():
@@ -346,10 +340,9 @@ def test_results_stand_in_the_jobs_order():
     parts = [result(), result(1, index=9, trajectory=WireTrajectory.of(trajectory())), result(index=0)]
     back = codec.decode(codec.encode(results(*parts)), Results)
     assert back.jobs.tolist() == [0, 3, 9]
-    assert back.rollouts.tolist() == [2, 2, 1]
     assert back.returns.tolist() == [*parts[2].returns, *parts[0].returns, *parts[1].returns]
     assert back.flags[:, 1].tolist() == [*parts[2].dropped, *parts[0].dropped, *parts[1].dropped]
-    assert back.traced.tolist() == [0, 1, 2, 3]  # the one that is seen does not explore
+    # Who is seen does not explore, and so has no trace.
     assert back.traces.tobytes() == parts[2].traces.tobytes() + parts[0].traces.tobytes()
 
 
@@ -360,11 +353,12 @@ def test_traces_of_the_best_and_the_worst(returns, expected):
     seen = result(1, index=0, trajectory=WireTrajectory.of(trajectory()), returns=np.array([9.0]))
     parts = [seen, *(result(index=i, returns=np.array(returns[2 * i - 2 : 2 * i])) for i in (1, 2))]
     back = results(*parts, traces="extremes")
-    assert back.traced.tolist() == [1 + row for row in expected]
+    exploring = np.array([False, True, True, True, True])
+    assert traced("extremes", back.returns, exploring).tolist() == [1 + row for row in expected]
     for row, trace in zip(expected, back.traces, strict=True):
         assert trace.tobytes() == parts[1 + row // 2].traces[row % 2].tobytes()
-    assert not results(seen, traces="extremes").traced.size
-    assert not results(*parts, traces="none").traced.size
+    assert not results(seen, traces="extremes").traces.size
+    assert not results(*parts, traces="none").traces.size
 
 
 @pytest.mark.parametrize("times", [[], [0.1], [0.0, 0.2, 0.1], [0.0, 0.0]])

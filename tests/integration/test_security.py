@@ -66,7 +66,6 @@ def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Res
             trajectory=None,
             returns=np.full(2, 1000.0),
             success=two,
-            steps=np.full(2, 15),
             dropped=~two,
             failed=~two,
             clamped=~two,

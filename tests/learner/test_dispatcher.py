@@ -46,7 +46,7 @@ def result(index: int, rollouts: int = 2, steps: int = STEPS, value: float | Non
     no = np.zeros(rollouts, bool)
     return Result(
         index=index, trajectory=None, returns=np.full(rollouts, float(index) if value is None else value), success=no,
-        steps=np.full(rollouts, steps), dropped=no, failed=no, clamped=no,
+        dropped=no, failed=no, clamped=no,
         traces=np.zeros((rollouts, steps, 54), "<f4"),
     )  # fmt: skip
 
@@ -90,7 +90,7 @@ class Worker:
         self.session.publish(key, message if isinstance(message, bytes) else codec.encode(message))
 
     def results(self, chunk: Chunk, *results: Result) -> Results:
-        found = results or tuple(result(index) for index in chunk.jobs.tolist())
+        found = results or tuple(result(index) for index in chunk.indices.tolist())
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.name}
         return Results.of(found, traces="extremes", **head)
 
@@ -103,7 +103,7 @@ class Worker:
         while len(done) < count:
             chunk = self.chunk()
             self.answer(self.results(chunk))
-            done += chunk.jobs.tolist()
+            done += chunk.indices.tolist()
         return done
 
 
@@ -192,7 +192,7 @@ def test_no_more_than_a_worker_wants(learner: Learner, hire: Hire) -> None:
     done = 0
     while done < 30:
         chunk = worker.chunk()
-        held += chunk.jobs.tolist()
+        held += chunk.indices.tolist()
         assert len(held) <= 3
         while held and (len(held) > 1 or done == 29):
             worker.answer(worker.results(chunk, result(held.pop(0))))
@@ -365,7 +365,7 @@ def test_a_worker_that_lost_its_jobs(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     worker.want(2)
     collected = learner.collect(jobs(5))
-    forgotten = {index for _ in range(2) for index in worker.chunk().jobs.tolist()}
+    forgotten = {index for _ in range(2) for index in worker.chunk().indices.tolist()}
     worker.want(2, idle=True)
     assert forgotten <= set(worker.work(5))
     assert indices(collected.result(WAIT)) == list(range(5))
@@ -409,7 +409,7 @@ def test_a_job_that_fails_everywhere(learner: Learner, hire: Hire, workers: int)
                 chunk = codec.decode(event.payload, Chunk)
                 turn.put(None)
                 text = f"OverflowError: too much for {hand.name}"
-                hand.answer(Failure(**_head(chunk), worker=hand.name, index=int(chunk.jobs[0]), error=text))
+                hand.answer(Failure(**_head(chunk), worker=hand.name, index=int(chunk.indices[0]), error=text))
 
     threads = [threading.Thread(target=fail, args=(hand,)) for hand in hands]
     for thread in threads:

@@ -30,7 +30,7 @@ def result(index: int) -> Result:
     arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items()}
     return Result(
         index=index, trajectory=WireTrajectory(value=9.0, success=True, times=np.zeros(1), **arrays) if seen else None,
-        returns=np.full(1, 9.0) if seen else RETURNS[index], success=no, steps=np.full(no.size, 3), dropped=no,
+        returns=np.full(1, 9.0) if seen else RETURNS[index], success=no, dropped=no,
         failed=no, clamped=no, traces=np.zeros((1, *TRACE), "<f4") if seen else TRACES[index],
     )  # fmt: skip
 
@@ -50,8 +50,9 @@ def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: 
     while len(done) <= PAIRS:
         some = rng.permutation(PAIRS + 1)[: rng.integers(1, 6)].tolist()
         sent = message(some, traces)
-        assert round_.fits(sent)
-        round_.put(sent, np.array([index not in done for index in sent.jobs.tolist()]))
+        place = round_.place(sent)
+        assert place is not None
+        round_.put(sent, place, np.array([index not in done for index in sent.jobs.tolist()]))
         done.update(some)
     assert round_.returns.tolist() == [*RETURNS.reshape(-1), 9.0]
     flat, kept = TRACES.reshape(-1, *TRACE), round_.traces
@@ -63,18 +64,33 @@ def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: 
 
 @pytest.mark.parametrize(("wanted", "sent"), [("extremes", "none"), ("extremes", "all"), ("none", "extremes")])
 def test_other_traces_than_were_wanted_do_not_fit(wanted: str, sent: str) -> None:
-    assert not begun(wanted).fits(message([0, 3, PAIRS], sent))
+    assert begun(wanted).place(message([0, 3, PAIRS], sent)) is None
 
 
 def test_traces_of_another_length_do_not_fit() -> None:
     longer = Round(begun("all").jobs, "all", (4, 54), SHAPES)
-    assert not longer.fits(message([0], "all"))
-    assert longer.fits(message([PAIRS], "all"))  # it has none
+    assert longer.place(message([0], "all")) is None
+    assert longer.place(message([PAIRS], "all")) is not None  # it has none
 
 
 def test_a_message_with_a_job_of_no_round_does_not_fit() -> None:
     """Its best rollout may be that job's, and a trace that is needed be missing."""
     good = message([0, 3], "extremes")
     for index in (-1, PAIRS + 1):
-        assert not begun("extremes").fits(replace(good, jobs=np.sort(np.array([0, index]))))
-    assert not begun("extremes").fits(replace(good, jobs=np.array([0, PAIRS])))  # that one is of one rollout
+        assert begun("extremes").place(replace(good, jobs=np.sort(np.array([0, index])))) is None
+    assert begun("extremes").place(replace(good, jobs=np.array([0, PAIRS]))) is None  # that one is of one rollout
+
+
+def test_results_of_other_shapes_do_not_fit() -> None:
+    good, round_ = message([0, 3, PAIRS], "extremes"), begun("extremes")
+    place = round_.place(good)
+    assert place is not None
+    assert place.rows.tolist() == [0, 1, 6, 7, 2 * PAIRS]
+    assert place.seen.tolist() == [PAIRS]
+    assert round_.place(replace(good, trajectories=())) is None
+    assert round_.place(replace(good, trajectories=good.trajectories * 2)) is None
+    assert round_.place(replace(good, returns=good.returns[1:], flags=good.flags[1:])) is None
+    assert round_.place(replace(good, traces=good.traces[1:])) is None
+    assert round_.place(replace(good, traces=good.traces[:, 1:])) is None
+    wide = replace(good.trajectories[0], bodies=np.zeros((1, 3, 7), "<f4"))
+    assert round_.place(replace(good, trajectories=(wide,))) is None

@@ -113,7 +113,6 @@ def test_a_trajectory_shows_the_scene(rate):
     np.testing.assert_allclose(shown.targets[1:], episode.actions, atol=1e-6)
     np.testing.assert_allclose(shown.terms[1:, 0], episode.rewards, rtol=1e-6)
     assert (shown.value, shown.success) == (episode.value, None)
-    assert result.steps.tolist() == [5]
     assert result.traces.shape == (1, 0, 54)
     assert not result.success.any()
 
@@ -127,7 +126,7 @@ def test_physics_that_blows_up_is_never_good():
     assert result.failed.all()
     assert result.clamped.all()
     assert (result.returns == RETURN_FLOOR).all()
-    assert result.steps[0] < 50
+    assert len(result.trajectory.times) <= 50
     codec.encode(result.trajectory)
     runner._env.unwrapped.model.opt.timestep = 0.01
     assert runner.episode(theta, None).value == Environment(config, policy_of(config)).episode(theta, None).value

@@ -58,7 +58,7 @@ class Backend:
 def result(index: int, value: float) -> Result:
     no = np.zeros(1, bool)
     return Result(
-        index=index, trajectory=None, returns=np.array([value]), success=no, steps=np.ones(1, "<i8"), dropped=no,
+        index=index, trajectory=None, returns=np.array([value]), success=no, dropped=no,
         failed=no, clamped=no, traces=np.zeros((1, 1, 54), "<f4"),
     )  # fmt: skip
 
@@ -381,7 +381,7 @@ def test_messages_it_cannot_read(
     learner.announce()
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]
-    until(lambda: sum("schema version 3, this side speaks 2" in line for line in caplog.messages) == 2)
+    until(lambda: sum("schema version 4, this side speaks 3" in line for line in caplog.messages) == 2)
 
 
 def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
