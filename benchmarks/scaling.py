@@ -10,12 +10,14 @@ many workers cost, not so many rollouts.
 """
 
 import argparse
+import gc
 import heapq
 import itertools
 import json
 import os
 import platform
 import queue
+import signal
 import statistics
 import subprocess
 import sys
@@ -184,6 +186,7 @@ def main() -> None:
     if arguments.emulate:
         _emulate(arguments.emulate[0], int(arguments.emulate[1]), arguments.pair)
         return
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without ending what it began
     counts = [int(word) for word in arguments.workers.split(",")]
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}\n")
     print("| workers | ms a pair | N | all joined after [s] | rollouts/s | ideal | efficiency | learner: cores | "
@@ -244,6 +247,7 @@ def _emulate(endpoint: str, workers: int, pair: float) -> None:
             link = stack.enter_context(session.connect(config.connect, None, over.is_set))
             emulated.append(Emulated(config, link, agenda))
             emulated[-1].join()
+        gc.freeze()  # dozens of workers are many objects to look through for garbage
         thread = threading.Thread(target=agenda.follow, args=(emulated, over))
         stack.callback(thread.join)
         thread.start()

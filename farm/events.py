@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from contextlib import suppress
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,11 +25,15 @@ class Event:
 
 
 class Events:
-    """What came in, first come first served; a flood is dropped rather than kept."""
+    """What came in, first come first served; a flood is dropped rather than kept.
+
+    No SimpleQueue: where a signal comes just before its time is over, Python 3.11's may wait for ever.
+    """
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._lock, self._bytes, self.dropped = threading.Lock(), 0, 0
+        self._events: deque[Event] = deque()
+        self._came = threading.Condition()
+        self._bytes = self.dropped = 0
 
     def put(self, event: Event) -> None:
         """Append an event, unless those that wait take up too much.
@@ -37,12 +41,13 @@ class Events:
         There is twice the room for who comes and goes: nobody would say that again.
         """
         size = _size(event)
-        with self._lock:
+        with self._came:
             if self._bytes + size > (_BACKLOG if event.payload else 2 * _BACKLOG):
                 self.dropped += 1
                 return
             self._bytes += size
-        self._queue.put(event)
+            self._events.append(event)
+            self._came.notify()
 
     def get(self, timeout: float = 0.0) -> Event:
         """The next event.
@@ -50,23 +55,25 @@ class Events:
         Raises:
           queue.Empty: none came in time [s].
         """
-        event = self._queue.get(timeout=timeout) if timeout > 0.0 else self._queue.get_nowait()
-        with self._lock:
-            self._bytes -= _size(event)
-        return event
+        for event in self._take(1, timeout):
+            return event
+        raise queue.Empty
 
     def waiting(self, timeout: float) -> list[Event]:
         """What waits, after waiting for the first [s]."""
-        events = []
-        with suppress(queue.Empty):
-            events.append(self.get(timeout))
-            while len(events) < _AT_ONCE:
-                events.append(self.get())
+        return self._take(_AT_ONCE, timeout)
+
+    def _take(self, most: int, timeout: float) -> list[Event]:
+        with self._came:
+            if timeout > 0.0:
+                self._came.wait_for(lambda: self._events, timeout)
+            events = [self._events.popleft() for _ in range(min(most, len(self._events)))]
+            self._bytes -= sum(map(_size, events))
         return events
 
     def __len__(self) -> int:
         """How many wait."""
-        return self._queue.qsize()
+        return len(self._events)
 
 
 def _size(event: Event) -> int:

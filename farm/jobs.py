@@ -74,7 +74,7 @@ class Jobs:
     """Jobs as one table: a map or an object for each would take ten times as long to send and to read."""
 
     table: IntArray = array("<i8", 2)
-    """(J, 10): index; whether the origin is the mean of the generation; whether there are eps; place of the rate in RATES;
+    """(J, 10): index; whether the origin is the mean; whether there are eps; place of the rate in RATES;
     two signs, the second 0 for a single rollout; four words of the perturbation's seed, -1 for nominal conditions"""
     eps: FloatArray = array("<f8", 2)
     """Of those jobs that have some, one after the other (K, P)"""
@@ -173,21 +173,18 @@ class Chunk(Jobs):
 
     def __post_init__(self) -> None:
         """Check that there are such jobs."""
-        if not self.table.size or self.table.shape[1] != _COLUMNS:
-            raise ValueError(f"jobs in a table of shape {self.table.shape}")
-        columns = list(zip(*self.table.tolist(), strict=True))
-        for name, column, (least, most) in zip(_NAMES, columns, _BOUNDS, strict=True):
-            if min(column) < least or max(column) > most:
-                raise ValueError(f"{name} out of range")
-        if len(set(columns[_INDEX])) < len(self):
+        table, seeds = self.table, self.table[:, _SEED]
+        if not table.size or table.shape[1] != _COLUMNS:
+            raise ValueError(f"jobs in a table of shape {table.shape}")
+        if (table < _LEAST).any() or (table > _MOST).any() or not table[:, _FIRST].all():
+            raise ValueError("jobs out of range")
+        if len(set(self.indices.tolist())) < len(self):
             raise ValueError("a job twice")
-        if 0 in columns[_FIRST]:
-            raise ValueError("jobs without rollouts")
-        seeds = self.table[:, _SEED]
-        if min(columns[-1]) < 0 and ((seeds < 0).any(axis=1) != (seeds < 0).all(axis=1)).any():
+        nominal = seeds < 0
+        if nominal.any() and (nominal.any(axis=1) != nominal.all(axis=1)).any():
             raise ValueError("half a seed")
-        if len(self.eps) != sum(columns[_EXPLORES]):
-            raise ValueError(f"{len(self.eps)} rows of eps of {sum(columns[_EXPLORES])} jobs")
+        if len(self.eps) != table[:, _EXPLORES].sum():
+            raise ValueError(f"{len(self.eps)} rows of eps of {table[:, _EXPLORES].sum()} jobs")
 
     @classmethod
     def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
@@ -197,8 +194,8 @@ class Chunk(Jobs):
 
 _COLUMNS: Final = 10
 _INDEX, _EXPLORES, _RATE, _FIRST, _SIGN, _SEED = 0, 2, 3, 4, slice(4, 6), slice(6, 10)
-_NAMES: Final = ("index", "origin", "eps", "rate", "sign", "sign", "seed", "seed", "seed", "seed")
-_BOUNDS: Final = ((0, 2**31 - 1), (0, 1), (0, 1), (0, len(RATES) - 1), *[(-1, 1)] * 2, *[(-1, 2**32 - 1)] * 4)
+_LEAST: Final = np.array([0, 0, 0, 0, -1, -1, -1, -1, -1, -1])
+_MOST: Final = np.array([2**31 - 1, 1, 1, len(RATES) - 1, 1, 1, *[2**32 - 1] * 4])
 
 _SIGNS: Final = ((1, -1), (1,), (-1,), (-1, 1), (1, 1), (-1, -1))
 

@@ -305,6 +305,15 @@ def test_texts_have_an_end(name, field):
         codec.decode(codec.encode(said), type(said))
 
 
+@pytest.mark.parametrize("column", range(6, 10))
+@pytest.mark.parametrize("others", [JOBS, JOBS[:2]], ids=["some nominal", "none nominal"])
+def test_a_seed_is_whole_or_not_there(others, column):
+    jobs = Jobs.of(others)
+    jobs.table[0, column] = -1
+    with pytest.raises(ValueError, match="half a seed"):
+        Chunk.carrying(jobs, **HEAD)
+
+
 def test_a_chunk_has_jobs():
     with pytest.raises(ValueError, match=r"jobs in a table of shape \(0, 10\)"):
         Chunk(table=TABLE[:0], eps=np.empty((0, 0)), **HEAD)
