@@ -42,13 +42,13 @@ from farm.messages import Spec
 from farm.results import Failure, Result, Results, WireTrajectory
 from farm.scene import load
 from workers.backends import BACKENDS
-from workers.worker import Worker, WorkerConfig
+from workers.worker import IDLE, Worker, WorkerConfig
 
 TOGETHER = 32  # emulated workers a process
 MOST = 3200  # pairs a second that are tried
 PAIRS = 1000  # a generation; beyond 64 workers as many a worker as there
 PARAMETERS = 64
-LOOK = 0.2  # [s] between two looks at whether a worker has nothing to do
+LOOK = 1.0  # [s] between two looks at whether workers have nothing to do
 
 
 class MadeUp:
@@ -108,6 +108,10 @@ class Emulated(Worker):
 
     def _events(self) -> list[Event]:
         return sorted(self._session.events.waiting(0.0), key=lambda event: event.topic == "inbox")
+
+    def _tell_idle(self) -> None:
+        if time.monotonic() >= self._until + IDLE:  # until then it is simulating, as it were
+            super()._tell_idle()
 
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
         key, payload = keys.result(self._config.farm, chunk.run, self.id), codec.encode(message)
