@@ -88,8 +88,8 @@ class MadeUp:
 class Emulated(Worker):
     """A worker that answers when one with a core of its own would have.
 
-    A pair takes it so long, and what it does besides as long as it takes the processor: that dozens of workers wait for
-    each other on one core is not theirs.
+    A pair takes it so long, and reading jobs and writing results as long as they take the processor. That dozens of
+    workers wait for each other on one core is not theirs; sending and Zenoh's threads are not counted either.
     """
 
     pair: ClassVar[float] = 0.02
@@ -158,7 +158,7 @@ class Agenda:
             if now >= look:
                 look = now + LOOK
                 for worker in workers:
-                    worker.turn_at(now)
+                    worker.turn_at(time.monotonic())
             next_due = self._due[0][0] if self._due else look
             with suppress(queue.Empty):
                 arrived, worker = self.came.get(timeout=max(1e-6, min(look, next_due) - time.monotonic()))
@@ -225,13 +225,13 @@ def _measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
             command = [__file__, "--pair", str(pair), "--emulate", endpoint, str(count)]
             emulators.append(stack.enter_context(_process(command, folder)))
         while _present(link) < workers:
-            time.sleep(0.05)
+            _pause(learner, *emulators)
         joined = time.monotonic() - begun
-        _wait(run, len(_progress(run)) + 2)
+        _wait(run, len(_progress(run)) + 2, learner, *emulators)
         first, cpu, start = len(_progress(run)), _cpu(learner.pid), time.monotonic()
         others = sum(_cpu(emulator.pid) for emulator in emulators)
         time.sleep(seconds)
-        _wait(run, len(_progress(run)) + 1)
+        _wait(run, len(_progress(run)) + 1, learner, *emulators)
         lines, used, took = _progress(run), _cpu(learner.pid) - cpu, time.monotonic() - start
         times = [line["seconds"] for line in lines[first - 1 :]]
         over = (len(times) - 1) * pairs / (times[-1] - times[0])
@@ -242,6 +242,7 @@ def _measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
     """A process full of workers, until its standard input closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for who began us
     Emulated.pair, over, agenda = pair, threading.Event(), Agenda()
     BACKENDS["made-up"] = MadeUp
     with ExitStack() as stack:
@@ -252,11 +253,13 @@ def _emulate(endpoint: str, workers: int, pair: float) -> None:
             emulated.append(Emulated(config, link, agenda))
             emulated[-1].join()
         gc.freeze()  # dozens of workers are many objects to look through for garbage
-        thread = threading.Thread(target=agenda.follow, args=(emulated, over))
-        stack.callback(thread.join)
-        thread.start()
-        sys.stdin.read()
-        over.set()
+        threading.Thread(target=_until_closed, args=(over,), daemon=True).start()
+        agenda.follow(emulated, over)
+
+
+def _until_closed(over: threading.Event) -> None:
+    sys.stdin.read()
+    over.set()
 
 
 @contextmanager
@@ -290,9 +293,15 @@ def _progress(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
-def _wait(run: Path, generations: int) -> None:
+def _wait(run: Path, generations: int, *processes: "subprocess.Popen[bytes]") -> None:
     while len(_progress(run)) < generations:
-        time.sleep(0.05)
+        _pause(*processes)
+
+
+def _pause(*processes: "subprocess.Popen[bytes]") -> None:
+    time.sleep(0.05)
+    if any(process.poll() is not None for process in processes):
+        sys.exit("a learner or a process full of workers ended before its time")
 
 
 def _cpu(pid: int) -> float:

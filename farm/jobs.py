@@ -109,7 +109,7 @@ class Jobs:
         table[:] = (0, True, True, RATES.index("none"), *(*signs, 0)[:2], *_NOMINAL)
         table[:, _INDEX] = np.arange(count)
         if seeds is not None:
-            table[:, _SEED] = seeds
+            table[:, _SEED] = np.array(seeds, dtype="<i8").reshape(count, 4)
         return Jobs(
             table=np.concatenate([table, others.table]),
             eps=np.concatenate([eps, others.eps]) if others.eps.size else eps,
@@ -139,7 +139,7 @@ class Jobs:
         first, end = chosen[0], chosen[-1] + 1
         if list(chosen) == list(range(first, end)):
             return Jobs(table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]])
-        table, before = self.table[list(chosen)], np.array(self._before)[list(chosen)]
+        table, before = self.table[list(chosen)], np.array([self._before[at] for at in chosen])
         return Jobs(table=table, eps=self.eps[before[table[:, _EXPLORES] != 0]])
 
     def split(self) -> list[Job]:

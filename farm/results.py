@@ -57,10 +57,12 @@ class Results:
     """Tactile traces [N] that are wanted, (K, T, 54)"""
 
     def __post_init__(self) -> None:
-        """Check that all speak of as many rollouts."""
+        """Check that all speak of as many rollouts, at least one a job."""
+        if not 1 <= len(self.jobs) <= len(self.returns):
+            raise ValueError(f"{len(self.jobs)} jobs of {len(self.returns)} rollouts")
         jobs = self.jobs.tolist()
-        if not jobs or jobs != sorted(set(jobs)):
-            raise ValueError("no jobs, or such that do not rise")
+        if jobs != sorted(set(jobs)):
+            raise ValueError("jobs that do not rise")
         if self.flags.shape != (len(self.returns), 4):
             raise ValueError(f"flags of shape {self.flags.shape} of {len(self.returns)} rollouts")
 

@@ -87,7 +87,7 @@ class Round:
             if new[at]:
                 self.traces[int(rows[at])] = trace
         wanted = set(results.jobs[chosen].tolist())
-        for job, trajectory in zip(place.seen.tolist(), results.trajectories, strict=True):
+        for job, trajectory in zip(place.shown.tolist(), results.trajectories, strict=True):
             if job in wanted:
                 self._trajectories[job] = trajectory
 
@@ -99,5 +99,5 @@ class Place(NamedTuple):
     """Of their rollouts, in the round, (S,)"""
     traced: IntArray
     """Which of their rollouts have a trace, (K,)"""
-    seen: IntArray
+    shown: IntArray
     """The jobs that their trajectories are of."""

@@ -286,6 +286,10 @@ class Worker:
     def _do(self, chunk: Chunk, backend: Backend, header: Generation, jobs: Sequence[Job]) -> None:
         """Run some of a chunk's jobs and say what they gave."""
         results = backend.run(header.mu, jobs)
+        for job, result in zip(jobs, results, strict=True):  # the learner takes results to be what it asked for
+            asked, given = (len(job.signs), job.rate == "none"), (len(result.returns), result.trajectory is None)
+            if (job.index, *asked) != (result.index, *given):
+                raise ValueError(f"result {result.index} of the backend is not what job {job.index} asks for")
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
         self._answer(chunk, Results.of(results, traces=header.traces, **head))
 

@@ -269,6 +269,7 @@ REFUSED = {
     "results": [
         {"jobs": np.zeros(2, dtype=np.int64)},
         {"jobs": np.zeros(0, dtype=np.int64)},
+        {"jobs": np.arange(6)},
         {"jobs": np.array([0, 9, 3])},
         {"jobs": np.array([0, 3, 3])},
         {"returns": np.zeros(1)},
@@ -389,7 +390,7 @@ def test_results_of_nothing_are_refused():
     shapes = {"traces": (0, 15, 54), "flags": (0, 4)}
     arrays = [f for f in dataclasses.fields(Results) if "dtype" in f.metadata]
     nothing = {f.name: np.zeros(shapes.get(f.name, 0), f.metadata["dtype"]) for f in arrays}
-    with pytest.raises(ValueError, match="no jobs"):
+    with pytest.raises(ValueError, match="0 jobs of 0 rollouts"):
         dataclasses.replace(results(result()), **nothing)
 
 

@@ -86,7 +86,7 @@ def test_results_of_other_shapes_do_not_fit() -> None:
     place = round_.place(good)
     assert place is not None
     assert place.rows.tolist() == [0, 1, 6, 7, 2 * PAIRS]
-    assert place.seen.tolist() == [PAIRS]
+    assert place.shown.tolist() == [PAIRS]
     assert round_.place(replace(good, trajectories=())) is None
     assert round_.place(replace(good, trajectories=good.trajectories * 2)) is None
     assert round_.place(replace(good, returns=good.returns[1:], flags=good.flags[1:])) is None

@@ -359,6 +359,30 @@ def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytes
     assert [r.levelno for r in caplog.records] == [logging.ERROR]
 
 
+@pytest.mark.parametrize("wrong", ["index", "rollouts", "count"])
+def test_a_backend_that_answers_something_else(stage: Stage, monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
+    run = Backend.run
+
+    def other(self: Backend, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
+        first, *rest = run(self, mu, jobs)
+        if first.index != 12:
+            return [first, *rest]
+        changed = {"index": replace(first, index=99), "rollouts": replace(first, returns=np.zeros(2))}
+        return [changed.get(wrong, first), *(rest if wrong != "count" else [])]
+
+    monkeypatch.setattr(Backend, "run", other)
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.send(worker.id, 12, 14)
+    if wrong == "count":  # one by one it is right
+        assert indices(stage.results()) == [12]
+    else:
+        failed = stage.failure()
+        assert failed.index == 12
+        assert "of the backend is not what job 12 asks for" in failed.error
+    assert indices(stage.results()) == [14]
+
+
 def test_messages_it_cannot_read(
     stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
