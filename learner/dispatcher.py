@@ -183,7 +183,8 @@ class Dispatcher:
         try:
             want = _decode(event, Want)
         except MessageError as error:
-            if error.kind == "version":  # it cannot read why either, but will say that it cannot
+            # It cannot read why either, but will say that it cannot. Who takes part has our release: that was another.
+            if error.kind == "version" and sender not in self._ledger.workers:
                 self._refuse(sender, str(error))
             raise
         if want.worker != sender:

@@ -261,6 +261,26 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     assert farm.ignored == {"bad": 2 + 8, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
 
 
+def test_another_release_in_a_workers_name_does_not_shut_it_out(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    farm = learner.show()
+    worker = hire("a/1")
+    with monkeypatch.context() as other:
+        other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
+        newer = codec.encode(
+            Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
+        )
+    worker.want(1)
+    collected = learner.collect(jobs(2))
+    first = worker.chunk()
+    worker.say(keys.want(FARM, worker.name), newer)
+    worker.answer(worker.results(first))
+    worker.work(1)
+    assert [one.returns.tolist() for one in collected.result(WAIT)] == [[i, i] for i in range(2)]
+    assert farm.ignored == {"version": 1}
+
+
 def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attendance, "_SOON", 0.0)
     monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
