@@ -31,6 +31,9 @@ SPEC = Spec(
     phases=np.empty(0),
 )  # fmt: skip
 SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
+NEWER = codec.encode(
+    Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2), codec.SCHEMA + 1
+)
 PATIENT = LedgerConfig(straggler_seconds=60.0)
 WAIT = 20.0
 
@@ -223,16 +226,11 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     monkeypatch.setattr(codec, "MAX_BYTES", 100_000)
     farm = learner.show()
     worker = hire("a/1")
-    with monkeypatch.context() as other:
-        other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
-        newer = codec.encode(
-            Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
-        )
     inbox = keys.want(FARM, worker.name)
     for nonsense in (
         b"",
         b"\xc1",
-        newer,
+        NEWER,
         Want(worker="b/1", credits=50, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
     ):
         worker.say(inbox, nonsense)
@@ -241,7 +239,7 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     first = worker.chunk()
     honest = worker.results(first)
     bad = [
-        b"", b"no message", b"\x80", b"\0" * 200_000, newer,
+        b"", b"no message", b"\x80", b"\0" * 200_000, NEWER,
         worker.results(first, result(0, rollouts=1)), worker.results(first, result(-1)),
         worker.results(first, result(0, steps=2)), worker.results(first, result(4)),
         replace(honest, run="other"), replace(honest, worker="b/1"),
@@ -261,20 +259,13 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     assert farm.ignored == {"bad": 2 + 8, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
 
 
-def test_another_release_in_a_workers_name_does_not_shut_it_out(
-    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
-    with monkeypatch.context() as other:
-        other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
-        newer = codec.encode(
-            Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
-        )
     worker.want(1)
     collected = learner.collect(jobs(2))
     first = worker.chunk()
-    worker.say(keys.want(FARM, worker.name), newer)
+    worker.say(keys.want(FARM, worker.name), NEWER)
     worker.answer(worker.results(first))
     worker.work(1)
     assert [one.returns.tolist() for one in collected.result(WAIT)] == [[i, i] for i in range(2)]
