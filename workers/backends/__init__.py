@@ -25,7 +25,10 @@ class Backend(Protocol):
         ...
 
     def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
-        """Run jobs around a mean (P,); results in the jobs' order."""
+        """Run jobs around a mean (P,); results in the jobs' order.
+
+        Each has a return for each sign, and a trajectory unless the job's rate is `none`; anything else is a failure.
+        """
         ...
 
     def close(self) -> None:
