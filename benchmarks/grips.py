@@ -7,11 +7,11 @@ import argparse
 
 import numpy as np
 
-from farm.hand import FINGERS
-from farm.policy import Features, Policy, PolicyConfig
-from farm.states import STATES
-from farm.tasks.finger_gait import TIMESTEP, TaskConfig, moved
-from workers.simulation import Simulation
+from farm.policies.fourier import Features, Policy, PolicyConfig
+from farm.tasks.finger_gait.hand import FINGERS
+from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.physics import Simulation
+from farm.tasks.finger_gait.task import TIMESTEP, TaskConfig, moved
 
 SECONDS = (0.0, 0.5, 1.0, 2.0, 3.0)
 

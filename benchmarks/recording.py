@@ -24,9 +24,9 @@ from pathlib import Path
 import rerun_cli
 
 from farm import tasks
-from farm.local import Place, Run, free_endpoint, open_run
 from learner.config import RunConfig
 from learner.recording.run import Recording
+from learner.run import Place, Run, free_endpoint, open_run
 
 BLOCK = 10
 """Generations of a block; the first of each is left out, and of every run the first four blocks."""

@@ -22,13 +22,13 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from farm.local import Place, Run, free_endpoint, open_run
-from farm.policy import Features, Policy
-from farm.states import STATES
-from farm.tasks.finger_gait import SUBSTEPS, Perturbation
+from farm.policies.fourier import Features, Policy
+from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.physics import CLOSING, Simulation
+from farm.tasks.finger_gait.task import SUBSTEPS, Perturbation
 from learner.config import PRESETS, RunConfig
-from learner.report import Report
-from workers.simulation import CLOSING, Simulation
+from learner.run import Place, Run, free_endpoint, open_run
+from learner.telemetry.report import Report
 
 STILL = 50.0  # every parameter: so far from any joint position that the kernel is zero
 

@@ -32,15 +32,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from farm import codec, keys, session
 from farm.arrays import FloatArray
 from farm.commands.status import ask
-from farm.events import Event, Events
-from farm.jobs import Chunk, Job
-from farm.local import free_endpoint
-from farm.messages import Spec
-from farm.results import Failure, Result, Results, WireTrajectory
-from farm.scene import load
+from farm.net import codec, keys, session
+from farm.net.events import Event, Events
+from farm.net.jobs import Chunk, Job
+from farm.net.messages import Spec
+from farm.net.results import Failure, Result, Results, WireTrajectory
+from farm.sim.scene import load
+from learner.run import free_endpoint
 from workers.backends import BACKENDS
 from workers.worker import IDLE, Worker, WorkerConfig
 

@@ -19,9 +19,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from farm.local import Place, free_endpoint, open_run
-from learner import history
 from learner.config import RunConfig
+from learner.run import Place, free_endpoint, open_run
+from learner.telemetry import report_log as history
 
 MOST = 4  # workers at a time
 

@@ -15,17 +15,18 @@ from typing import Final
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from farm import rendering, tactile, video
 from farm.arrays import FloatArray
-from farm.finished import again
-from farm.hand import TIP_RADIUS
-from farm.policy import Features, Policy, PolicyConfig
-from farm.scene import CONTACTS, load
-from farm.states import STATES
-from farm.tasks.finger_gait import Frames, TaskConfig
-from learner.folder import RunFolder
-from workers.grip import Grasping
-from workers.simulation import Simulation
+from farm.policies.fourier import Features, Policy, PolicyConfig
+from farm.sim import rendering, video
+from farm.sim.scene import CONTACTS, load
+from farm.tasks.finger_gait import touch as tactile
+from farm.tasks.finger_gait.grasp import Grasping
+from farm.tasks.finger_gait.hand import TIP_RADIUS
+from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.physics import Simulation
+from farm.tasks.finger_gait.task import Frames, TaskConfig
+from learner.replay import again
+from learner.run_folder import RunFolder
 
 PANEL: Final = (400, 450)
 """Width and height of one hand [pixels]."""

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from farm.measuring import measure
-from learner.experiments.catalogue import EXPERIMENTS, TRIALS, minutes
-from learner.experiments.experiment import Experiment
-from learner.experiments.figures import draw
-from learner.experiments.findings import Data, judge, spread, verdict
-from learner.experiments.folder import ExperimentFolder
+from benchmarks.thesis.catalogue import EXPERIMENTS, TRIALS, minutes
+from benchmarks.thesis.experiment import Experiment
+from benchmarks.thesis.figures import draw
+from benchmarks.thesis.findings import Data, judge, spread, verdict
+from benchmarks.thesis.folder import ExperimentFolder
+from benchmarks.thesis.measure import measure
 
 HERE = Path(__file__).parent
 

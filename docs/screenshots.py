@@ -23,7 +23,7 @@ import rerun_cli
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from farm.local import free_endpoint
+from learner.run import free_endpoint
 
 SIZE: Final = "1600x1000"
 _PATIENCE: Final = 60.0  # [s] for the viewer to start, to load, to draw

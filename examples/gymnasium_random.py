@@ -9,7 +9,7 @@ import argparse
 
 import gymnasium
 
-ID = "workers.environment:rolloutfarm/FingerGait-v0"
+ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 
 
 def main() -> None:

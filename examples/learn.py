@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from farm.errors import FarmError
-from farm.local import learn
 from learner.config import RunConfig
+from learner.run import learn
 
 
 def main() -> None:

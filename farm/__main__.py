@@ -23,11 +23,12 @@ COMMANDS: Final = {
     "status": "which runs and workers a farm has, and how they are doing",
     "router": "a standing rendezvous that outlives learners",
     "certificates": "a small certificate authority, for farms of several machines",
-    "experiment": "an experiment of Plage 2016, or one of ours: its runs side by side, its figure",
-    "plot": "the figures of an experiment again, from its data",
     "runs": "a table of the runs in a folder",
 }
 """Commands and what they are for; each is a module of farm.commands with a function `main`."""
+
+
+_HOME: Final = dict.fromkeys(("status", "router", "certificates"), "farm")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,7 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ConfigError(f"unknown command {name!r}; known are {', '.join(COMMANDS)} (see farm --help)")
         if arguments is None:  # where a command has no better idea, SIGTERM is as Ctrl-C
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return int(importlib.import_module(f"farm.commands.{name}").main(words[1:]))
+        module = "workers.command" if name == "worker" else f"{_HOME.get(name, 'learner')}.commands.{name}"
+        return int(importlib.import_module(module).main(words[1:]))
     except (KeyboardInterrupt, Interrupted) as end:
         if isinstance(end, KeyboardInterrupt):
             sys.stderr.write("farm: stopped before the end\n")

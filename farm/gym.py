@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 
-from farm import scene as scenes
 from farm.errors import ConfigError
-from farm.scene import Scene
-from farm.tasks.finger_gait import STEPS_LIMIT, TaskConfig
-from farm.tasks.sizes import Sizes
+from farm.sim import scene as scenes
+from farm.sim.scene import Scene
+from farm.tasks.base import Sizes
+from farm.tasks.finger_gait.task import STEPS_LIMIT, TaskConfig
 
 if TYPE_CHECKING:
     import gymnasium

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from farm import codec
 from farm.arrays import FloatArray
-from farm.codec import array
 from farm.errors import CheckpointError, MessageError
-from farm.jobs import Job
+from farm.net import codec
+from farm.net.codec import array
+from farm.net.jobs import Job
 
 _MAGIC: Final = b"rolloutfarm checkpoint 1\n"
 _SCHEMA: Final = 1  # of what follows, whichever version messages have

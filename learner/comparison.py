@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from farm.errors import ConfigError
+from farm.net.stats import Progress
 from learner.config import RunConfig, changes, preset_of, settings
-from learner.folder import RunFolder
-from learner.progress import Progress
+from learner.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

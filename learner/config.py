@@ -9,9 +9,9 @@ from typing import Any, Final, Literal, get_args, get_type_hints
 
 from farm import tasks
 from farm.errors import ConfigError
-from farm.policy import PolicyConfig
-from farm.randomness import SEEDS
-from farm.tasks.finger_gait import TaskConfig
+from farm.policies.fourier import PolicyConfig
+from farm.seeds import SEEDS
+from farm.tasks.finger_gait.task import TaskConfig
 from learner.algorithms import ALGORITHMS, PGPE, Algorithm, name_of
 
 VERSION: Final = 1

@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from farm import randomness
-from farm.jobs import Job
-from farm.results import Result
-from farm.trajectory import Trajectory
+from farm import seeds as randomness
+from farm.net.jobs import Job
+from farm.net.results import Result
+from farm.sim.trajectory import Trajectory
 
 EVALUATION_ROLLOUTS: Final = 100
 """Rollouts of the evaluation at the end of a run, and of a plain `farm evaluate`."""

@@ -9,24 +9,25 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import randomness, tasks
+from farm import seeds as randomness
+from farm import tasks
 from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import CheckpointError, RunError
-from farm.jobs import Job, Jobs
-from farm.messages import Spec
-from farm.results import Result
-from farm.trajectory import Trajectory
+from farm.net.jobs import Job, Jobs
+from farm.net.messages import Spec
+from farm.net.results import Result
+from farm.net.stats import Progress
+from farm.sim.trajectory import Trajectory
 from learner import config as configs
 from learner.algorithms import SearchState
-from learner.beginning import specification
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
-from learner.dispatcher import Dispatcher
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, evaluation_jobs, mean_job
-from learner.folder import RunFolder
-from learner.progress import Progress
-from learner.report import Report
-from learner.round import Round
+from learner.run_folder import RunFolder
+from learner.scheduler.dispatcher import Dispatcher
+from learner.scheduler.round import Round
+from learner.setup import specification
+from learner.telemetry.report import Report
 
 log = logging.getLogger(__name__)
 

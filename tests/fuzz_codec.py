@@ -9,12 +9,12 @@ import sys
 import atheris
 
 with atheris.instrument_imports(include=["farm"]):
-    from farm import codec
     from farm.errors import MessageError
-    from farm.jobs import Chunk, Generation
-    from farm.messages import Refusal, Spec, Want
-    from farm.reports import RunStatus
-    from farm.results import Failure, Results
+    from farm.net import codec
+    from farm.net.jobs import Chunk, Generation
+    from farm.net.messages import Refusal, Spec, Want
+    from farm.net.results import Failure, Results
+    from farm.net.telemetry import RunStatus
 
 KINDS = (Chunk, Failure, Generation, Refusal, Results, RunStatus, Spec, Want)
 

@@ -7,7 +7,7 @@ import sys
 import threading
 from dataclasses import dataclass
 
-from farm import arguments
+from farm import settings as arguments
 from farm.errors import ConfigError, FarmError
 from workers.worker import WorkerConfig, work
 

@@ -8,13 +8,13 @@ import numpy as np
 
 from farm import tasks
 from farm.arrays import FloatArray
-from farm.jobs import Job
-from farm.policy import Policy
-from farm.results import Result, WireTrajectory
-from farm.scene import Scene
-from farm.tactile import TAXELS
-from farm.tasks.finger_gait import TaskConfig
-from farm.trajectory import Trajectory
+from farm.net.jobs import Job
+from farm.net.results import Result, WireTrajectory
+from farm.policies.fourier import Policy
+from farm.sim.scene import Scene
+from farm.sim.trajectory import Trajectory
+from farm.tasks.finger_gait.task import TaskConfig
+from farm.tasks.finger_gait.touch import TAXELS
 from workers.jobs import parameters
 
 

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from farm import tactile
 from farm.arrays import FloatArray
-from farm.jobs import Job
-from farm.policy import Policy
-from farm.results import Result, WireTrajectory
-from farm.tasks.finger_gait import SUBSTEPS, TIMESTEP, Frames, Perturbation, TaskConfig
-from farm.trajectory import Trajectory
+from farm.net.jobs import Job
+from farm.net.results import Result, WireTrajectory
+from farm.policies.fourier import Policy
+from farm.sim.trajectory import Trajectory
+from farm.tasks.finger_gait import touch as tactile
+from farm.tasks.finger_gait.physics import Rollouts, Simulation
+from farm.tasks.finger_gait.task import SUBSTEPS, TIMESTEP, Frames, Perturbation, TaskConfig
 from workers.jobs import parameters
-from workers.simulation import Rollouts, Simulation
 
 
 class Gait:

@@ -7,10 +7,10 @@ import numpy as np
 from farm import tasks
 from farm.arrays import FloatArray
 from farm.errors import ConfigError, UnservedError
-from farm.jobs import Job
-from farm.messages import Spec
-from farm.policy import Features, Policy, PolicyConfig
-from farm.tasks.finger_gait import TaskConfig
+from farm.net.jobs import Job
+from farm.net.messages import Spec
+from farm.policies.fourier import Features, Policy, PolicyConfig
+from farm.tasks.finger_gait.task import TaskConfig
 
 
 def specified(spec: Spec) -> tuple[TaskConfig, Policy]:

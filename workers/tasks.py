@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from farm.arrays import FloatArray
-from farm.jobs import Job
-from farm.policy import Policy
-from farm.results import Result
-from farm.tasks.finger_gait import TaskConfig
+from farm.net.jobs import Job
+from farm.net.results import Result
+from farm.policies.fourier import Policy
+from farm.tasks.finger_gait.task import TaskConfig
+from farm.tasks.gymnasium import Environment
 from workers.finger_gait import Gait
-from workers.gym import Environment
 
 
 class Simulates(Protocol):

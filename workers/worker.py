@@ -16,15 +16,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from farm import __version__, codec, keys, scene
+from farm import __version__
 from farm.errors import ConfigError, FarmError, MessageError, UnservedError, brief
-from farm.events import Event
-from farm.jobs import Chunk, Generation, Job
-from farm.messages import Refusal, Spec, Want
-from farm.results import Failure, Results
-from farm.session import Session, check_endpoint, connect
-from farm.tls import Bundle, find
-from workers import canary
+from farm.net import codec, keys
+from farm.net.events import Event
+from farm.net.jobs import Chunk, Generation, Job
+from farm.net.messages import Refusal, Spec, Want
+from farm.net.results import Failure, Results
+from farm.net.session import Session, check_endpoint, connect
+from farm.net.tls import Bundle, find
+from farm.sim import scene
+from workers import fingerprint as canary
 from workers.backends import BACKENDS, Backend
 
 log = logging.getLogger(__name__)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import tyro
 
-from farm import arguments, keys
+from farm import settings as arguments
 from farm.errors import ConfigError
-from farm.tls import Role
+from farm.net import keys
+from farm.net.tls import Role
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey

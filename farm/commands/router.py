@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from farm import arguments, keys
+from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
-from farm.local import LISTEN
-from farm.session import listen, router_settings
-from farm.tls import find
+from farm.net import keys
+from farm.net.session import listen, router_settings
+from farm.net.tls import find
+from learner.run import LISTEN
 
 
 @dataclass(frozen=True, kw_only=True)

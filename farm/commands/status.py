@@ -12,15 +12,16 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from farm import arguments, codec, keys
+from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.commands.tables import compact, wide
 from farm.errors import FarmError, MessageError
-from farm.local import LISTEN
-from farm.reports import RunStatus
-from farm.session import Session, connect
-from farm.tls import find
+from farm.net import codec, keys
+from farm.net.session import Session, connect
+from farm.net.telemetry import RunStatus
+from farm.net.tls import find
+from learner.run import LISTEN
 
 _ANSWER = 1.0  # [s] that learners have to answer
 

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from farm.tasks import finger_gait
-from farm.tasks.finger_gait import TaskConfig
-from farm.tasks.sizes import Sizes
+from farm.tasks.base import Sizes
+from farm.tasks.finger_gait import task as finger_gait
+from farm.tasks.finger_gait.task import TaskConfig
 
 if TYPE_CHECKING:
-    from farm.scene import Scene
+    from farm.sim.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Task:
 
 # MuJoCo and Gymnasium are loaded when they are asked: whoever only reads a configuration needs neither.
 def _hand(config: TaskConfig) -> "Scene":
-    from farm import scene
+    from farm.sim import scene
 
     return scene.load(config.object)
 

@@ -6,7 +6,7 @@ from typing import Final, Literal
 import rerun as rr
 import rerun.blueprint as rrb
 
-from farm.hand import FINGERS
+from farm.tasks.finger_gait.hand import FINGERS
 from learner.recording.drawing import Mover
 
 _BACKGROUND: Final = [74, 80, 88, 255]

@@ -18,10 +18,10 @@ import numpy as np
 import rerun as rr
 
 from farm.arrays import FloatArray
-from farm.hand import FINGERS
-from farm.scene import Scene
-from farm.trajectory import Trajectory
-from learner.progress import Progress
+from farm.net.stats import Progress
+from farm.sim.scene import Scene
+from farm.sim.trajectory import Trajectory
+from farm.tasks.finger_gait.hand import FINGERS
 from learner.recording import blueprint
 from learner.recording.curves import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, Colour, lines
 from learner.recording.drawing import Drawing

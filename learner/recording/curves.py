@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 
 from farm.arrays import FloatArray, IntArray
-from learner.progress import Progress
+from farm.net.stats import Progress
 
 Colour = tuple[int, int, int]
 

@@ -3,7 +3,7 @@
 Entities hang flat below /world: /world/<body>, with its geometries and, at a finger's last link,
 its taxels as children. A finger keeps its colour everywhere (palette of Okabe and Ito).
 
-A fingertip's picture has the taxels' 6 rows and 3 columns (see `farm.tactile`): top is towards the back
+A fingertip's picture has the taxels' 6 rows and 3 columns (see `farm.tasks.finger_gait.touch`): top is towards the back
 of the finger, bottom towards its pad, left the side of negative y. A trace has the fingers' taxels
 below each other, row by row, and time to the right.
 """
@@ -15,12 +15,12 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 
-from farm import tactile
 from farm.arrays import AnyArray, FloatArray, IntArray
-from farm.hand import FINGERS, JOINTS, TIP_RADIUS
-from farm.rewards import TERMS
-from farm.scene import Geometry, HandScene, Scene
-from farm.trajectory import Trajectory
+from farm.sim.scene import Geometry, HandScene, Scene
+from farm.sim.trajectory import Trajectory
+from farm.tasks.finger_gait import touch as tactile
+from farm.tasks.finger_gait.hand import FINGERS, JOINTS, TIP_RADIUS
+from farm.tasks.finger_gait.rewards import TERMS
 from learner.recording.curves import (
     BLUE,
     GREEN,

@@ -25,9 +25,9 @@ import rerun as rr
 
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
-from farm.scene import Scene
-from farm.trajectory import Trajectory, joined
-from learner.progress import Progress
+from farm.net.stats import Progress
+from farm.sim.scene import Scene
+from farm.sim.trajectory import Trajectory, joined
 from learner.recording import blueprint, curves
 from learner.recording.drawing import Drawing, trace
 from learner.recording.files import compact, next_part, parts

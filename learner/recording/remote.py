@@ -10,13 +10,13 @@ from rerun.chunk import RrdReader
 
 from farm import tasks
 from farm.errors import ConfigError, MessageError, RunError
-from farm.reports import RunEnd, RunReport
+from farm.net.telemetry import RunEnd, RunReport
 from learner.config import RunConfig
-from learner.folder import RunFolder
-from learner.following import Follower, other
 from learner.recording.files import compact, parts
 from learner.recording.run import Recording
-from learner.report import unpacked
+from learner.run_folder import RunFolder
+from learner.telemetry.report import unpacked
+from learner.telemetry.subscriber import Follower, other
 
 _STATISTICS: Final = "/learning/return"  # an entity that has one row a generation
 

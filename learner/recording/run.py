@@ -7,14 +7,14 @@ from typing import Final
 
 from farm import tasks
 from farm.errors import ConfigError
-from farm.scene import Scene
-from farm.trajectory import Trajectory
+from farm.sim.scene import Scene
+from farm.sim.trajectory import Trajectory
 from learner import config as configs
 from learner.config import RunConfig
 from learner.recording.files import COMPACTING
 from learner.recording.recorder import Recorder
 from learner.recording.thread import RecorderThread
-from learner.report import Report
+from learner.telemetry.report import Report
 
 log = logging.getLogger(__name__)
 

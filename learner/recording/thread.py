@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from farm.arrays import AnyArray
-from farm.trajectory import Trajectory
-from learner.progress import Progress
+from farm.net.stats import Progress
+from farm.sim.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 

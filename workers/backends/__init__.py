@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import ClassVar, Final, Protocol
 
 from farm.arrays import FloatArray
-from farm.jobs import Job
-from farm.messages import Spec
-from farm.results import Result
+from farm.net.jobs import Job
+from farm.net.messages import Spec
+from farm.net.results import Result
 from workers.backends.cpu import CpuBackend
 
 

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from farm.arrays import FloatArray
-from farm.jobs import Job
-from farm.messages import Spec
-from farm.results import Result
+from farm.net.jobs import Job
+from farm.net.messages import Spec
+from farm.net.results import Result
+from farm.tasks.finger_gait.physics import CAPACITY
 from workers.jobs import specified
-from workers.simulation import CAPACITY
 from workers.tasks import SIMULATES
 
 

@@ -1,0 +1,402 @@
+"""Every experiment, by name. A new one is a few lines here: its set-ups, then the experiment. Pure.
+
+The set-up of the thesis' experiments is `--preset thesis` with what the figure's caption and text say; where they
+are silent the preset's value stays (docs/method.md says what that leaves open).
+"""
+
+from dataclasses import replace
+from typing import Any, Final
+
+from benchmarks.thesis import claims
+from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer
+from learner.algorithms import PGPE
+from learner.config import PRESETS, RunConfig
+
+TRIALS: Final = 5
+"""Trials of a set-up unless told otherwise; the thesis has three."""
+
+OBJECTS: Final = ("bar", "thin-bar", "thick-bar", "cylinder", "bolt")
+
+_TASK: Final = set(RunConfig().task.__dataclass_fields__)
+_POLICY: Final = set(RunConfig().policy.__dataclass_fields__)
+_RUN: Final = set(RunConfig.__dataclass_fields__)
+
+
+def setup(preset: str, **settings: Any) -> RunConfig:  # noqa: ANN401  values of any setting
+    """A preset with some settings changed, each by its flag's name."""
+    base = PRESETS[preset]
+    task = {k: v for k, v in settings.items() if k in _TASK}
+    policy = {k: v for k, v in settings.items() if k in _POLICY}
+    run = {k: v for k, v in settings.items() if k in _RUN}
+    rest = {k: v for k, v in settings.items() if k not in _TASK | _POLICY | _RUN}
+    return replace(
+        base, task=replace(base.task, **task), policy=replace(base.policy, **policy),
+        algorithm=replace(base.algorithm, **rest), traces="none", **run,
+    )  # fmt: skip
+
+
+def _projected(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: ANN401
+    return setup("thesis", state=state, features=features, **settings)
+
+
+def _direct(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: ANN401
+    own = {"weights": "direct", "clip": False, **settings}
+    return setup("thesis", controller="direct", state=state, features=features, **own)
+
+
+_RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb"}
+
+
+SETUPS: Final[dict[str, RunConfig]] = {
+    "joints-D300": _projected("joints", 300),
+    "joints-D1500": _projected("joints", 1500),
+    "joints-D8000": _projected("joints", 8000),
+    "joints-D8000-returns-x128": _projected("joints", 8000, return_scale=12.8),
+    "joints-D8000-returns-x100": _projected("joints", 8000, return_scale=10.0),
+    "contacts-D1500": _projected("joints+contacts", 1500),
+    "contacts-D1500-N50": _projected("joints+contacts", 1500, pairs=50),
+    "joints-tactile-D5400": _projected("joints+tactile", 5400),
+    "direct-contacts-N50": _direct("joints+contacts", 100, pairs=50),
+    "direct-contacts-N50-clipped": _direct("joints+contacts", 100, pairs=50, clip=True),
+    "direct-contacts-N50-limited": _direct("joints+contacts", 100, pairs=50, reward="limited"),
+    "direct-contacts-N50-both": _direct("joints+contacts", 100, pairs=50, clip=True, reward="limited"),
+    "direct-contacts-N50-low": _direct("joints+contacts", 100, pairs=50, initial_mu=0.1, initial_sigma=0.2),
+    "direct-contacts-N50-derived": _direct("joints+contacts", 100, pairs=50, normaliser="sehnke"),
+    "direct-contacts-N50-plain": _direct("joints+contacts", 100, pairs=50, estimator="plain"),
+    "direct-contacts-N15-short": _direct("joints+contacts", 100, pairs=15, generations=133),
+    "direct-contacts-N25-short": _direct("joints+contacts", 100, pairs=25, generations=80),
+    "direct-contacts-N50-short": _direct("joints+contacts", 100, pairs=50, generations=40),
+    "direct-contacts-N100-short": _direct("joints+contacts", 100, pairs=100, generations=20),
+    "direct-joints-N5": _direct("joints", 100, pairs=5, generations=450),
+    "direct-joints-N15": _direct("joints", 100, pairs=15),
+    "direct-joints-N50": _direct("joints", 100, pairs=50, generations=45),
+    "cosine-joints-D100": setup("thesis", controller="cosine", features=100),
+    "cosine-joints-D1500": setup("thesis", controller="cosine", features=1500),
+    "direct-joints-N15-projected-weights": _direct("joints", 100, weights="projected"),
+    "joints-D1600": _projected("joints", 1600),
+    "contacts-D3400": _projected("joints+contacts", 3400),
+    "tactile-D10800": _projected("tactile", 10800),
+    "joints-tactile-D12600": _projected("joints+tactile", 12600),
+    "joints-kernel": setup("thesis", controller="kernel"),
+    "default-contacts": setup("default", state="joints+contacts"),
+    "default-contacts-h2": setup("default", state="joints+contacts", bandwidth=2.0),
+    "default-contacts-x0.3": setup("default", state="joints+contacts", contacts_scale=0.3),
+    "default-contacts-x0.1": setup("default", state="joints+contacts", contacts_scale=0.1),
+    "joints-D8000-near": _projected("joints", 8000, initial_mu=1.75, initial_sigma=0.8),
+    "joints-D8000-capped": _projected("joints", 8000, sigma_rule="capped"),
+    "joints-D8000-near-capped": _projected(
+        "joints", 8000, initial_mu=1.75, initial_sigma=0.8, sigma_rule="capped"
+    ),
+    "joints-D8000-sehnke": _projected("joints", 8000, normaliser="sehnke"),
+    **{f"default-{name}": setup("default", object=name) for name in OBJECTS},
+    "default-direct": setup("default", controller="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
+    "release-kernel": setup("default", **_RELEASE),
+    "release-direct": setup(
+        "default", controller="direct", features=100, initial_mu=0.0, initial_sigma=0.1, **_RELEASE
+    ),
+    "default-optimal-baseline": setup("default", baseline="optimal"),
+    "default-no-baseline": setup("default", baseline="none"),
+    "default-plain": setup("default", estimator="plain"),
+    "default-plain-optimal-baseline": setup("default", estimator="plain", baseline="optimal"),
+}  # fmt: skip
+"""Configurations by name; a run is one of them and a seed, shared by all experiments that show it."""
+
+_CLAIMS: Final = [
+    Experiment(
+        name="fig-4.1",
+        title="Direct learning: late success, then a race to the bottom",
+        question="What happens when the weights of the features are learnt directly?",
+        claim="Flat for 50 to 70 generations, a peak by about 100, then returns fall without end while actions grow to "
+        "100 times the joint range; the grip is not changed (4.1.1).",
+        curves={"direct, D 100, N 50": "direct-contacts-N50"},
+        figure=Curves(panels=("return", "action"), scale="symlog"),
+        find=claims.race,
+    ),
+    Experiment(
+        name="fig-4.2",
+        title="Convergence of mu and sigma",
+        question="Does the search distribution converge when parameters are projected?",
+        claim="Sigma goes to 0 and mu converges, to another value in each trial (4.2.1).",
+        curves={"projected, joints+contacts, D 1500": "contacts-D1500"},
+        figure=Curves(panels=("mu_2", "sigma_2")),
+        find=claims.converges,
+    ),
+    Experiment(
+        name="fig-4.3",
+        title="Number of features",
+        question="How does learning depend on the number of random features?",
+        claim="The more features, the faster, higher and more evenly it learns; 300 learn nothing in 150 generations "
+        "(4.2.2).",
+        curves={"D 300": "joints-D300", "D 1500": "joints-D1500", "D 8000": "joints-D8000"},
+        find=claims.features,
+    ),
+    Experiment(
+        name="fig-4.4",
+        title="State bases",
+        question="Which of the hand's senses should the controller see?",
+        claim="Joint positions learn fastest and highest, joint positions with the tactile image slowest (4.2.3).",
+        curves={
+            "joints, D 1500": "joints-D1500",
+            "joints+contacts, D 1500": "contacts-D1500",
+            "joints+tactile, D 5400": "joints-tactile-D5400",
+        },
+        find=claims.states,
+    ),
+    Experiment(
+        name="fig-4.5",
+        title="Pairs a generation",
+        question="Few pairs and many updates, or many pairs and few updates?",
+        claim="N 50 rises at generation 30 to 40, drops and recovers; N 15 rises at 90, smoother and nearly as high "
+        "(4.2.4).",
+        curves={"N 50": "contacts-D1500-N50", "N 15": "contacts-D1500"},
+        find=claims.pairs_a_generation,
+    ),
+    Experiment(
+        name="fig-4.6",
+        title="The same over rollouts",
+        question="Which N makes more of the same number of rollouts?",
+        claim="What counts is the number of rollouts; a small N learns sooner (4.2.4). The thesis counts histories, "
+        "of two rollouts each.",
+        curves={"N 50": "contacts-D1500-N50", "N 15": "contacts-D1500"},
+        figure=Curves(over="rollouts"),
+        find=claims.rollouts_count,
+    ),
+    Experiment(
+        name="text-8000",
+        title="The best set-up",
+        question="Is the gait learnt within 90 generations?",
+        claim="Joint positions, D 8000, N 15: learnt in less than 90 generations, sigma converged after 50 (5, 5.2).",
+        curves={"joints, D 8000": "joints-D8000"},
+        figure=Curves(panels=("return", "success", "sigma")),
+        find=claims.learnt_within_90,
+    ),
+    Experiment(
+        name="text-4.1.1",
+        title="Remedies for direct learning",
+        question="Do limits on actions or their punishment, or lower first values, keep direct learning stable?",
+        claim="No. With limited actions every action is at its limit within 10 generations and does not come back "
+        "in 100; lower first mu and sigma do not help (4.1.1).",
+        curves={
+            "unlimited": "direct-contacts-N50",
+            "clipped": "direct-contacts-N50-clipped",
+            "punishment limited": "direct-contacts-N50-limited",
+            "clipped, punishment limited": "direct-contacts-N50-both",
+            "low mu and sigma": "direct-contacts-N50-low",
+        },
+        figure=Curves(panels=("return", "action"), scale="symlog"),
+        find=claims.remedies,
+    ),
+    Experiment(
+        name="text-4.1.2",
+        title="Direct learning: histories a generation",
+        question="Does N matter to direct learning, over 2000 histories?",
+        claim="No difference within 2000 histories, all of them in the flat part (4.1.2).",
+        curves={
+            "N 15": "direct-contacts-N15-short",
+            "N 25": "direct-contacts-N25-short",
+            "N 50": "direct-contacts-N50-short",
+            "N 100": "direct-contacts-N100-short",
+        },
+        figure=Curves(over="rollouts", scale="symlog"),
+        find=claims.no_difference,
+    ),
+    Experiment(
+        name="text-4.3",
+        title="Direct against projected",
+        question="How do the two ways compare on the same state and N?",
+        claim="A similar rise; then both drop, and only projected learning recovers (4.3).",
+        curves={"direct, D 100": "direct-contacts-N50", "projected, D 1500": "contacts-D1500-N50"},
+        figure=Curves(scale="symlog"),
+        find=claims.only_projected_recovers,
+    ),
+    Experiment(
+        name="text-3.5.2",
+        title="Scaled returns",
+        question="Does the size of the returns matter?",
+        claim="Learning does not change when returns are scaled (3.5.2).",
+        curves={
+            "returns x1": "joints-D8000",
+            "returns x128": "joints-D8000-returns-x128",
+            "returns x100": "joints-D8000-returns-x100",
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.scale_free,
+    ),
+    Experiment(
+        name="table-3.2",
+        title="Features for an accuracy",
+        question="How many features does a kernel accuracy need?",
+        claim="D = d eps^-2 log(1/eps^2): for eps 0.1, 1600 features for 8 numbers to 12600 for 63 (table 3.2).",
+        figure=KernelError(features=(30, 90, 280, 560, 1600, 3400, 5400, 12600)),
+        find=claims.kernel_error,
+    ),
+]
+
+_QUESTIONS: Final = [
+    Experiment(
+        name="why-features",
+        title="Is it the kernel's noise?",
+        question="Few features approximate the kernel badly. Does that noise hinder, or explore? The kernel itself "
+        "has none.",
+        curves={"D 300": "joints-D300", "D 1500": "joints-D1500", "D 8000": "joints-D8000", "kernel": "joints-kernel"},
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="why-start",
+        title="Is it where the search begins?",
+        question="mu = 1 squeezes the bar at once, and sigma = 2 makes most samples do nothing. What do a start "
+        "near the held grip (mu 1.75, sigma 0.8), capped steps of sigma, both, and the derived normaliser change?",
+        curves={
+            "as printed": "joints-D8000",
+            "start near": "joints-D8000-near",
+            "sigma capped": "joints-D8000-capped",
+            "near, capped": "joints-D8000-near-capped",
+            "derived normaliser": "joints-D8000-sehnke",
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="why-race",
+        title="What makes the race to the bottom?",
+        question="Does direct learning run away with another normaliser, or without symmetric sampling "
+        "and normalisation (thesis 3.1)?",
+        curves={
+            "as printed": "direct-contacts-N50",
+            "derived normaliser": "direct-contacts-N50-derived",
+            "plain, not normalised": "direct-contacts-N50-plain",
+        },
+        figure=Curves(panels=("return", "action"), scale="symlog"),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="why-contacts",
+        title="Is it the contact points, or where the search begins?",
+        question="A contact point of one fingertip radius moves the kernel as far as a joint by 57 degrees: does touch "
+        "hinder less when it counts less? Or is it that nine more numbers take the first mean so far away that the "
+        "kernel is zero, which a width of 2 makes up for?",
+        curves={
+            "joints alone": "default-bar",
+            "contacts x1": "default-contacts",
+            "contacts x0.3": "default-contacts-x0.3",
+            "contacts x0.1": "default-contacts-x0.1",
+            "contacts x1, h 2": "default-contacts-h2",
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="cosine",
+        title="Direct learning with bounded parameters",
+        question="Thesis 5.2: would the cosine of the parameters make direct learning work?",
+        curves={
+            "direct, D 100": "direct-joints-N15-projected-weights",
+            "cosine, D 100": "cosine-joints-D100",
+            "cosine, D 1500": "cosine-joints-D1500",
+            "projected, D 1500": "joints-D1500",
+        },
+        figure=Curves(scale="symlog"),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="direct-few",
+        title="Direct learning with few rollouts",
+        question="Thesis 5: does direct learning work on joint positions alone, with few histories a generation?",
+        curves={
+            "N 5": "direct-joints-N5",
+            "N 15": "direct-joints-N15",
+            "N 50": "direct-joints-N50",
+            "N 15, default preset, from 0": "default-direct",
+        },
+        figure=Curves(over="rollouts", scale="symlog"),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="equal-accuracy",
+        title="State bases at one kernel accuracy",
+        question="Thesis 5: how do the state bases compare when each has the features for an accuracy of 10 %?",
+        curves={
+            "joints, D 1600": "joints-D1600",
+            "joints+contacts, D 3400": "contacts-D3400",
+            "tactile, D 10800": "tactile-D10800",
+            "joints+tactile, D 12600": "joints-tactile-D12600",
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="objects",
+        title="Other objects",
+        question="Thesis 5.2: can the gait be learnt on other objects, and does a policy work on objects it has "
+        "never held?",
+        curves={name: f"default-{name}" for name in OBJECTS},
+        figure=Transfer(objects=OBJECTS),
+        find=claims.transfer,
+    ),
+    Experiment(
+        name="release",
+        title="The way back",
+        question="Thesis 5.2: chains need other gaits. Can the middle finger be taken off again (index+middle+thumb to "
+        "index+thumb)? The kernel's actions are never negative, so it can only close; direct ones have a sign.",
+        curves={"kernel": "release-kernel", "direct, D 100": "release-direct"},
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="chain",
+        title="A chain of gaits",
+        question="Thesis 5.2: can an upper level chain learnt gaits? It switches by touch: when the goal grip has "
+        "been felt for three steps, the other policy takes over.",
+        curves={"add the middle finger": "default-bar", "take it off": "release-direct"},
+        figure=Chain(),
+        find=claims.chain,
+    ),
+    Experiment(
+        name="friction",
+        title="Friction",
+        question="Thesis 5.2: real fingertips hold better than simulated ones. How does success depend on friction?",
+        curves={"default": "default-bar", "thesis, D 8000": "joints-D8000"},
+        figure=Friction(factors=(0.01, 0.02, 0.04, 0.07, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)),
+        find=claims.friction,
+    ),
+    Experiment(
+        name="baselines",
+        title="Baselines, and plain PGPE",
+        question="What are symmetric sampling and the optimal baseline worth, on the same number of rollouts?",
+        curves={
+            "symmetric": "default-bar",
+            "symmetric, optimal b": "default-optimal-baseline",
+            "symmetric, b = 0": "default-no-baseline",
+            "plain": "default-plain",
+            "plain, optimal b": "default-plain-optimal-baseline",
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+]
+
+EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for experiment in (*_CLAIMS, *_QUESTIONS)}
+"""By name, the thesis' own first."""
+
+RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}
+"""Rollouts a second of two cores, of the projected controller times its features; for estimates alone."""
+
+
+def rollouts(name: str) -> int:
+    """Exploring rollouts of a trial of a set-up."""
+    config = SETUPS[name]
+    assert isinstance(config.algorithm, PGPE)
+    return 2 * config.algorithm.pairs * config.generations
+
+
+def minutes(names: tuple[str, ...]) -> float:
+    """About how long set-ups take on two cores, one trial each [min]."""
+    seconds = 0.0
+    for name in names:
+        config = SETUPS[name]
+        rate = RATES[config.policy.controller]
+        if config.policy.controller == "projected":
+            rate = min(550.0, rate / config.policy.features)
+        seconds += rollouts(name) / rate + 2.0
+    return seconds / 60

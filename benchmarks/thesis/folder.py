@@ -1,0 +1,188 @@
+"""An experiment's folder: what it is for, its runs, and the data that outlives them.
+
+    experiment.json    which experiments, how many trials, how long
+    runs/SETUP-sN/     a run's folder each, shared by all experiments that show the set-up
+    data/SETUP.npz     what its trials recorded
+    data/NAME.npz      what was measured on the learnt policies
+    NAME.svg, .png     the figure
+
+runs/ may be deleted: figures and findings need data/ alone.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from benchmarks.thesis import series
+from benchmarks.thesis.catalogue import EXPERIMENTS, SETUPS
+from benchmarks.thesis.experiment import Experiment, trial
+from benchmarks.thesis.findings import Data
+from farm.errors import ConfigError
+from learner.config import RunConfig
+from learner.run_folder import RunFolder
+
+_VERSION: Final = 1
+_OVER: Final = ("finished", "diverged")
+"""States that running again would not change."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentFolder:
+    """The files of one or more experiments."""
+
+    path: Path
+    experiments: tuple[str, ...]
+    """Their names."""
+    trials: int
+    generations: int | None
+    """Shortens every run, None: as the set-ups say."""
+
+    @classmethod
+    def open(cls, path: Path) -> "ExperimentFolder":
+        """An existing one.
+
+        Raises:
+          ConfigError: there is none, or it is of an experiment that this release does not know.
+        """
+        try:
+            told = json.loads((path / "experiment.json").read_text("utf-8"))
+        except FileNotFoundError:
+            raise ConfigError(f"{path} is not an experiment's folder: it has no experiment.json") from None
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"cannot read {path / 'experiment.json'}: {error}") from None
+        names = told.get("experiments") if isinstance(told, dict) and told.get("version") == _VERSION else None
+        if not isinstance(names, list) or not names:
+            raise ConfigError(f"{path / 'experiment.json'} is not of version {_VERSION}")
+        generations = told.get("generations")
+        return cls(
+            path=path, experiments=tuple(find(str(name)).name for name in names),
+            trials=_count("trials", told.get("trials")),
+            generations=None if generations is None else _count("generations", generations),
+        )  # fmt: skip
+
+    @classmethod
+    def prepare(cls, path: Path, names: Sequence[str], trials: int, generations: int | None) -> "ExperimentFolder":
+        """A new one, or an existing one to go on with; trials may be added.
+
+        Raises:
+          ConfigError: the folder is another experiment's, or something else's.
+        """
+        folder = cls(path=path, experiments=tuple(names), trials=trials, generations=generations)
+        if (path / "experiment.json").exists():
+            there = cls.open(path)
+            if there.experiments != folder.experiments:
+                raise ConfigError(f"{path} holds {', '.join(there.experiments)}: give another --out")
+            if there.generations != generations:
+                said = "all" if there.generations is None else there.generations
+                raise ConfigError(f"{path} was begun with {said} generations: give the same, or another --out")
+            if there.trials > trials:
+                raise ConfigError(f"{path} has {there.trials} trials: give as many or more, or another --out")
+        try:
+            if not (path / "experiment.json").exists() and path.exists() and any(path.iterdir()):
+                raise ConfigError(f"{path} holds something else and no experiment.json: give another --out")
+            folder.check_runs(go_on=True)
+            (path / "runs").mkdir(parents=True, exist_ok=True)
+            (path / "data").mkdir(exist_ok=True)
+            told = {"version": _VERSION, "experiments": list(names), "trials": trials, "generations": generations}
+            aside = path / "experiment.json.new"
+            aside.write_text(json.dumps(told, indent=2) + "\n", "utf-8")
+            aside.replace(path / "experiment.json")
+        except OSError as error:
+            raise ConfigError(f"cannot write to {path}: {error.strerror}") from None
+        return folder
+
+    @property
+    def setups(self) -> tuple[str, ...]:
+        """The set-ups that its experiments show, each once."""
+        return tuple(dict.fromkeys(name for e in self.experiments for name in EXPERIMENTS[e].curves.values()))
+
+    def config(self, setup: str, number: int) -> RunConfig:
+        """The configuration of a trial."""
+        return trial(SETUPS[setup], number, self.generations)
+
+    def run(self, setup: str, number: int) -> RunFolder:
+        """The folder of a trial, whether it is there or not."""
+        return RunFolder(self.path / "runs" / f"{setup}-s{number}")
+
+    def todo(self) -> list[tuple[str, int]]:
+        """Set-ups and trials that are not over, trial by trial: a first picture comes early."""
+        pairs = ((setup, number) for number in range(self.trials) for setup in self.setups)
+        return [pair for pair in pairs if not over(self.run(*pair))]
+
+    def check_runs(self, *, go_on: bool = False) -> None:
+        """See that the runs that are there are the set-ups', and that none is gone whose data is kept.
+
+        To go on with the runs each has to be there; for data alone, all of a set-up may be gone.
+
+        Raises:
+          ConfigError: one is of another configuration, or gone.
+        """
+        for setup in self.setups:
+            folders = [self.run(setup, number) for number in range(self.trials)]
+            there = [folder.path.exists() for folder in folders]
+            for number, folder in enumerate(folders):
+                if there[number] and folder.read_config() != self.config(setup, number):
+                    raise ConfigError(f"{folder.path} is not of the set-up {setup} any more: give another --out")
+            file = self.path / "data" / f"{setup}.npz"
+            known = series.load(file).states if file.exists() and (go_on or any(there)) else ()
+            for folder, exists, state in zip(folders, there, known, strict=False):
+                if state != "missing" and not exists:
+                    raise ConfigError(
+                        f"{file} tells of {folder.path}, which is gone: put it back, or give another --out"
+                    )
+
+    def gather(self) -> None:
+        """Bring data/ up to date with the runs that are there.
+
+        Raises:
+          ConfigError: as check_runs.
+        """
+        self.check_runs()
+        for setup in self.setups:
+            folders = [self.run(setup, number) for number in range(self.trials)]
+            file = self.path / "data" / f"{setup}.npz"
+            if any(folder.path.exists() for folder in folders) or not file.exists():
+                series.save(file, series.read(folders, self.config(setup, 0)))
+
+    def data(self, experiment: Experiment) -> Data:
+        """What is known of an experiment.
+
+        Raises:
+          ConfigError: nothing has been gathered.
+        """
+        known = {label: series.load(self.path / "data" / f"{name}.npz") for label, name in experiment.curves.items()}
+        measured = self.measured(experiment)
+        return Data(
+            series=known, measured=series.read_arrays(measured) if measured.exists() else {},
+            configs={label: self.config(name, 0) for label, name in experiment.curves.items()},
+        )  # fmt: skip
+
+    def measured(self, experiment: Experiment) -> Path:
+        """The file with what was measured on an experiment's policies."""
+        return self.path / "data" / f"{experiment.name}.npz"
+
+
+def find(name: str) -> Experiment:
+    """The experiment of a name.
+
+    Raises:
+      ConfigError: there is none; names those there are.
+    """
+    if name not in EXPERIMENTS:
+        raise ConfigError(
+            f"unknown experiment {name!r}; known are {', '.join(EXPERIMENTS)}, and thesis for all of them"
+        )
+    return EXPERIMENTS[name]
+
+
+def over(folder: RunFolder) -> bool:
+    """Whether a run has ended in a way that running it again would not change."""
+    return (folder.read_summary() or {}).get("state") in _OVER
+
+
+def _count(name: str, value: object) -> int:
+    if type(value) is not int or not 1 <= value <= 10_000_000:
+        raise ConfigError(f"experiment.json: {name} is {value!r}; expected 1 or more")
+    return value

@@ -1,0 +1,194 @@
+"""What an experiment measures on policies that its runs have learnt, beyond what they recorded.
+
+Kept beside the recorded data with the hashes of the runs it is of, and what the figure asks for; measured anew when
+those change.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from benchmarks.thesis.chain import chain
+from benchmarks.thesis.claims import SIZES
+from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer
+from benchmarks.thesis.folder import ExperimentFolder
+from benchmarks.thesis.series import load, read_arrays, write_arrays
+from farm import seeds as randomness
+from farm.arrays import AnyArray, FloatArray
+from farm.errors import ConfigError
+from farm.policies.fourier import Features, Policy, PolicyConfig
+from farm.tasks.finger_gait.hand import LOWER, UPPER
+from farm.tasks.finger_gait.physics import Simulation
+from farm.tasks.finger_gait.task import SUCCESS_STEPS, Perturbation
+from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED
+from learner.replay import stored
+from learner.run_folder import RunFolder
+
+_POINTS: Final = 40
+"""States whose kernel values are compared, all pairs of them."""
+
+_AT_LIMIT: Final = 1e-9  # [rad]
+
+
+def measure(folder: ExperimentFolder, experiment: Experiment) -> None:
+    """Measure what an experiment's figure needs, if that has not been done for these runs.
+
+    Raises:
+      ConfigError: it has not, and the runs are no longer there.
+    """
+    measuring = _measuring(experiment)
+    if measuring is None:
+        return
+    path = folder.measured(experiment)
+    known = {name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()}
+    of = {"hashes": np.array([digest for series in known.values() for digest in series.hashes])}
+    of["recorded"] = np.array([(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in known.values()])
+    of |= {"trials": np.array(folder.trials), "figure": np.array(repr(experiment.figure))}
+    if path.exists():
+        kept = read_arrays(path)
+        if all(name in kept and np.array_equal(kept[name], value) for name, value in of.items()):
+            return
+    for name, series in known.items():
+        for number, digest in enumerate(series.hashes):
+            if digest and not folder.run(name, number).checkpoint.exists():
+                raise ConfigError(f"cannot measure for {experiment.name}: {folder.run(name, number).path} is gone")
+    write_arrays(path, {**measuring(folder, experiment), **of})
+
+
+Measuring = Callable[[ExperimentFolder, Experiment], dict[str, AnyArray]]
+
+
+def _measuring(experiment: Experiment) -> Measuring | None:
+    figure = experiment.figure
+    if isinstance(figure, Curves):
+        return _actions if "action" in figure.panels else None
+    return {Transfer: _transfer, Friction: _friction, Chain: _chain, KernelError: _kernel_error}[type(figure)]
+
+
+def _trials(folder: ExperimentFolder, setup: str) -> list[RunFolder | None]:
+    """A set-up's runs, None where there is no learnt policy."""
+    runs = [folder.run(setup, number) for number in range(folder.trials)]
+    return [run if run.checkpoint.exists() else None for run in runs]
+
+
+def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
+    """How large the mean policy's actions are, generation by generation.
+
+    Returns:
+      action: (set-ups, trials, generations) the largest of a rollout, in units of its joint's range;
+      saturated: (set-ups, trials, generations) part of a rollout's joint targets at or beyond a joint's limits.
+    """
+    names = list(experiment.curves.values())
+    longest = max(folder.config(name, 0).generations for name in names)
+    action = np.full((len(names), folder.trials, longest), np.nan)
+    saturated = action.copy()
+    for i, name in enumerate(names):
+        for trial, run in enumerate(_trials(folder, name)):
+            if run is None or not run.progress():
+                continue
+            rows = run.parameters()
+            rollouts = stored(run).simulation.run(rows["mu"].astype(float), [None] * len(rows))
+            at = rows["generation"] - 1
+            with np.errstate(over="ignore"):
+                action[i, trial, at] = (np.abs(rollouts.actions) / (UPPER - LOWER)).max(axis=(1, 2))
+            acting = np.arange(rollouts.targets.shape[1]) < rollouts.outcome.steps[:, None]
+            limit = (rollouts.targets <= LOWER + _AT_LIMIT) | (rollouts.targets >= UPPER - _AT_LIMIT)
+            saturated[i, trial, at] = (limit & acting[..., None]).sum(axis=(1, 2)) / (acting.sum(axis=1) * len(LOWER))
+    return {"action": action, "saturated": saturated}
+
+
+def _transfer(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
+    """Robust success of each learnt policy on each object.
+
+    Returns:
+      transfer: (set-ups, trials, objects).
+    """
+    assert isinstance(experiment.figure, Transfer)
+    objects = experiment.figure.objects
+    rate = np.full((len(experiment.curves), folder.trials, len(objects)), np.nan)
+    for i, name in enumerate(experiment.curves.values()):
+        for trial, run in enumerate(_trials(folder, name)):
+            for j, item in enumerate(objects if run else ()):
+                assert run
+                policy = stored(run, object_name=item)
+                rate[i, trial, j] = _success(policy.simulation, policy.mu, None)
+    return {"transfer": rate}
+
+
+def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
+    """Robust success of learnt policies at each friction, otherwise perturbed as in an evaluation.
+
+    Returns:
+      success: (set-ups, trials, factors); factors.
+    """
+    assert isinstance(experiment.figure, Friction)
+    factors = experiment.figure.factors
+    rate = np.full((len(experiment.curves), folder.trials, len(factors)), np.nan)
+    for i, name in enumerate(experiment.curves.values()):
+        for trial, run in enumerate(_trials(folder, name)):
+            if run is None:
+                continue
+            policy = stored(run)
+            for j, factor in enumerate(factors):
+                rate[i, trial, j] = _success(policy.simulation, policy.mu, factor)
+    return {"success": rate, "factors": np.array(factors)}
+
+
+def _success(simulation: Simulation, mu: FloatArray, friction: float | None) -> float:
+    """Part of the evaluation's perturbed rollouts that succeed, all at one friction if it is given."""
+    drawn = _drawn(simulation.task.config.steps)
+    if friction is not None:
+        drawn = [replace(perturbation, friction=friction) for perturbation in drawn]
+    theta = np.repeat(mu[None], len(drawn), axis=0)
+    return float(simulation.run(theta, drawn).outcome.success.mean())
+
+
+def _drawn(steps: int) -> list[Perturbation]:
+    """The evaluation's perturbations, for so many control steps."""
+    seeds = (randomness.trial(EVALUATION_SEED, i) for i in range(EVALUATION_ROLLOUTS))
+    return [Perturbation.draw(np.random.default_rng(seed), steps) for seed in seeds]
+
+
+def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
+    """How often the grip changes when two learnt policies act in turn, on the evaluation's perturbed starts.
+
+    Returns:
+      reached: (trials, changes) part of the rollouts that made at least so many;
+      acting: (steps,) and force: (steps, 3) [N] of the first trial's first rollout.
+    """
+    assert isinstance(experiment.figure, Chain)
+    steps = experiment.figure.steps
+    most = steps // SUCCESS_STEPS
+    reached = np.full((folder.trials, most + 1), np.nan)
+    shown: dict[str, AnyArray] = {"acting": np.full(steps, -1), "force": np.zeros((steps, 3))}
+    for trial, runs in enumerate(zip(*(_trials(folder, name) for name in experiment.curves.values()), strict=True)):
+        policies = [stored(run) for run in runs if run is not None]
+        if len(policies) == len(runs):
+            chained = chain(policies, _drawn(steps), steps)
+            reached[trial] = [(chained.changes >= k).mean() for k in range(most + 1)]
+            if trial == 0:
+                shown = {"acting": chained.acting[0], "force": chained.force[0]}
+    return {"reached": reached, **shown}
+
+
+def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
+    """The largest error of the kernel over all pairs of states drawn from U(0, 1) in each number.
+
+    Returns:
+      error: (sizes, counts), the mean over the trials' draws of features; sizes; features.
+    """
+    assert isinstance(experiment.figure, KernelError)
+    counts = experiment.figure.features
+    error = np.zeros((len(SIZES), len(counts)))
+    for i, size in enumerate(SIZES):
+        states = np.random.default_rng(0).uniform(size=(_POINTS, size))
+        squares = ((states[:, None] - states) ** 2).sum(axis=-1)
+        for j, count in enumerate(counts):
+            for trial in range(folder.trials):
+                config = PolicyConfig(features=count)
+                policy = Policy(config, size, Features.draw(config, size, randomness.features(trial)))
+                mapped = np.stack([policy.features(state) for state in states])
+                error[i, j] += np.abs(mapped @ mapped.T - np.exp(-squares / 2)).max() / folder.trials
+    return {"error": error, "sizes": np.array(SIZES), "features": np.array(counts)}

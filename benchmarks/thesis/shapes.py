@@ -1,0 +1,58 @@
+"""Shapes of learning curves: where a return rises, how far it drops, whether it stays down. Pure."""
+
+import numpy as np
+
+from benchmarks.thesis.series import Series
+from farm.arrays import BoolArray, FloatArray
+
+END_OF_START = 5
+"""Generations that count as the beginning of a run."""
+
+
+def about(values: FloatArray, low: float, high: float) -> bool:
+    """Whether most trials are known and their median lies there."""
+    known = values[~np.isnan(values)]
+    return len(known) > len(values) / 2 and bool(low <= np.median(known) <= high)
+
+
+def _smoothed(row: FloatArray) -> FloatArray:
+    """Mean over five generations; nan where there are not five around."""
+    out = np.full(len(row), np.nan)
+    kept = row[~np.isnan(row)]
+    if len(kept) < 5:
+        out[: len(kept)] = kept
+    else:
+        out[2 : len(kept) - 2] = np.convolve(kept, np.ones(5) / 5, "valid")
+    return out
+
+
+def first_and_best(series: Series) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Smoothed returns (trials, generations); each trial's mean return at its start, and its best."""
+    returns = series.columns["return_mean"]
+    smooth = np.stack([_smoothed(row) for row in returns])
+    return smooth, np.nanmean(returns[:, :END_OF_START], axis=1), np.nanmax(smooth, axis=1)
+
+
+def rise(series: Series) -> FloatArray:
+    """(trials,) generation at which the return is half way from its start to its best.
+
+    nan where the best is not above the start by a quarter of it.
+    """
+    smooth, first, best = first_and_best(series)
+    at = [1 + np.argmax(row >= f + 0.5 * (b - f)) for row, f, b in zip(smooth, first, best, strict=True)]
+    return np.where(best - first > 0.25 * np.abs(first), np.array(at, dtype=float), np.nan)
+
+
+def largest_drop(series: Series) -> FloatArray:
+    """(trials,) the most that the smoothed return lost within 10 generations."""
+    out = []
+    for row in first_and_best(series)[0]:
+        kept = row[~np.isnan(row)]
+        out.append(max(float(kept[i] - kept[i : i + 10].min()) for i in range(len(kept))))
+    return np.array(out)
+
+
+def fallen(series: Series) -> BoolArray:
+    """(trials,) whether the return ended below its start, and below its best by more than half of the start's size."""
+    _, first, best = first_and_best(series)
+    return np.asarray(best - series.end("return_mean") > np.maximum(best - first, 0.5 * np.abs(first)))

@@ -1,0 +1,183 @@
+"""Who may do what on a farm with certificates: bundles on disk, and Zenoh's configuration of them.
+
+`farm certificates` makes a folder of bundles; each holds what one machine needs:
+
+    certs/learner/       ca.pem  cert.pem  key.pem  identity.json  roster.json
+    certs/worker-NAME/   ca.pem  cert.pem  key.pem  identity.json
+
+Both sides show a certificate of the farm's own CA. Access control lives where sessions meet, in
+the learner or in a router: a worker may speak only under its own name, the common name of its
+certificate, whatever it calls itself; a viewer may only look.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from farm.errors import ConfigError
+from farm.net import keys
+
+Role = Literal["learner", "worker", "viewer"]
+
+_FILES: Final = ("ca.pem", "cert.pem", "key.pem", "identity.json")
+
+
+@dataclass(frozen=True)
+class Roster:
+    """Common names of everybody who may take part."""
+
+    learners: tuple[str, ...]
+    workers: tuple[str, ...]
+    viewers: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """One machine's certificate, its key, and the CA that vouches for the others."""
+
+    folder: Path
+    role: Role
+    name: str
+    """Common name of the certificate."""
+
+    def listening(self) -> dict[str, object]:
+        """Zenoh's settings for a session that is dialled."""
+        return {
+            "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
+            "transport/link/tls/listen_certificate": str(self.folder / "cert.pem"),
+            "transport/link/tls/listen_private_key": str(self.folder / "key.pem"),
+            "transport/link/tls/enable_mtls": True,
+            "transport/link/tls/close_link_on_expiration": True,
+        }
+
+    def dialling(self) -> dict[str, object]:
+        """Zenoh's settings for a session that dials."""
+        return {
+            "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
+            "transport/link/tls/connect_certificate": str(self.folder / "cert.pem"),
+            "transport/link/tls/connect_private_key": str(self.folder / "key.pem"),
+            "transport/link/tls/enable_mtls": True,
+            "transport/link/tls/close_link_on_expiration": True,
+        }
+
+    def roster(self) -> Roster:
+        """Who may take part; the learner's and a router's bundle know it.
+
+        Raises:
+          ConfigError: this bundle does not, or its list is damaged.
+        """
+        path = self.folder / "roster.json"
+        try:
+            values = json.loads(path.read_text("utf-8"))
+            return Roster(*(tuple(map(str, values[part])) for part in ("learners", "workers", "viewers")))
+        except (OSError, ValueError, KeyError, TypeError):
+            raise ConfigError(f"{path} does not say who may take part; listen with the learner's bundle") from None
+
+
+def find(folder: Path, role: Role, name: str = "") -> Bundle:
+    """The bundle for this role in a folder: the folder itself, or the one of that role and name below it.
+
+    Raises:
+      ConfigError: there is none, several fit, or it is for another role.
+    """
+    if (folder / "cert.pem").exists():
+        return _read(folder, role)
+    if role == "learner":
+        return _read(folder / "learner", role)
+    wanted = folder / f"{role}-{name}"
+    if name and wanted.is_dir():
+        return _read(wanted, role)
+    found = sorted(folder.glob(f"{role}-*/cert.pem"))
+    if len(found) == 1 and not name:
+        return _read(found[0].parent, role)
+    names = ", ".join(path.parent.name.removeprefix(f"{role}-") for path in found) or "none"
+    raise ConfigError(f"{folder} holds certificates for these {role}s: {names}; choose one with --name")
+
+
+def _read(folder: Path, role: Role) -> Bundle:
+    missing = [name for name in _FILES if not (folder / name).is_file()]
+    if missing:
+        raise ConfigError(f"{folder} lacks {', '.join(missing)}: make it with farm certificates, and copy all of it")
+    try:
+        identity = json.loads((folder / "identity.json").read_text("utf-8"))
+        bundle = Bundle(folder, identity["role"], keys.checked("certificate", identity["name"]))
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(f"{folder / 'identity.json'} is damaged") from None
+    if bundle.role != role:
+        raise ConfigError(f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here")
+    return bundle
+
+
+def access_control(farm: str, roster: Roster) -> dict[str, Any]:
+    """Zenoh's access control for the session that others dial: all is denied that is not said here."""
+    rules: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+
+    def admit(name: str, parts: list[tuple[str, list[str], list[str]]]) -> None:
+        own = [
+            {
+                "id": f"{name} {i}", "permission": "allow", "flows": [flow],
+                "messages": messages, "key_exprs": expressions,
+            }
+            for i, (flow, messages, expressions) in enumerate(parts)
+        ]  # fmt: skip
+        rules.extend(own)
+        subjects.append({"id": name, "cert_common_names": [name]})
+        policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
+
+    for name in roster.workers:
+        admit(name, _worker(farm, name))
+    for name in roster.viewers:
+        admit(name, _viewer(farm))
+    for name in roster.learners:
+        admit(name, _learner(farm))
+    return {
+        "enabled": True, "default_permission": "deny",
+        "rules": rules, "subjects": subjects, "policies": policies,
+    }  # fmt: skip
+
+
+_TOKENS: Final = ["liveliness_token"]
+_WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
+
+
+def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
+    """What a worker may send, and what it may be sent."""
+    own, told, asked = f"{name}/**", keys.generation(farm, "*"), [keys.spec(farm, "*"), keys.generation(farm, "*")]
+    sent = [keys.inbox(farm, own), keys.refused(farm, own), told]
+    return [
+        ("ingress", ["put"], [keys.want(farm, own), keys.result(farm, "*", own)]),
+        ("ingress", ["declare_subscriber"], sent),
+        ("ingress", ["query"], asked),
+        ("ingress", _TOKENS, [keys.worker_token(farm, own)]),
+        ("ingress", _WATCHES, [keys.learner_token(farm, "*")]),
+        ("egress", ["put"], sent),
+        ("egress", ["reply", "declare_queryable"], asked),
+        ("egress", _TOKENS, [keys.learner_token(farm, "*")]),
+        # The learners' own wildcard subscriptions, or the worker would see nobody to send to.
+        ("egress", ["declare_subscriber"], [keys.want(farm, "**"), keys.result(farm, "*", "**")]),
+        ("egress", _WATCHES, [keys.worker_token(farm, "**")]),
+    ]
+
+
+def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
+    """A viewer sees which learners and workers there are, what runs are about, and what they report."""
+    told = [keys.generation(farm, "*"), keys.report(farm, "*"), keys.history(farm, "*")]
+    asked = [keys.spec(farm, "*"), keys.generation(farm, "*"), keys.status(farm, "*"), keys.history(farm, "*")]
+    tokens = [keys.learner_token(farm, "*"), keys.worker_token(farm, "**")]
+    return [
+        ("ingress", ["declare_subscriber"], told),
+        ("ingress", ["query"], asked),
+        ("ingress", _WATCHES, tokens),
+        ("egress", ["put"], told),
+        ("egress", ["reply", "declare_queryable"], asked),
+        ("egress", _TOKENS, tokens),
+    ]
+
+
+def _learner(farm: str) -> list[tuple[str, list[str], list[str]]]:
+    """A learner behind a router may do everything on its farm."""
+    every = ["put", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS, *_WATCHES]
+    return [(flow, every, [f"{farm}/**"]) for flow in ("ingress", "egress")]

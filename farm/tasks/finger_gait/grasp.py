@@ -1,0 +1,126 @@
+"""Where the fingers touch an object and what to command for a grip, found by simulation.
+
+Nothing about a grip is typed in: each fingertip comes straight down (the thumb: up) on the
+object until it touches; from there the servos are asked for the joint torques that press
+with a chosen force, tau = J' F (a position servo of stiffness k turns them into an offset
+tau / k of its target).
+"""
+
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+from farm.sim.scene import HandScene
+from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, LOWER, UPPER
+
+PRESS: Final = {"index": 4.0, "middle": 3.0, "thumb": 6.5}
+"""Force with which a finger is told to press [N]; the object's weight and friction share it out."""
+
+WAIT: Final = 0.02
+"""Height over its contact at which a finger that does not grip waits [m]."""
+
+_APPROACH: Final = {"index": -1.0, "middle": -1.0, "thumb": 1.0}
+"""Sign of the vertical motion with which a fingertip comes to the object."""
+
+_BENT: Final = np.array([0.47, 1.09, 0.88, 0.48, 1.11, 0.88, 0.70, 0.86])
+"""Where the search for joint positions starts [rad]: fingers bent round a middling object."""
+
+_REACH: Final = 0.06
+"""How far from the object's centre the approach starts [m]."""
+
+
+class Grasping:
+    """Inverse kinematics and touch for one scene."""
+
+    def __init__(self, scene: HandScene) -> None:
+        """Look at the scene in its start configuration, hand bent and object in place."""
+        self.scene = scene
+        self.data = mujoco.MjData(scene.model)
+        self.data.qpos[:8] = _BENT
+        mujoco.mj_forward(scene.model, self.data)
+        self.centre = self.data.xpos[scene.object_body].copy()
+        self.contact = _BENT.copy()
+        for finger in FINGERS:
+            self.contact[list(FINGER_JOINTS[finger])] = self._touch(finger)
+
+    def command(self, fingers: tuple[str, ...]) -> FloatArray:
+        """Joint targets of a grip by these fingers, the others waiting open [rad], (8,)."""
+        targets = np.empty(8)
+        for finger in FINGERS:
+            joints = list(FINGER_JOINTS[finger])
+            if finger in fingers:
+                targets[joints] = self.contact[joints] + self._press(finger)
+            else:
+                targets[joints] = self.opened(finger)
+        return np.clip(targets, LOWER, UPPER)
+
+    def opened(self, finger: str) -> FloatArray:
+        """Joint positions of a finger waiting over its contact [rad]."""
+        self._place(finger, self.contact)
+        site = self._site(finger)
+        return self._reach(finger, self.data.site_xpos[site][2] - _APPROACH[finger] * WAIT)
+
+    def _touch(self, finger: str) -> FloatArray:
+        """Joint positions at which the fingertip just touches the object, by bisection of its height."""
+        far = self.centre[2] - _APPROACH[finger] * _REACH
+        near = self.centre[2]
+        if self._distance(finger, far) <= 0:
+            raise ConfigError(f"object {self.scene.object_name!r} is in the way of the {finger} finger's approach")
+        for _ in range(40):
+            middle = 0.5 * (far + near)
+            if self._distance(finger, middle) > 0:
+                far = middle
+            else:
+                near = middle
+        return self._reach(finger, far)
+
+    def _distance(self, finger: str, height: float) -> float:
+        """Gap between fingertip and object with the tip at that height [m]."""
+        joints = list(FINGER_JOINTS[finger])
+        self.data.qpos[joints] = self._reach(finger, height)
+        mujoco.mj_kinematics(self.scene.model, self.data)
+        tip = self.scene.tip_geoms[FINGERS.index(finger)]
+        return min(
+            mujoco.mj_geomDistance(self.scene.model, self.data, tip, geom, 1.0, None)
+            for geom in self.scene.object_geoms
+        )
+
+    def _reach(self, finger: str, height: float) -> FloatArray:
+        """Joint positions with the tip over (under) the object's centre line at a height: damped Gauss-Newton."""
+        joints = list(FINGER_JOINTS[finger])
+        site = self._site(finger)
+        jacobian = np.empty((3, self.scene.model.nv))
+        self._place(finger, _BENT)
+        goal = np.array([self.centre[0], height])
+        for _ in range(60):
+            mujoco.mj_kinematics(self.scene.model, self.data)
+            mujoco.mj_comPos(self.scene.model, self.data)
+            error = goal - self.data.site_xpos[site][[0, 2]]
+            mujoco.mj_jacSite(self.scene.model, self.data, jacobian, None, site)
+            plane = jacobian[[0, 2]][:, joints]
+            step = plane.T @ np.linalg.solve(plane @ plane.T + 1e-8 * np.eye(2), error)
+            self.data.qpos[joints] += np.clip(step, -0.2, 0.2)
+        return self.data.qpos[joints].copy()
+
+    def _press(self, finger: str) -> FloatArray:
+        """Target offsets that press with PRESS along the approach: J' F / k [rad]."""
+        joints = list(FINGER_JOINTS[finger])
+        self._place(finger, self.contact)
+        jacobian = np.empty((3, self.scene.model.nv))
+        mujoco.mj_jacSite(self.scene.model, self.data, jacobian, None, self._site(finger))
+        stiffness = self.scene.model.actuator_gainprm[joints, 0]
+        return jacobian[2, joints] * _APPROACH[finger] * PRESS[finger] / stiffness
+
+    def _place(self, finger: str, joints: FloatArray) -> None:
+        """Put one finger's joints as given and the others as they began: nothing depends on what was asked before."""
+        index = list(FINGER_JOINTS[finger])
+        self.data.qpos[:8] = _BENT
+        self.data.qpos[index] = joints[index]
+        mujoco.mj_kinematics(self.scene.model, self.data)
+        mujoco.mj_comPos(self.scene.model, self.data)
+
+    def _site(self, finger: str) -> int:
+        return self.scene.tip_sites[FINGERS.index(finger)]

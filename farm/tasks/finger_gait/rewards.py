@@ -1,0 +1,161 @@
+"""Rewards of the thesis (3.5.2) as terms a step, and the return.
+
+Pure, batched. A new reward is one function here and one line in REWARDS.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.tasks.finger_gait.hand import LOWER, UPPER
+
+TERMS: Final = ("tactile", "joints", "action", "contact points", "drop")
+"""What a reward is made of, in the order of every (..., 5) array of terms."""
+
+RETURN_SCALE: Final = 0.1
+"""Factor of the return (3.4)."""
+
+RETURN_FLOOR: Final = -1e12
+"""A return that overflows counts as this: huge actions must never look good."""
+
+_RANGE: Final = UPPER - LOWER
+
+
+@dataclass(frozen=True)
+class Weights:
+    """One row of Table 3.1."""
+
+    tactile: float
+    """a1"""
+    joints: float
+    """a2"""
+    action: float
+    """a3"""
+    contact_points: float
+    """a4"""
+    drop: float
+    """p"""
+
+
+WEIGHTS: Final[dict[str, Weights]] = {
+    # The thesis says "sensor range": the ranges of the controlled joints [rad].
+    "direct": Weights(1.0, 30.0, 10.0 / float(_RANGE @ _RANGE), 1.0, 1000.0),
+    "projected": Weights(0.1, 6.0, 1.0 / float(_RANGE.mean()), 6.0, 400.0),
+}
+"""Rows of Table 3.1 by the controller they were made for."""
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """The grip to be reached, recorded from the simulation."""
+
+    joints: FloatArray
+    """q_d [rad], (8,)"""
+    images: FloatArray
+    """c_d [N], (3, 18)"""
+    points: FloatArray
+    """CP_d [radii], (3, 3)"""
+
+
+Reward = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, Demonstration, Weights], FloatArray]
+
+
+def _squares(difference: FloatArray) -> FloatArray:
+    return (difference * difference).sum(axis=-1)
+
+
+def basic(
+    joints: FloatArray,
+    images: FloatArray,  # noqa: ARG001
+    points: FloatArray,  # noqa: ARG001
+    action: FloatArray,
+    goal: Demonstration,
+    weights: Weights,
+) -> FloatArray:
+    """Terms of (3.3): joints and action; W_q = a2 / (q_d' q_d) I and W_a = a3 I, which the thesis leaves open."""
+    zero = np.zeros(joints.shape[:-1])
+    near = -weights.joints / float(_squares(goal.joints)) * _squares(joints - goal.joints)
+    return np.stack([zero, near, -weights.action * _squares(action), zero, zero], axis=-1)
+
+
+def full(
+    joints: FloatArray,
+    images: FloatArray,
+    points: FloatArray,
+    action: FloatArray,
+    goal: Demonstration,
+    weights: Weights,
+) -> FloatArray:
+    """Terms of (3.5): tactile image, joints, action and contact points."""
+    terms = basic(joints, images, points, action, goal, weights)
+    touch = images.reshape(*images.shape[:-2], -1) - goal.images.reshape(-1)
+    where = (points - goal.points).reshape(*points.shape[:-2], -1)
+    terms[..., 0] = -weights.tactile / float(_squares(goal.images.reshape(-1))) * _squares(touch)
+    terms[..., 3] = -weights.contact_points * _squares(where)
+    return terms
+
+
+def limited(
+    joints: FloatArray,
+    images: FloatArray,
+    points: FloatArray,
+    action: FloatArray,
+    goal: Demonstration,
+    weights: Weights,
+) -> FloatArray:
+    """Terms of (3.5) with no action punished for more than a joint's range ("limit the action punishment", 4.1.1)."""
+    return full(joints, images, points, np.minimum(np.abs(action), _RANGE), goal, weights)
+
+
+REWARDS: Final[dict[str, Reward]] = {
+    "basic": basic,
+    "full": full,
+    "limited": limited,
+}
+"""Rewards by name: joints (..., 8), images (..., 3, 18), points (..., 3, 3), action (..., 8) -> terms (..., 5)."""
+
+
+def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArray, weights: Weights) -> FloatArray:
+    """Cut the terms where each rollout ended and add the penalty there.
+
+    Args:
+      terms: (B, T, 5) as a reward gave them for every step.
+      steps: (B,) how many control steps each rollout lasted, its last included.
+      dropped: (B,) whether the last of them ended without any contact: the penalty is added.
+      failed: (B,) whether the physics blew up in the last of them: the penalty is all it gives.
+      weights: for the penalty p.
+
+    Returns:
+      (B, T, 5), zero after the end.
+    """
+    count, horizon, _ = terms.shape
+    rows, last = np.arange(count), steps - 1
+    out = np.where((np.arange(horizon) < steps[:, None])[..., None], terms, 0.0)
+    out[rows[failed], last[failed]] = 0.0
+    ended = dropped | failed
+    out[rows[ended], last[ended], 4] = -weights.drop
+    return out
+
+
+def discounted(terms: FloatArray, gamma: float, scale: float = RETURN_SCALE) -> tuple[FloatArray, BoolArray]:
+    """Return (3.4): R = 0.1 sum_t gamma^t r_t, t from 0.
+
+    Args:
+      terms: (B, T, K) reward terms of every step, zero after the end.
+      gamma: discount factor.
+      scale: the 0.1.
+
+    Returns:
+      returns (B,), and (B,) where the sum overflowed and was clamped to RETURN_FLOOR.
+    """
+    total = np.zeros(len(terms))
+    with np.errstate(over="ignore", invalid="ignore"):
+        reward = terms.sum(axis=-1)
+        for t in range(terms.shape[1]):
+            total += gamma**t * reward[:, t]
+        total *= scale
+        clamped = ~(total >= RETURN_FLOOR)  # catches nan as well
+    return np.where(clamped, RETURN_FLOOR, total), clamped

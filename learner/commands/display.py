@@ -1,0 +1,234 @@
+"""How a run is going: a live screen on a terminal, a line a generation elsewhere; JSON or hardly anything if wanted."""
+
+import json
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Final, Literal, Protocol
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from farm.net.telemetry import WorkerStatus
+from learner import config as configs
+from learner.run import Run
+from learner.telemetry.report import Report
+
+_BLOCKS: Final = "▁▂▃▄▅▆▇█"
+_SPARK: Final = 40  # fits into 80 columns
+_WORKERS: Final = 6  # shown by name
+
+Style = Literal["auto", "quiet", "json"]
+"""What a user asked for: a screen or lines, nothing but the end, or a JSON object a line."""
+
+
+class Display(Protocol):
+    """Shows a run while it is entered, and how it ended after that."""
+
+    def __enter__(self) -> "Display":
+        """Begin."""
+        ...
+
+    def __exit__(self, *_: object) -> None:
+        """End."""
+        ...
+
+    def show(self, report: Report) -> None:
+        """A generation is over."""
+        ...
+
+    def conclude(self, lines: Sequence[str]) -> None:
+        """The run is over; the lines say how it went and what to do next."""
+        ...
+
+
+def display(run: Run, announcement: Sequence[str], style: Style) -> Display:
+    """What fits the user's wish and standard output; the announcement says what begins here."""
+    if style == "json":
+        return JsonDisplay(run)
+    if style == "quiet":
+        return QuietDisplay()
+    console = Console()
+    return LiveDisplay(console, run, announcement) if console.is_terminal else PlainDisplay(run, announcement)
+
+
+class QuietDisplay:
+    """Nothing until the run is over."""
+
+    def __enter__(self) -> "QuietDisplay":
+        """Nothing to prepare."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to put away."""
+
+    def show(self, report: Report) -> None:
+        """Say nothing."""
+
+    def conclude(self, lines: Sequence[str]) -> None:
+        """Say how it ended."""
+        _write(lines)
+
+
+class PlainDisplay(QuietDisplay):
+    """One line a generation."""
+
+    def __init__(self, run: Run, announcement: Sequence[str]) -> None:
+        """Say what begins."""
+        self._generations = run.learner.config.generations
+        _write(announcement)
+
+    def show(self, report: Report) -> None:
+        """Write the line."""
+        p, success = report.progress, ""
+        if p.success_rate is not None:
+            success = f" {'success' if p.mean_policy_success else '-':7}  success {p.success_rate:4.0%}"
+        _write(
+            [
+                f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
+                f"  return {p.return_mean:8.3f}  mean policy {p.mean_policy_return:8.3f}"
+                f"{success}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
+            ]
+        )
+
+
+class JsonDisplay(QuietDisplay):
+    """One JSON object a line: the run, each generation as in progress.jsonl, at last the summary."""
+
+    def __init__(self, run: Run) -> None:
+        """Say what begins."""
+        self._run = run
+        folder = str(run.learner.folder.path)
+        self._say("run", {"folder": folder, "live": run.live, "config": configs.to_dict(run.learner.config)})
+
+    def show(self, report: Report) -> None:
+        """Write the generation."""
+        self._say("generation", {**report.progress.to_dict(), "rollouts_per_second": round(report.rate, 1)})
+
+    def conclude(self, lines: Sequence[str]) -> None:  # noqa: ARG002  the summary says it all
+        """Write the summary."""
+        self._say("summary", self._run.summary)
+
+    def _say(self, event: str, values: dict[str, object]) -> None:
+        _write([json.dumps({"event": event, **values})])
+
+
+class LiveDisplay:
+    """Returns, sigma, workers, recording and a progress bar, refreshed in place; messages scroll above."""
+
+    def __init__(self, console: Console, run: Run, announcement: Sequence[str]) -> None:
+        """Say what begins, and prepare the screen."""
+        self._run, self._console = run, console
+        _write(announcement)
+        columns = BarColumn(None), MofNCompleteColumn(), TextColumn("time left"), TimeRemainingColumn()
+        self._bar = Progress(TextColumn("generation"), *columns, console=console, expand=True)
+        done = run.learner.state.generation
+        self._task = self._bar.add_task("", total=run.learner.config.generations, completed=done)
+        self._live = Live(self._screen(None), console=console, refresh_per_second=8)
+        self._handler = RichHandler(console=console, show_path=False, show_level=False)
+        self._returns: list[float] = []
+        self._before: list[logging.Handler] = []
+
+    def __enter__(self) -> "LiveDisplay":
+        """Take the terminal; messages are printed above the screen."""
+        root = logging.getLogger()
+        self._before = [h for h in root.handlers if type(h) is logging.StreamHandler]
+        for handler in self._before:
+            self._handler.setLevel(handler.level)
+            root.removeHandler(handler)
+        root.addHandler(self._handler)
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the last state on the terminal."""
+        self._live.stop()
+        logging.getLogger().removeHandler(self._handler)
+        for handler in self._before:
+            logging.getLogger().addHandler(handler)
+
+    def show(self, report: Report) -> None:
+        """Refresh."""
+        self._returns.append(report.progress.mean_policy_return)
+        self._bar.update(self._task, completed=report.progress.generation)
+        self._live.update(self._screen(report))
+
+    def conclude(self, lines: Sequence[str]) -> None:
+        """Say how it ended."""
+        _write(lines)
+
+    def _screen(self, report: Report | None) -> Group:
+        rows = [self._bar] if report is None else [self._learning(report), self._farm(report), self._bar]
+        return Group(*rows)
+
+    def _learning(self, report: Report) -> Table:
+        p = report.progress
+        table = _grid()
+        table.add_row("return", f"{p.return_mean:.3f}", f"{p.return_min:.3f} to {p.return_max:.3f}, best {p.best:.3f}")
+        succeeds = _success(p.mean_policy_success)
+        table.add_row("mean policy", f"{p.mean_policy_return:.3f}", succeeds)
+        low, high = min(self._returns), max(self._returns)
+        table.add_row("  so far", f"{low:.3f}", Text.assemble((spark(self._returns, _SPARK), "cyan"), f" {high:.3f}"))
+        if p.success_rate is None:
+            table.add_row("failed", str(p.failed), "of the rollouts")
+        else:
+            said = f"of the rollouts; {p.dropped} dropped, {p.failed} failed"
+            table.add_row("success", f"{p.success_rate:.0%}", said)
+        table.add_row("sigma", f"{p.sigma_mean:.3f}", f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}")
+        return table
+
+    def _farm(self, report: Report) -> Table:
+        p, workers = report.progress, self._run.workers
+        table = _grid()
+        extra = f"; {p.reissued} jobs given out again" if p.reissued else ""
+        dropped = self._run.dropped
+        table.add_row("farm", f"{report.rate:.0f}", f"rollouts/s, {p.workers} workers{extra}")
+        for worker in workers[:_WORKERS]:
+            table.add_row("", f"{worker.rate:.0f}", Text(name(worker)))
+        if len(workers) > _WORKERS:
+            table.add_row("", f"{sum(w.rate for w in workers[_WORKERS:]):.0f}", f"{len(workers) - _WORKERS} more")
+        if self._run.recorded:
+            left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
+            table.add_row("recording", "", Text(f"farm view {self._run.learner.folder.path}{left_out}"))
+        if self._run.live is not None:
+            table.add_row("live", "", f"farm view {self._run.live}")
+        return table
+
+
+def name(worker: WorkerStatus) -> str:
+    """A worker as people know it: its name and process, and its host where that is another name."""
+    short, _, instance = worker.worker.partition("/")
+    process = instance.partition("-")[0]
+    return f"{short}/{process}" + ("" if worker.host.startswith(short) else f" on {worker.host}")
+
+
+def spark(values: Sequence[float], width: int) -> str:
+    """A curve of at most so many characters: the last value of each share of the whole."""
+    count = min(width, len(values))
+    chosen = [values[(i + 1) * len(values) // count - 1] for i in range(count)]
+    low = min(values)
+    span = (max(values) - low) or 1.0
+    return "".join(_BLOCKS[int((v - low) / span * (len(_BLOCKS) - 1))] for v in chosen)
+
+
+def _success(success: bool | None) -> Text:
+    if success is None:
+        return Text()
+    return Text("succeeds", "green") if success else Text("does not succeed", "yellow")
+
+
+def _grid() -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(min_width=11, style="bold")
+    table.add_column(min_width=7, justify="right")
+    table.add_column(no_wrap=True, overflow="ellipsis")
+    return table
+
+
+def _write(lines: Sequence[str]) -> None:
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()

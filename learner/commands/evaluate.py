@@ -1,0 +1,80 @@
+"""`farm evaluate`: the learnt mean policy on perturbed starts."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from farm import settings as arguments
+from farm import tasks
+from farm.errors import ConfigError
+from farm.seeds import SEEDS
+from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
+from learner.run import simulate
+from learner.run_folder import RunFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateCommand:
+    """The learnt mean policy on perturbed starts: friction, mass, object position and joint readings."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    rollouts: int = EVALUATION_ROLLOUTS
+    """Perturbed rollouts."""
+    seed: int = EVALUATION_SEED
+    """Seed of the perturbations."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not 1 <= self.rollouts <= 1_000_000:
+            raise ConfigError(f"rollouts is {self.rollouts}; expected 1 to 1000000")
+        if not 0 <= self.seed < SEEDS:
+            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(EvaluateCommand, words, "farm evaluate")
+    figures = evaluate(RunFolder.open(command.run), command.rollouts, command.seed)
+    if command.json:
+        sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+        return 0
+    table = Table(title=f"{figures['run']}, mean policy after generation {figures['generation']}")
+    for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "dropped"):
+        table.add_column(column, justify="left" if column == "conditions" else "right")
+    for name in ("nominal", "perturbed"):
+        row = figures[name]
+        success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
+        returns = [f"{row[key]:.3f}" for key in ("return_mean", "return_min", "return_max")]
+        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["dropped"]))
+    Console().print(table)
+    return 0
+
+
+def evaluate(folder: RunFolder, rollouts: int, seed: int) -> dict[str, Any]:
+    """The figures, as the JSON shows them."""
+    generation, results = simulate(folder, evaluation_jobs(rollouts, seed))
+    judged = tasks.sizes(folder.read_config().task).success
+    parts = {"nominal": results[rollouts:], "perturbed": results[:rollouts]}
+    figures: dict[str, Any] = {"run": folder.name, "generation": generation, "seed": seed}
+    for name, part in parts.items():
+        returns = np.array([result.returns[0] for result in part])
+        figures[name] = {
+            "rollouts": len(part),
+            "success_rate": float(np.mean([result.success[0] for result in part])) if judged else None,
+            "return_mean": float(returns.mean()),
+            "return_min": float(returns.min()),
+            "return_max": float(returns.max()),
+            "dropped": int(sum(result.dropped[0] for result in part)),
+        }
+    return figures

@@ -1,0 +1,43 @@
+"""`farm export`: a learnt policy as one file for plain MuJoCo and numpy."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from farm import settings as arguments
+from farm.errors import ConfigError
+from learner import export
+from learner.replay import stored
+from learner.run_folder import RunFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportCommand:
+    """A learnt policy as one file for plain MuJoCo and numpy; docs/export.md says how to run it."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    to: tyro.conf.Positional[Path]
+    """File to write: a name that ends in .npz."""
+    generation: int | None = None
+    """Generation whose mean policy is written, 0 for the first; None: the last."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.to.suffix != ".npz":
+            raise ConfigError(f"{self.to}: expected a name that ends in .npz")
+        if self.generation is not None and self.generation < 0:
+            raise ConfigError(f"generation is {self.generation}; expected 0 or more")
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(ExportCommand, words, "farm export")
+    policy = stored(RunFolder.open(command.run), command.generation)
+    export.write(command.to, policy)
+    size = command.to.stat().st_size
+    sys.stdout.write(f"mean policy after generation {policy.generation} written to {command.to}, {size >> 10} KiB\n")
+    return 0

@@ -1,0 +1,169 @@
+"""What a learner is told besides the run's configuration: nothing here changes a number."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from farm import settings as arguments
+from farm.errors import ConfigError
+from farm.net import keys
+from farm.net.session import check_endpoint
+from farm.tasks import TASKS
+from learner import config as configs
+from learner.algorithms import name_of
+from learner.commands.display import Style
+from learner.config import RunConfig, changes, preset_for
+from learner.run_folder import RunFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerOptions:
+    """Where a run comes from, where it goes, and who may watch."""
+
+    preset: str = "default"
+    """Settings to begin with: default | thesis; gym with gym: tasks."""
+    algorithm: str | None = None
+    """Learning algorithm, by name: pgpe. Another than the one to begin with has its own settings, at its defaults."""
+    config: Path | None = None
+    """Settings to begin with: a config.json (other flags override it)."""
+    resume: Path | None = None
+    """Go on with the run in this folder; --generations may extend it."""
+    resume_existing: bool = False
+    """Go on with the run of that --name if there is one, begin it otherwise: for learners that others start again."""
+    out: Path = Path("runs")
+    """Folder that run folders are made in."""
+    name: str = ""
+    """Name of the run and its folder; without one: task-preset-sSEED-UTC time."""
+    record: bool = True
+    """Record the run with Rerun."""
+    serve: str | None = None
+    """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
+    listen: str | None = None
+    """Where workers can reach the learner; None: tcp/127.0.0.1:7447, with farm run any free port."""
+    connect: tuple[str, ...] = ()
+    """Dial a router instead of listening, repeatable."""
+    tls: Path | None = None
+    """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
+    trust_network: bool = False
+    """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
+    mixed: bool = False
+    """Admit workers whose machines round differently: faster than waiting for equal ones, but not repeatable."""
+    farm: str = "farm"
+    """Name of the farm: learners and workers of one name work together."""
+    quiet: bool = False
+    """Say only warnings and, in the end, what came out."""
+    json: bool = False
+    """Write a JSON object a line: the run, each generation, the summary."""
+    log_level: str = "INFO"
+    """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
+
+    @property
+    def style(self) -> Style:
+        """How the run is shown."""
+        return "json" if self.json else "quiet" if self.quiet else "auto"
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        keys.checked("farm", self.farm)
+        if self.name:
+            keys.checked("run", self.name)
+        elif self.resume_existing:
+            raise ConfigError("--resume-existing needs --name: the run that is begun once and gone on with later")
+        if self.quiet and self.json:
+            raise ConfigError("--quiet and --json exclude each other")
+        if self.listen is not None and self.connect:
+            raise ConfigError("--listen and --connect exclude each other: a learner listens, or dials a router")
+        for endpoint in (*self.connect, *([self.listen] if self.listen else [])):
+            check_endpoint(endpoint, encrypted=self.tls is not None)
+        if self.serve is not None:
+            address(self.serve)
+
+
+def address(serve: str) -> tuple[str, int]:
+    """Host and port of [HOST:]PORT.
+
+    Raises:
+      ConfigError: it has another form.
+    """
+    host, _, port = serve.rpartition(":")
+    if not port.isdigit() or not 0 < int(port) < 65536:
+        raise ConfigError(f"--serve {serve!r} is not of the form [HOST:]PORT, for example 9876")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
+    """The configuration that other flags change, and the run to resume.
+
+    Raises:
+      ConfigError: two of --preset, --config and --resume, or one that cannot be used, or is for another task.
+    """
+    task = _value(words, "--task") or ""
+    kind = task.partition(":")[0]
+    fitting = preset_for(kind)
+    begin, folder = _origin(words, fitting)
+    if kind in TASKS and fitting != preset_for(begin.task.kind):
+        raise ConfigError(f"--task {task} over settings for {begin.task.task}: begin with --preset {fitting}")
+    if kind in TASKS and kind != begin.task.kind:  # its steps are the other task's
+        begin = replace(begin, task=replace(begin.task, task=task, steps=0))
+    chosen = _value(words, "--algorithm")
+    if chosen is not None and chosen != name_of(begin.algorithm):
+        begin = replace(begin, algorithm=configs.algorithm(chosen)())
+    return begin, folder
+
+
+def _origin(words: Sequence[str], preset: str) -> tuple[RunConfig, RunFolder | None]:
+    chosen = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
+    given = [f"--{name}" for name, value in chosen.items() if value is not None]
+    if len(given) > 1:
+        raise ConfigError(f"{' and '.join(given)} exclude each other: each says what to begin with")
+    if chosen["resume"] is not None:
+        folder = RunFolder.open(Path(chosen["resume"]))
+        return folder.read_config(), folder
+    if chosen["config"] is not None:
+        return configs.read(Path(chosen["config"])), None
+    return configs.preset(chosen["preset"] or preset), None
+
+
+def _value(words: Sequence[str], flag: str) -> str | None:
+    """The last value given for a flag, in either form; a missing one is left to the parser."""
+    found = None
+    for i, word in enumerate(words):
+        if word == flag and i + 1 < len(words):
+            found = words[i + 1]
+        elif word.startswith(flag + "="):
+            found = word.partition("=")[2]
+    return found
+
+
+def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
+    """Whether a run may go on with this configuration.
+
+    Raises:
+      ConfigError: a setting other than the number of generations has changed, or that one is too small.
+    """
+    changed = [change for change in changes(saved, wanted) if change[0] != "generations"]
+    if changed:
+        what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
+        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may grow")
+    done = len(folder.progress())
+    if wanted.generations < done:
+        raise ConfigError(f"--generations {wanted.generations}: the run has {done} behind it")
+
+
+def run_name(options: LearnerOptions, config: RunConfig) -> str:
+    """The new run's name."""
+    fitting = preset_for(config.task.kind)
+    what = options.config.stem if options.config else options.preset if fitting == "default" else fitting
+    task = config.task.task.replace(":", "-").replace("/", "-")
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    return keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
+
+
+def parse(
+    kind: type[arguments.C], words: Sequence[str], program: str
+) -> tuple[arguments.C, RunFolder | None, RunConfig]:
+    """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
+    begin, resumed = origin(words)
+    default = replace(kind(), run=begin)  # type: ignore[type-var]
+    return arguments.parse(kind, words, program, default), resumed, begin

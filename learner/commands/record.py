@@ -1,0 +1,120 @@
+"""`farm record`: a run's recording made on any machine, over the network."""
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from farm import settings as arguments
+from farm.commands import logs
+from farm.commands.screen import display
+from farm.commands.signals import stop_flag
+from farm.errors import ConfigError
+from farm.net import keys, session
+from farm.net.tls import find
+from learner.commands import options, recordings
+from learner.commands.learning import INTERRUPTED
+from learner.run import LISTEN, check_rerun
+
+if TYPE_CHECKING:
+    from learner.recording.remote import Remote
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordCommand:
+    """A run's recording made on any machine: the same as the learner's, all of it, whenever this begins."""
+
+    connect: tuple[str, ...] = ()
+    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
+    run: str = ""
+    """The run; without one the only run on the farm, or the first to appear."""
+    out: Path = Path("recordings")
+    """Folder that the run's recording gets a folder in."""
+    file: bool = True
+    """Write run.rrd and replay.rrd."""
+    serve: str | None = None
+    """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
+    spawn: bool = False
+    """Open a viewer on the live stream."""
+    farm: str = "farm"
+    """Name of the farm."""
+    tls: Path | None = None
+    """Folder with certificates: a viewer's bundle."""
+    name: str = ""
+    """Which viewer's, where the folder holds several."""
+    log_level: str = "INFO"
+    """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
+
+    def __post_init__(self) -> None:
+        """Check names and addresses."""
+        keys.checked("farm", self.farm)
+        if self.run:
+            keys.checked("run", self.run)
+        if self.serve is not None:
+            options.address(self.serve)
+        if not (self.file or self.serve or self.spawn):
+            raise ConfigError("--no-file leaves nothing to do: add --serve PORT or --spawn")
+        if self.spawn and not display():
+            raise ConfigError("no display to open a window on: take --serve PORT, and open the viewer elsewhere")
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        """Where to serve; a viewer of our own finds any port."""
+        if self.serve is not None:
+            return options.address(self.serve)
+        return ("127.0.0.1", 0) if self.spawn else None
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(RecordCommand, words, "farm record")
+    check_rerun()
+    logs.set_up(command.log_level)
+    with stop_flag("ending") as stop:
+        remote = record(command, stop.is_set)
+    where = "" if remote.folder is None else f" in {remote.folder.path}"
+    if remote.end is None:
+        sys.stdout.write(f"recorded up to generation {remote.done}{where}; the same command goes on\n")
+        return INTERRUPTED
+    sys.stdout.write(f"run over after generation {remote.done}, all recorded{where}\n")
+    if remote.folder is not None:
+        sys.stdout.write(f"look at it with: farm view {remote.folder.path}\n")
+    return 0
+
+
+def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
+    """Follow a run to its end, or until stopped."""
+    from learner.recording.remote import open_remote
+    from learner.telemetry.subscriber import Follower, find_run
+
+    bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
+    endpoints = command.connect or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"),)
+    with ExitStack() as kept:
+        # The session goes first: the learner waits for that at the end, while the file is still being merged.
+        with session.connect(endpoints, None, stopped, bundle) as link:
+            run = command.run or find_run(link, command.farm, stopped)
+            follower = Follower(link, command.farm, run)
+            name, config = follower.begin(stopped)
+            path = command.out / run if command.file else None
+            remote = kept.enter_context(open_remote(path, name=name, config=config, serve=command.address))
+            _announce(run, remote, spawn=command.spawn)
+            remote.follow(follower, stopped)
+        return remote
+
+
+def _announce(run: str, remote: "Remote", *, spawn: bool) -> None:
+    done = f", going on after generation {remote.done}" if remote.done else ""
+    into = "" if remote.folder is None else f" into {remote.folder.path}"
+    sys.stdout.write(f"recording run {run}{into}{done}\n")
+    if remote.recording.uri is not None:
+        sys.stdout.write("".join(f"{line}\n" for line in recordings.look_on(remote.recording.uri)))
+    sys.stdout.flush()
+    if spawn and remote.recording.uri is not None:
+        # In a session of its own: the window stays when this ends, whoever looks closes it. A viewer listens, too.
+        flags = ("--bind", "127.0.0.1", "--port", "auto")
+        from learner.recording.viewing import program
+
+        subprocess.Popen([program(), remote.recording.uri, *flags], start_new_session=True)

@@ -1,0 +1,73 @@
+"""`farm runs`: a table of the runs in a folder."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from farm import settings as arguments
+from farm.commands.tables import compact, wide
+from farm.errors import ConfigError
+from learner.run_folder import RunFolder
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunsCommand:
+    """A table of the runs in a folder."""
+
+    dir: tyro.conf.Positional[Path] = Path("runs")
+    """Folder that holds run folders."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(RunsCommand, words, "farm runs")
+    if not command.dir.is_dir():
+        raise ConfigError(f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}")
+    rows = [_row(RunFolder(path.parent)) for path in sorted(command.dir.glob("*/config.json"))]
+    if command.json:
+        sys.stdout.write(json.dumps(rows, indent=2) + "\n")
+        return 0
+    table = compact()
+    for name in ("run", "state", "done", "return", "success", "robust", "hash"):
+        left = name in ("run", "state", "hash")
+        table.add_column(
+            name, justify="left" if left else "right", no_wrap=name not in ("run", "state"), overflow="fold"
+        )
+    for row in rows:
+        robust = row["robust_success_rate"]
+        value = row["mean_policy_return"]
+        table.add_row(
+            row["run"], row["state"], str(row["generations"]),
+            "" if value is None else f"{value:.3f}",
+            {True: "yes", False: "no", None: ""}[row["mean_policy_success"]],
+            "" if robust is None else f"{robust:.0%}",
+            (row["parameters_sha256"] or "")[:8],
+        )  # fmt: skip
+    wide().print(table)
+    return 0
+
+
+def _row(folder: RunFolder) -> dict[str, Any]:
+    """A run's summary; of one that has none yet, what its progress says."""
+    summary = folder.read_summary()
+    progress = folder.progress()
+    if summary is not None and (not progress or summary.get("generations") == progress[-1].generation):
+        return summary
+    last = progress[-1] if progress else None
+    return {
+        "run": folder.name,
+        "state": "running or killed",
+        "generations": last.generation if last else 0,
+        "rollouts": last.rollouts if last else 0,
+        "mean_policy_return": last.mean_policy_return if last else None,
+        "mean_policy_success": last.mean_policy_success if last else None,
+        "robust_success_rate": None,
+        "parameters_sha256": None,
+    }

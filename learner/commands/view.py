@@ -1,0 +1,107 @@
+"""`farm view`: recordings of runs in the Rerun viewer."""
+
+import logging
+import socket
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import tyro
+
+from farm import settings as arguments
+from farm.commands import logs
+from farm.commands.screen import display
+from farm.commands.signals import stop_flag
+from farm.errors import ConfigError, Interrupted, RunError
+from learner.commands import recordings
+from learner.run import check_rerun
+
+log = logging.getLogger(__name__)
+
+_PAGE = 9090  # where a browser finds the viewer, if nobody else is there
+_LOOK = 0.1  # [s] between two looks at the viewer
+_CLOSING = 5.0  # [s] that it has to end
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewCommand:
+    """Opens the recordings of runs in the Rerun viewer; those of several runs with a table of the runs."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of runs, recordings (.rrd), or the address of a live stream."""
+    web: bool = False
+    """Serve the viewer to a browser on this machine instead of opening a window."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(ViewCommand, words, "farm view")
+    logs.set_up("WARNING")
+    check_rerun()
+    if not command.runs:
+        raise ConfigError("nothing to look at: give a run's folder or a .rrd file")
+    found = [recordings.sources(what) for what in command.runs]
+    if not command.web:
+        check_display(command.runs[0])
+    return show([source for some in found for source in some], web=command.web, table=len(found) > 1)
+
+
+def check_display(what: str) -> None:
+    """Whether a window can be opened.
+
+    Raises:
+      ConfigError: it cannot; says what to do.
+    """
+    if not display():
+        raise ConfigError(
+            f"no display to open a window on: farm view {what} --web serves a browser, or copy the recording elsewhere"
+        )
+
+
+def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> int:
+    """Open recordings and wait until the viewer is closed.
+
+    Args:
+      sources: files of recordings, or addresses of live streams.
+      web: serve a browser instead of opening a window.
+      table: begin with the table of the recordings.
+
+    Raises:
+      RunError: the viewer failed.
+      Interrupted: Ctrl-C or SIGTERM, which end the viewer as well.
+    """
+    from learner.recording.viewing import free_port, program, show_table
+
+    port = free_port()
+    command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
+    if web:
+        page = free_port(_PAGE)
+        command += ["--web-viewer", "--web-viewer-port", str(page)]
+        tunnels = " ".join(f"-L {number}:127.0.0.1:{number}" for number in (page, port))
+        log.warning("over ssh: ssh %s %s, and open the page there", tunnels, socket.gethostname())
+    with stop_flag("closing the viewer") as stop, subprocess.Popen(command) as viewer:
+        try:
+            if table and not web:
+                show_table(port, lambda: viewer.poll() is not None or stop.is_set())
+            while viewer.poll() is None and not stop.wait(_LOOK):
+                pass
+        finally:
+            _end(viewer)
+    if stop.is_set():
+        raise Interrupted("the viewer is closed")
+    if viewer.returncode:
+        raise RunError(f"Rerun's viewer ended with status {viewer.returncode}: {_hint(web=web)}")
+    return 0
+
+
+def _hint(*, web: bool) -> str:
+    return "see above" if web else "is the display there? --web serves a browser instead"
+
+
+def _end(viewer: "subprocess.Popen[bytes]") -> None:
+    """End a viewer that has not ended by itself."""
+    viewer.terminate()
+    try:
+        viewer.wait(_CLOSING)
+    except subprocess.TimeoutExpired:
+        viewer.kill()

@@ -1,1 +1,0 @@
-"""Experiments as data: which runs, which question, which figure, and what the thesis says came out."""

@@ -1,0 +1,372 @@
+"""The learner's side of the network: gives a round's jobs to workers and collects what they gave.
+
+One thread, the caller's, owns the ledger and does all publishing; subscriptions fill a queue.
+"""
+
+import hashlib
+import logging
+import secrets
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import MessageError, RunError, brief
+from farm.net import codec, keys
+from farm.net.codec import M
+from farm.net.events import Event
+from farm.net.jobs import Chunk, Generation, Jobs
+from farm.net.messages import Refusal, Spec, Want
+from farm.net.results import Failure, Results
+from farm.net.session import Session
+from farm.net.stats import Progress
+from farm.net.telemetry import RunStatus, WorkerStatus
+from farm.tasks.finger_gait.hand import FINGERS
+from farm.tasks.finger_gait.touch import TAXELS
+from learner.scheduler.admission import Admission
+from learner.scheduler.attendance import Attendance
+from learner.scheduler.census import Census
+from learner.scheduler.round import Round
+from learner.scheduler.scheduler import Ledger, LedgerConfig
+
+log = logging.getLogger(__name__)
+
+_WAIT: Final = 0.2  # [s] between two looks at whether to stop
+_STATUS: Final = 0.5  # [s] between two refreshments of the status
+_ASK: Final = 0.5  # [s] for a token that may be there
+_LOOKS: Final = 5  # tokens that are asked for at a time: for all at once Zenoh needs 9 s where there are 30 000
+_REFUSED: Final = 10_000  # workers that are remembered to be refused
+_PATIENCE: Final = 3.0  # [s] without workers before the user is told
+
+
+class Stopped(Exception):  # noqa: N818  not an error
+    """The user asked to end."""
+
+
+class Dispatcher:
+    """Rounds of jobs, one after the other, on whichever workers there are."""
+
+    def __init__(
+        self,
+        session: Session,
+        farm: str,
+        spec: Spec,
+        generations: int,
+        how_to_join: str | None,
+        stopped: Callable[[], bool],
+        admission: Admission,
+        shapes: Mapping[str, tuple[int, ...]],
+        ledger: LedgerConfig | None = None,
+    ) -> None:
+        """Show the run on the network: subscriptions first, the liveliness token last.
+
+        Args:
+          session: an open session; this dispatcher reads its events.
+          farm: name of the farm.
+          spec: what the run simulates.
+          generations: until its end, for people who ask.
+          how_to_join: the command by which workers join, for when there are none; None where they join by themselves.
+          stopped: asked now and then, true ends the collecting.
+          admission: who may take part.
+          shapes: of a trajectory's frames.
+          ledger: how jobs are cut into chunks, and when they are given out again.
+        """
+        self.run = spec.run
+        self.ignored: Counter[str] = Counter()
+        """Messages not counted, by kind: stale, doubled, foreign, absent, refused, bad, large, version, flood."""
+        self.admission = admission
+        self._session, self._farm, self._stopped = session, farm, stopped
+        self._ledger = Ledger(ledger or LedgerConfig())
+        self._how_to_join = how_to_join
+        self._trace = (spec.task_config["steps"], len(FINGERS) * TAXELS)
+        self._shapes = shapes
+        self._incarnation = secrets.token_hex(8)
+        self._spec = codec.encode(spec)
+        self._header = Generation(
+            run=self.run, incarnation=self._incarnation, round=0, generation=0,
+            spec=hashlib.sha256(self._spec).hexdigest(), traces="none", mu=_NOTHING,
+        )  # fmt: skip
+        self._round: Round | None = None
+        self._told: set[str] = set()
+        self._attendance = Attendance()
+        self._refused: dict[str, str] = {}
+        self._declined: set[str] = set()
+        self._census = Census()
+        self._progress: Progress | None = None
+        self._generations, self._status, self._status_due = generations, b"", 0.0
+        self._alone = time.monotonic()
+        session.subscribe("want", keys.want(farm, "**"))
+        session.subscribe("result", keys.result(farm, self.run, "**"))
+        session.watch("worker", keys.worker_token(farm, "**"))
+        session.answer(keys.spec(farm, self.run), lambda: self._spec)
+        session.answer(keys.generation(farm, self.run), lambda: codec.encode(self._header))
+        session.answer(keys.status(farm, self.run), lambda: self._status)
+        self._tell_status()
+        session.token(keys.learner_token(farm, self.run))
+
+    @property
+    def incarnation(self) -> str:
+        """Which start of the run's learner this is."""
+        return self._incarnation
+
+    @property
+    def workers(self) -> tuple[str, ...]:
+        """Workers that take part, sorted."""
+        return tuple(sorted(self._ledger.workers))
+
+    def census(self) -> tuple[WorkerStatus, ...]:
+        """Workers that take part, with what they did lately."""
+        return self._census.status(time.monotonic())
+
+    @property
+    def reissued(self) -> int:
+        """Jobs given out again since the start."""
+        return self._ledger.reissued
+
+    def begin(self, generation: int, mu: FloatArray, jobs: Jobs, traces: str = "none") -> None:
+        """Announce a round and hand out its first jobs.
+
+        Args:
+          generation: updates done.
+          mu: (P,).
+          jobs: all of them, by index.
+          traces: which tactile traces of the exploring rollouts are wanted, one of TRACES.
+        """
+        self._header = Generation(
+            run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
+            generation=generation, spec=self._header.spec, traces=traces, mu=mu,
+        )  # fmt: skip
+        self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
+        self._round = Round(jobs, traces, self._trace, self._shapes)
+        self._ledger.begin(len(jobs))
+        self._hand_out()
+
+    def collect(self) -> Round:
+        """Wait for the results of the round that has begun.
+
+        Raises:
+          RunError: a job failed on several workers.
+          Stopped: the user asked to end.
+        """
+        assert self._round is not None
+        while not self._ledger.complete:
+            for event in self._events():
+                self._take(event)
+            self._hand_out()
+            self._tell_when_alone()
+            self._tell_status()
+            if self._stopped():
+                raise Stopped
+        return self._round
+
+    def _events(self) -> list[Event]:
+        """What came, after waiting for it until the next deadline."""
+        due = self._ledger.next_deadline(time.monotonic())
+        return self._session.events.waiting(_WAIT if due is None else max(0.001, min(due, _WAIT)))
+
+    def _take(self, event: Event) -> None:
+        try:
+            if event.topic == "want":
+                self._asked(event)
+            elif event.topic == "worker":
+                self._liveliness(event)
+            else:
+                self._result(event)
+        except MessageError as error:
+            self._ignore(error.kind, f"on {event.key}: {error}")
+
+    def _asked(self, event: Event) -> None:
+        sender = keys.tail(event.key, keys.want(self._farm, ""))
+        try:
+            want = _decode(event, Want)
+        except MessageError as error:
+            # It cannot read why either, but will say that it cannot. Who takes part has our release: that was another.
+            if error.kind == "version" and sender not in self._ledger.workers:
+                self._refuse(sender, str(error))
+            raise
+        if want.worker != sender:
+            self._ignore("foreign", f"of {want.worker} from {sender}")
+            return
+        if self._attendance.asked(want, time.monotonic()):
+            self._admit(want)
+
+    def _admit(self, want: Want) -> None:
+        refusal = self.admission.refusal(want)
+        if refusal is not None:
+            self._refuse(want.worker, refusal)
+            return
+        self._refused.pop(want.worker, None)
+        if want.worker in self._declined:
+            return
+        if want.worker not in self._ledger.workers:
+            log.info("worker %s joined (release %s)", want.worker, want.version)
+        now = time.monotonic()
+        self._ledger.want(want.worker, want.credits, now, idle=self.run in want.idle)
+        self._census.asked(want, now)
+
+    def _refuse(self, worker: str, reason: str) -> None:
+        """Tell both sides; the worker every time it asks, or it may never hear it."""
+        self._warn(f"worker {worker} is refused: {reason}")
+        if len(self._refused) < _REFUSED:
+            self._refused[worker] = reason
+        message = codec.encode(Refusal(run=self.run, reason=reason))
+        self._session.publish(keys.refused(self._farm, worker), message, block=False)
+
+    def _liveliness(self, event: Event) -> None:
+        worker = keys.tail(event.key, keys.worker_token(self._farm, ""))
+        if event.alive:
+            self._came(worker)
+            return
+        self._attendance.left(worker)
+        self._refused.pop(worker, None)
+        self._declined.discard(worker)
+        if worker in self._ledger.workers:
+            again = self._forget(worker)
+            log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
+
+    def _came(self, worker: str) -> None:
+        early = self._attendance.came(worker)
+        if early is not None:
+            self._admit(early)
+
+    def _look_who_is_there(self, now: float) -> None:
+        """Of who asks without a token, ask Zenoh: its word that a token came is now and then missed."""
+        for worker in self._attendance.early(_LOOKS):
+            if self._session.present(keys.worker_token(self._farm, worker), _ASK):
+                try:
+                    self._came(worker)
+                except MessageError as error:
+                    self._ignore(error.kind, f"of {worker}: {error}")
+        for worker in self._attendance.absent(now):
+            self._ignore("absent", f"of {worker}, whose liveliness token is not there")
+
+    def _result(self, event: Event) -> None:
+        sender = keys.tail(event.key, keys.result(self._farm, self.run, ""))
+        try:
+            message: Results | Failure = _decode(event, Results)
+        except MessageError as first:
+            if first.kind != "bad":
+                raise
+            try:
+                message = _decode(event, Failure)
+            except MessageError:
+                raise first from None
+        if message.worker != sender or message.run != self.run:
+            self._ignore("foreign", f"of {message.worker} on {event.key}")
+        elif message.worker in self._refused:
+            self._ignore("refused", f"of {message.worker}, which is not admitted")
+        elif (message.incarnation, message.round) != (self._incarnation, self._header.round):
+            self.ignored["stale"] += 1
+        elif isinstance(message, Failure):
+            self._failed(message)
+        else:
+            self._count(message)
+
+    def _count(self, message: Results) -> None:
+        assert self._round is not None
+        place = self._round.place(message)
+        if place is None:
+            self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
+            return
+        verdicts = self._ledger.results(message.worker, message.jobs.tolist(), time.monotonic())
+        new = np.array([verdict == "new" for verdict in verdicts])
+        self._round.put(message, place, new)
+        if new.any():
+            self.admission.counted()
+        self.ignored.update(verdict for verdict in verdicts if verdict != "new")
+        self._census.did(message.worker, len(message.returns), time.monotonic())
+
+    def _failed(self, failure: Failure) -> None:
+        if failure.index is None:
+            self._does_not_serve(failure.worker, failure.error)
+            return
+        if self._round is None or not 0 <= failure.index < len(self._round):
+            self.ignored["bad"] += 1
+            return
+        self._warn(f"worker {failure.worker} failed at a job: {failure.error}")
+        if self._ledger.error(failure.worker, failure.index, time.monotonic()):
+            [job] = self._round.jobs.take([failure.index]).split()
+            raise RunError(
+                f"pair {failure.index} of generation {self._header.generation} (perturbation seed {job.perturbation}) "
+                f"failed wherever it was tried, last with {failure.error}"
+            )
+
+    def _does_not_serve(self, worker: str, reason: str) -> None:
+        """A worker that is here but does not serve this run: others may."""
+        if worker in self._ledger.workers:
+            self._warn(f"worker {worker} does not serve this run: {reason}")
+            self._declined.add(worker)
+            self._forget(worker)
+
+    def _forget(self, worker: str) -> int:
+        """It takes part no longer; how many of its jobs go to others."""
+        again = self._ledger.lost(worker)
+        self._census.left(worker)
+        if not self._ledger.workers:
+            self.admission.deserted()
+        return again
+
+    def _hand_out(self) -> None:
+        assert self._round is not None
+        for worker, indices in self._ledger.assign(time.monotonic()):
+            # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
+            head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
+            chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices), **head))
+            self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
+
+    def report(self, progress: Progress) -> None:
+        """Take in how the last generation went, for people who ask."""
+        self._progress = progress
+
+    def _tell_status(self) -> None:
+        """Keep the answer to status queries fresh; they are answered on another thread, which may not look here."""
+        now = time.monotonic()
+        if now < self._status_due:
+            return
+        self._status_due = now + _STATUS
+        self._look_who_is_there(now)
+        last, flood = self._progress, self._session.events.dropped
+        if flood:
+            self.ignored["flood"] = flood
+        status = RunStatus(
+            run=self.run,
+            generation=self._header.generation,
+            generations=self._generations,
+            return_mean=last.return_mean if last else None,
+            mean_policy_return=last.mean_policy_return if last else None,
+            open=self._ledger.remaining,
+            reissued=self._ledger.reissued,
+            refused=len(self._refused) + len(self._declined),
+            ignored=dict(self.ignored),
+            workers=self.census(),
+        )
+        self._status = codec.encode(status)
+
+    def _tell_when_alone(self) -> None:
+        now = time.monotonic()
+        if self._ledger.workers or self._how_to_join is None:
+            self._alone = now
+        elif now - self._alone > _PATIENCE:
+            log.warning("no workers; start some with: %s", self._how_to_join)
+            self._alone = float("inf")
+
+    def _ignore(self, kind: str, text: str) -> None:
+        self.ignored[kind] += 1
+        self._warn(f"ignored a message {text}")
+
+    def _warn(self, text: str) -> None:
+        """Say something once."""
+        text = brief(text)
+        if text not in self._told and len(self._told) < 1000:
+            self._told.add(text)
+            log.warning("%s", text)
+
+
+_NOTHING: Final = np.empty(0)
+
+
+def _decode(event: Event, kind: type[M]) -> M:
+    return codec.decode(event.payload, kind)

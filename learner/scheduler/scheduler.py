@@ -1,0 +1,235 @@
+"""The ledger: which job of a round is where, over workers that come and go. No I/O, no clock.
+
+A round is a generation's jobs 0..n-1. Every message about a job may be lost, doubled or late: each
+job is counted once, by its first result, wherever we believed the job to be.
+
+    pending --assign--> out --result--> done
+       ^                 | lost, idle, error: nobody holds it any more
+       +-----------------+ overdue: a copy goes to another worker
+
+Times are seconds of one monotonic clock, passed in as `now`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Container, Sequence, Set
+from typing import Literal, NamedTuple, TypeAlias
+
+from learner.scheduler.chunking import LedgerConfig, Pace
+from learner.scheduler.job_table import Books, Worker
+
+__all__ = ["Assignment", "Ledger", "LedgerConfig", "Verdict"]
+
+Verdict: TypeAlias = Literal["new", "doubled", "stale"]
+
+# A job whose copies are all out is given up at its oldest holder after this many times the
+# straggler's patience: workers that hang but stay connected must not keep a round for ever.
+_GIVE_UP = 10.0
+
+
+class Assignment(NamedTuple):
+    """Jobs to send to a worker in one message."""
+
+    worker: str
+    indices: tuple[int, ...]
+
+
+class Ledger:
+    """The books of one round after another, and who gets what when."""
+
+    def __init__(self, config: LedgerConfig) -> None:
+        self._config = config
+        self._pace = Pace(config)
+        self._books = Books(config.copies)
+        self._begun = False
+        self._reissued = 0
+        self._now = -math.inf
+        self._seen = -math.inf  # `assign` has looked after the deadlines up to here [s]
+
+    @property
+    def complete(self) -> bool:
+        """Whether a round has begun and all its jobs are done."""
+        return self._begun and not self._books.open
+
+    @property
+    def remaining(self) -> int:
+        """Jobs of this round that are not done."""
+        return len(self._books.open)
+
+    @property
+    def workers(self) -> Set[str]:
+        """Names of the known workers."""
+        return self._books.workers.keys()
+
+    @property
+    def reissued(self) -> int:
+        """Jobs issued once more, over the ledger's life: after a loss, an error, or as a copy."""
+        return self._reissued
+
+    def begin(self, jobs: int) -> None:
+        """Start a round of `jobs` jobs; the old one is forgotten, workers and credits stay."""
+        if jobs < 0:
+            raise ValueError(f"jobs is {jobs}, expected 0 or more")
+        self._begun = True
+        self._books.begin(jobs, self._now - self._pace.patience)
+        self._seen = -math.inf
+
+    def want(self, worker: str, credits: int, now: float, *, idle: bool = False) -> None:
+        """Note that a worker is there and how many jobs it is willing to hold at once.
+
+        Args:
+            worker: its name; an unknown one joins.
+            credits: jobs that are out there and the next chunk together stay within it.
+            now: time [s].
+            idle: it has nothing to do: what we believed there, or its results, got lost on the way
+                and is pending again.
+        """
+        if credits < 0:
+            raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
+        self._tick(now)
+        known = self._books.workers.setdefault(worker, Worker(credits))
+        known.credits, known.benched = credits, False
+        if idle:
+            known.answered = self._now
+            self._reissued += self._books.release(worker, self._now)
+
+    def lost(self, worker: str) -> int:
+        """Forget a worker; return how many of its jobs are pending again."""
+        if worker not in self._books.workers:
+            return 0
+        self._seen = -math.inf
+        count = self._books.release(worker, self._now)
+        self._reissued += count
+        del self._books.workers[worker]
+        return count
+
+    def results(self, worker: str, indices: Sequence[int], now: float) -> list[Verdict]:
+        """Note the results that came in one message; return for each whether it counts.
+
+        "new" counts, "doubled" came before, "stale" is no job of this round. Results of a worker
+        we do not know count too. Messages of other rounds are the caller's to sort out.
+        """
+        self._tick(now)
+        self._learn(worker, indices)
+        ours = [0 <= index < self._books.size for index in indices]
+        new = iter(self._books.finish(worker, [index for index, our in zip(indices, ours, strict=True) if our]))
+        return ["stale" if not our else "new" if next(new) else "doubled" for our in ours]
+
+    def error(self, worker: str, index: int, now: float) -> bool:
+        """Note that a worker answered an error; return whether the run has to stop.
+
+        It has to when the job failed on `max_errors` hosts that brought results before, or as often and
+        there is nobody left to try: what some machines lack must not end a run that others serve. Until
+        then it is issued again, elsewhere if possible. Who is not known counts for nothing.
+        """
+        self._tick(now)
+        counts, again = self._books.fail(worker, index, self._now)
+        self._reissued += again
+        if worker in self._books.workers:
+            self._books.workers[worker].answered = self._now
+        return counts and self._books.hopeless(index, self._config.max_errors)
+
+    def assign(self, now: float) -> list[Assignment]:
+        """Return the chunks to send now, within the credits, and count them as sent.
+
+        Workers with the fewest jobs come first, then by name. Each is kept at about two chunks,
+        one to work on and one to go on with; the rest waits here, so that all end together.
+        """
+        self._tick(now)
+        size = self._pace.chunk(self._books.waiting, len(self._books.workers))
+        chunks = self._again(self._books.failed, size)
+        chunks += self._first_time(size)
+        if not self._books.any_pending():
+            chunks += self._again(self._books.out, size)
+            chunks += self._again(self._books.full, size)
+        self._seen = self._now
+        return chunks
+
+    def next_deadline(self, now: float) -> float | None:
+        """Return the seconds until `assign` has something to do without any news, or None.
+
+        Overdue jobs that the last `assign` could not place wait for news: a result, a worker.
+        """
+        dues: list[float] = []
+        for queue in (self._books.out, self._books.full, self._books.failed):
+            wait = self._wait(queue)
+            ahead = (since + wait for since in queue.values() if since + wait > self._seen)
+            dues.extend(due for due in (next(ahead, None),) if due is not None)
+        return max(0.0, min(dues) - now) if dues else None
+
+    def _tick(self, now: float) -> None:
+        self._now = max(self._now, now)
+        self._seen = -math.inf
+
+    def _learn(self, worker: str, indices: Sequence[int]) -> None:
+        """Learn the time per job: since the worker was able to begin, over the jobs it did."""
+        known = self._books.workers.get(worker)
+        if known is None:
+            return
+        sent = [known.held[index] for index in set(indices) if index in known.held]
+        if sent:
+            self._pace.learn((self._now - max(known.answered, min(sent))) / len(sent))
+            known.answered = self._now
+
+    def _first_time(self, size: int) -> list[Assignment]:
+        """Hand out pending jobs in chunks, lowest index first; where there are too few for two chunks each, evenly."""
+        free = self._books.free(2 * size) if self._books.any_pending() else []
+        load = sum(held for held, _ in free)
+        chunks: list[Assignment] = []
+        while free and self._books.any_pending():
+            held, name = heapq.heappop(free)
+            # Two chunks fit into the credits, so that one travels while the other is computed.
+            credits = self._books.workers[name].credits
+            chunk = min(size, (credits + 1) // 2)
+            if held > chunk:
+                load -= held
+                continue
+            even = -(-(self._books.waiting + load) // (len(free) + 1)) - held  # until all hold as much
+            taken = self._books.take(name, min(chunk, even, credits - held), self._now)
+            chunks.append(Assignment(name, taken))
+            load -= held
+            held += len(taken)
+            if held < credits and held <= chunk:
+                heapq.heappush(free, (held, name))
+                load += held
+        return chunks
+
+    def _again(self, queue: dict[int, float], size: int) -> list[Assignment]:
+        """Issue failed or overdue jobs to workers that have room and do not hold them."""
+        due = self._due(queue)
+        free = self._books.free(2 * size) if due else []
+        chunks: dict[str, list[int]] = {}
+        for index in due:
+            if not free:
+                break
+            name = self._books.pick(index, free, self._avoided(index), 2 * size)
+            if name is not None:
+                self._reissued += queue is not self._books.failed  # those were counted before
+                self._books.give(index, name, self._now)
+                chunks.setdefault(name, []).append(index)
+        return [Assignment(name, tuple(taken)) for name, taken in chunks.items()]
+
+    def _wait(self, queue: dict[int, float]) -> float:
+        return self._pace.patience * (_GIVE_UP if queue is self._books.full else 1.0)
+
+    def _due(self, queue: dict[int, float]) -> list[int]:
+        """Return the jobs to issue again: overdue ones, oldest first, and every failed one."""
+        if queue is self._books.failed:
+            return list(queue)
+        wait = self._wait(queue)
+        due: list[int] = []
+        for index, since in queue.items():
+            if since + wait > self._now:
+                break
+            due.append(index)
+        return due
+
+    def _avoided(self, index: int) -> Container[str]:
+        """Return the workers that failed at a job, as long as another one may get to it soon."""
+        failed = self._books.errors[index]
+        since = self._books.failed.get(index, -math.inf)
+        if since + self._wait(self._books.failed) <= self._now:
+            return ()
+        return failed if any(name not in failed for name in self._books.workers) else ()

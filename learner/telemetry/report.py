@@ -1,0 +1,75 @@
+"""What is known of a generation that is over, and how it travels."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from farm.arrays import AnyArray
+from farm.errors import MessageError
+from farm.net.results import WireTrajectory
+from farm.net.stats import Progress
+from farm.net.telemetry import Line, RunReport, Trace
+from farm.sim.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Report:
+    """A generation that is over."""
+
+    progress: Progress
+    rate: float
+    """Rollouts a second over this generation."""
+    sample: Trajectory | None
+    """The mean policy's rollout."""
+    traces: Mapping[str, AnyArray]
+    """Tactile traces: `best` and `worst` (T, 54), and `all` (2N, T, 54) if the run keeps them."""
+    replay: Trajectory | None
+    """The best rollout so far at physics rate, once there is a new one."""
+    replay_generation: int
+    """The generation the replayed rollout came from."""
+
+
+def packed(report: Report, run: str, incarnation: str, lines: tuple[Line, ...]) -> RunReport:
+    """A report as it is sent, with what was said meanwhile."""
+    traces = {name: values if name == "all" else values[None] for name, values in report.traces.items()}
+    return RunReport(
+        run=run,
+        incarnation=incarnation,
+        generation=report.progress.generation,
+        progress=report.progress.to_dict(),
+        rate=report.rate,
+        lines=lines,
+        # Copies: a slice would keep the traces of the whole generation in memory.
+        traces=tuple(Trace(name=name, values=np.array(values, "<f4")) for name, values in traces.items()),
+        sample=wire(report.sample),
+        replay=wire(report.replay),
+        replay_generation=report.replay_generation,
+    )
+
+
+def unpacked(message: RunReport) -> Report:
+    """A report as it was.
+
+    Raises:
+      MessageError: its progress makes no sense.
+    """
+    try:
+        progress = Progress.from_dict(message.progress)
+    except ValueError as error:
+        raise MessageError(f"RunReport: {error}") from None
+    if progress.generation != message.generation:
+        raise MessageError(f"RunReport: generation {message.generation} with the progress of {progress.generation}")
+    return Report(
+        progress=progress,
+        rate=message.rate,
+        sample=message.sample.trajectory() if message.sample else None,
+        traces={trace.name: trace.values if trace.name == "all" else trace.values[0] for trace in message.traces},
+        replay=message.replay.trajectory() if message.replay else None,
+        replay_generation=message.replay_generation,
+    )
+
+
+def wire(trajectory: Trajectory | None) -> WireTrajectory | None:
+    """A trajectory as it is sent."""
+    return None if trajectory is None else WireTrajectory.of(trajectory)

@@ -1,0 +1,81 @@
+"""What a run reported so far, for recorders that join late. Bounded: old rollouts go, statistics stay."""
+
+import threading
+from collections import deque
+from dataclasses import replace
+from typing import Final
+
+from farm.net import codec
+from farm.net.results import WireTrajectory
+from farm.net.telemetry import RunReport, Trace
+
+MEMORY: Final = 32 << 20
+"""What rollouts and traces may take in memory [bytes]; the oldest go first."""
+
+PAGE: Final = 4 << 20
+"""A page ends with the report that reaches this size [bytes]."""
+
+_PLAIN: Final = 600  # [bytes] of a report's statistics, about
+
+
+class History:
+    """Reports in order; written by the learner's thread, read by the one that answers."""
+
+    def __init__(self, memory: int = MEMORY, page: int = PAGE) -> None:
+        self._memory, self._page = memory, page
+        self._reports: list[RunReport | bytes] = []  # as bytes, statistics take a fifth
+        self._whole: deque[int] = deque()  # where the reports with rollouts or traces stand
+        self._size = 0
+        self._lock = threading.Lock()
+
+    def add(self, report: RunReport) -> None:
+        """Keep the next generation's report, and let go of the oldest rollouts if they are too many."""
+        with self._lock:
+            size = _size(report)
+            self._reports.append(report if size else codec.encode(report))
+            if size:
+                self._whole.append(len(self._reports) - 1)
+                self._size += size
+            while self._size > self._memory:
+                at = self._whole.popleft()
+                oldest = self._at(at)
+                self._size -= _size(oldest)
+                self._reports[at] = codec.encode(statistics(oldest))
+
+    def page(self, generation: int) -> tuple[RunReport, ...]:
+        """Reports from that generation on, as many as a message should hold; one at least, if there is one."""
+        with self._lock:
+            chosen: list[RunReport] = []
+            size = 0
+            for i in range(self._first(generation), len(self._reports)):
+                chosen.append(self._at(i))
+                size += _PLAIN + _size(chosen[-1])
+                if size >= self._page:
+                    break
+            return tuple(chosen)
+
+    def _first(self, generation: int) -> int:
+        """Where the first report of this generation or a later one stands; one a generation, but some may lack."""
+        at = min(max(generation - 1, 0), len(self._reports))
+        while at > 0 and self._at(at - 1).generation >= generation:
+            at -= 1
+        return at
+
+    def _at(self, i: int) -> RunReport:
+        report = self._reports[i]
+        return codec.decode(report, RunReport) if isinstance(report, bytes) else report
+
+
+def statistics(report: RunReport) -> RunReport:
+    """A report without rollouts and traces."""
+    return replace(report, traces=(), sample=None, replay=None)
+
+
+def _size(report: RunReport) -> int:
+    """What rollouts and traces take [bytes]."""
+    parts: tuple[WireTrajectory | Trace | None, ...] = (report.sample, report.replay, *report.traces)
+    return sum(_bytes(part) for part in parts)
+
+
+def _bytes(part: WireTrajectory | Trace | None) -> int:
+    return sum(getattr(value, "nbytes", 0) for value in vars(part).values()) if part else 0

@@ -1,0 +1,157 @@
+"""A run as somebody elsewhere follows it: its reports in order, each once, however often either side goes away."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from farm.errors import ConfigError, Interrupted, MessageError, RunError
+from farm.net import codec, keys
+from farm.net.events import Event
+from farm.net.session import Session
+from farm.net.telemetry import RunEnd, RunHistory, RunReport
+from learner import config as configs
+from learner.config import RunConfig
+
+log = logging.getLogger(__name__)
+
+_WAIT: Final = 0.2  # [s] between two looks at whether to stop
+_ANSWER: Final = 2.0  # [s] that a learner has to answer
+_AGAIN: Final = 1.0  # [s] after which one that did not is asked again
+_QUIET: Final = 3.0  # [s] without a report after which the last may have been lost
+
+
+def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
+    """The name of the only run on a farm; waits for the first.
+
+    Raises:
+      ConfigError: there are several.
+      Interrupted: it was stopped.
+    """
+    token, told = keys.learner_token(farm, "*"), False
+    while not stopped():
+        runs = sorted(keys.tail(key, keys.learner_token(farm, "")) for key in session.tokens(token, _ANSWER))
+        if len(runs) > 1:
+            raise ConfigError(f"farm {farm} has several runs: {', '.join(runs)}; choose one with --run")
+        if runs:
+            return keys.checked("run", runs[0])
+        if not told:
+            log.info("no run on farm %s yet, waiting for one", farm)
+            told = True
+        # Asked again, not watched: of a token declared at this very moment a watch and a query may disagree.
+        session.events.waiting(_WAIT)
+    raise Interrupted("stopped before there was a run")
+
+
+class Follower:
+    """Reads one run's reports as they come, and asks the learner for those it missed."""
+
+    def __init__(self, session: Session, farm: str, run: str) -> None:
+        """Subscribe: what is published from now on is not missed."""
+        self._session, self._run, self._key = session, run, keys.history(farm, run)
+        self._done, self._incarnation = 0, ""
+        self._config: RunConfig | None = None
+        self._ask_at = 0.0
+        session.subscribe("report", keys.report(farm, run))
+        session.subscribe("history", self._key)
+        session.watch("learner", keys.learner_token(farm, run))
+
+    def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig]:
+        """The recording's id and the run's configuration, as soon as its learner is there.
+
+        Raises:
+          ConfigError: the configuration is none of this release.
+          RunError: the learner speaks another version.
+          Interrupted: it was stopped.
+        """
+        told = False
+        while not stopped():
+            page = self._ask()
+            if page is not None:
+                self._config = configs.from_dict(page.config, f"run {self._run}")
+                return page.recording, self._config
+            if not told:
+                log.info("waiting for the learner of run %s", self._run)
+                told = True
+            for event in self._session.events.waiting(_WAIT):
+                self._note(event)
+        raise Interrupted(f"stopped before run {self._run} was there")
+
+    def follow(self, done: int, stopped: Callable[[], bool]) -> Iterator[RunReport | RunEnd]:
+        """Reports after generation `done` in order, each once; last the end, when the run is over for good.
+
+        Raises:
+          RunError: the run began anew with other settings, or its learner speaks another version.
+        """
+        self._done, self._ask_at = done, 0.0
+        while not stopped():
+            for event in self._session.events.waiting(max(0.001, min(self._ask_at - time.monotonic(), _WAIT))):
+                yield from self._take(event)
+            if time.monotonic() >= self._ask_at:
+                page = self._ask()
+                if page is not None:
+                    yield from self._page(page)
+                    if page.end is not None and self._done >= page.generation:
+                        yield page.end
+                        return
+
+    def _take(self, event: Event) -> Iterator[RunReport]:
+        if event.topic != "report":
+            self._note(event)
+            return
+        try:
+            report = codec.decode(event.payload, RunReport)
+        except MessageError:
+            self._ask_at = 0.0  # the history's answer is checked, and says what is wrong
+            return
+        if report.incarnation != self._incarnation or report.generation > self._done + 1:
+            self._ask_at = 0.0
+        elif report.generation == self._done + 1:
+            self._ask_at = time.monotonic() + _QUIET
+            self._done += 1
+            yield report
+
+    def _note(self, event: Event) -> None:
+        """Look at what is not a report: mostly a reason to ask."""
+        if event.topic == "learner" and not event.alive:
+            log.warning("the learner of run %s is gone, waiting for it to come back", self._run)
+        elif event.topic in ("learner", "history"):
+            self._ask_at = 0.0
+
+    def _ask(self) -> RunHistory | None:
+        """What the learner reported after the last generation we have, None when nobody answers."""
+        payload = self._session.ask(f"{self._key}?from={self._done + 1}", _ANSWER)
+        self._ask_at = time.monotonic() + (_AGAIN if payload is None else _QUIET)
+        if payload is None:
+            return None
+        try:
+            return codec.decode(payload, RunHistory)
+        except MessageError as error:
+            raise RunError(f"the learner of run {self._run} cannot be understood: {error}") from None
+
+    def _page(self, page: RunHistory) -> Iterator[RunReport]:
+        if page.incarnation != self._incarnation:
+            self._recognise(page)
+        if page.generation > self._done:
+            self._ask_at = 0.0  # at least one page more, until we are level
+        if not page.reports:
+            self._done = max(self._done, page.generation)  # what its folder lost is not to be had
+        for report in page.reports:
+            if report.generation > self._done:
+                self._done = report.generation
+                yield report
+
+    def _recognise(self, page: RunHistory) -> None:
+        """See that a learner that comes back goes on with the run we know."""
+        config = configs.from_dict(page.config, f"run {self._run}")
+        if self._config is not None:
+            for name, old, new in other(self._config, config):
+                raise RunError(f"run {self._run} began anew: --{name} was {old} and is {new}; start a recorder anew")
+        if self._incarnation:
+            log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
+        self._incarnation = page.incarnation
+
+
+def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
+    """Settings by which two configurations are of different runs: all but the number of generations."""
+    return (change for change in configs.changes(old, new) if change[0] != "generations")

@@ -1,0 +1,160 @@
+"""A user's mistake gets one line, the right exit status, and costs nothing."""
+
+import json
+import logging
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes import SMALL, Farm
+
+from farm.__main__ import main
+from learner.run import free_endpoint
+
+MISTAKES = [
+    (("fly",), "unknown command 'fly'; known are run, learner"),
+    (("run", "--preset", "best"), "unknown preset 'best'; known are default, thesis"),
+    (("run", "--state", "smell"), "unknown state base 'smell'; known are joints, joints+contacts, tactile"),
+    (("run", "--algorithm", "guess"), "unknown algorithm 'guess'; known are pgpe"),
+    (("run", "--backend", "gpu"), "unknown backend 'gpu'; known are cpu"),
+    (("run", "--object", "cat"), "unknown object 'cat'; known are bar"),
+    (("run", "--controller", "pid"), "expected one of ('direct', 'projected', 'kernel', 'cosine')"),
+    (("run", "--goal-grip", "fist"), "unknown grip 'fist'; known are index+thumb"),
+    (("run", "--task", "juggling"), "unknown task 'juggling'; known are finger-gait, gym:NAME"),
+    (
+        ("run", "--task", "gym:Swimmr-v5"),
+        "task gym:Swimmr-v5: Environment `Swimmr` doesn't exist. Did you mean: `Swimmer`?",
+    ),
+    (("run", "--task", "gym:os:Swimmer-v5"), "task 'gym:os:Swimmer-v5' names a module to import, which is refused"),
+    (("run", "--task", "gym:Swimmer"), "task 'gym:Swimmer' is no environment's name; expected gym:NAME-vN"),
+    (("run", "--task", "gym:Pendulum-v1"), "task gym:Pendulum-v1: not an environment of MuJoCo"),
+    (
+        ("run", "--task", "gym:Swimmer-v5", "--preset", "thesis"),
+        "over settings for finger-gait: begin with --preset gym",
+    ),
+    (("run", "--task", "gym:Swimmer-v5", "--state", "tactile"), "--state is a setting of finger-gait; gym: tasks have"),
+    (("run", "--task", "gym:Swimmer-v5", "--action", "absolute"), "--action and --clip are settings of finger-gait"),
+    (("run", "--task", "gym:Swimmer-v5", "--stop-when-solved", "1"), "gym:Swimmer-v5 knows returns, but no success"),
+    (("run", "--task", "gym:Swimmer-v5", "--steps", "10001"), "steps is 10001; expected 0 to 10000"),
+    (("run", "--pairs", "-3"), "pairs is -3, expected an integer of 1 or more"),
+    (("run", "--pairs", "many"), "error parsing --pairs"),
+    (("run", "--gamma", "1.5"), "gamma is 1.5; expected a number in (0, 1]"),
+    (("run", "--workers", "-1"), "workers is -1; expected 0 to 1024"),
+    (("run", "--pears", "3"), "did you mean --pairs"),
+    (("run", "--serve", "here"), "is not of the form [HOST:]PORT"),
+    (("run", "--name", "a/b"), "run 'a/b' is not a name"),
+    (("run", "--config", "nowhere.json"), "cannot read the configuration nowhere.json"),
+    (("run", "--preset", "thesis", "--resume", "x"), "--preset and --resume exclude each other"),
+    (("run", "--resume", "nowhere"), "nowhere is not a run's folder"),
+    (("run", "--init-from", "nowhere"), "nowhere is not a run's folder"),
+    (("run", "--log-level", "LOUD"), "unknown log level 'LOUD'"),
+    (("learner", "--listen", "tcp/x"), "is not of the form tcp/HOST:PORT"),
+    (("learner", "--listen", "tcp/a:1", "--connect", "tcp/b:2"), "--listen and --connect exclude each other"),
+    (("worker", "--connect", "udp/1.2.3.4:5"), "is not of the form tcp/HOST:PORT"),
+    (("worker", "--processes", "0"), "processes is 0; expected 1 to 4096"),
+    (("worker", "--backend", "gpu"), "unknown backend 'gpu'; known are cpu"),
+    (("evaluate", "nowhere"), "nowhere is not a run's folder"),
+    (("evaluate", "nowhere", "--rollouts", "0"), "rollouts is 0; expected 1"),
+    (("replay", "nowhere"), "nowhere is not a run's folder"),
+    (("view", "nowhere"), "no recording in nowhere"),
+    (("runs", "nowhere"), "there is no folder nowhere"),
+]
+
+
+@pytest.fixture
+def logging_as_before() -> Iterator[None]:
+    """Commands set up the root logger for a process of their own."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+@pytest.mark.usefixtures("logging_as_before")
+@pytest.mark.parametrize(
+    ("words", "line"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
+)
+def test_mistakes(
+    words: tuple[str, ...],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """In this process: a program for each would take as long as all others together."""
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    said = "".join(capfd.readouterr())
+    assert line.lower() in said.lower()
+    assert len(said.strip().splitlines()) == 1
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_mistake_of_a_program(farm: Farm) -> None:
+    said = farm.call("run", "--seed", "-1", status=2, timeout=60)
+    assert said == "farm: seed is -1; expected 0 to 2^32 - 1\n"
+
+
+def test_a_port_in_use(farm: Farm) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        said = farm.call("learner", "--listen", endpoint, *SMALL, status=2)
+    assert f"cannot listen on {endpoint}" in said
+    assert "Traceback" not in said
+    assert not (farm.folder / "runs").exists()
+
+
+def test_nobody_answers(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    said = farm.call("worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1)
+    assert f"nobody answers at {endpoint} yet, trying again" in said
+    assert f"nobody answers at {endpoint} after 4 s: start a learner there, or check --connect" in said
+    assert "Traceback" not in said
+
+
+def test_run_folders_and_checkpoints(farm: Farm) -> None:
+    farm.call("run", "--name", "r", "--generations", "2", *SMALL)
+    runs = farm.folder / "runs"
+    kept = (runs / "r" / "checkpoint").read_bytes()
+
+    assert "exists and is never overwritten" in farm.call("run", "--name", "r", *SMALL, status=2)
+    assert "--seed is 0 in the run and 4 here" in farm.call("run", "--resume", "runs/r", "--seed", "4", status=2)
+    assert "the run has 2 behind it" in farm.call("run", "--resume", "runs/r", "--generations", "1", status=2)
+    said = farm.call("run", "--init-from", "runs/r", "--controller", "cosine", "--features", "9", status=2)
+    assert "its parameters mean something else" in said
+
+    def refused(content: bytes, expected: str) -> None:
+        shutil.rmtree(runs / "broken", ignore_errors=True)
+        shutil.copytree(runs / "r", runs / "broken")
+        (runs / "broken" / "checkpoint").write_bytes(content)
+        for words in (("run", "--resume", "runs/broken", "--generations", "5"), ("evaluate", "runs/broken")):
+            said = farm.call(*words, status=2)
+            assert expected in said
+            assert len(said.strip().splitlines()) == 1
+
+    refused(kept[:-10], "is truncated or damaged")
+    refused(b"", "is not a checkpoint")
+    refused(kept.replace(b"checkpoint 1", b"checkpoint 9"), "is a checkpoint of another version")
+    assert (runs / "r" / "checkpoint").read_bytes() == kept
+
+    config = json.loads((runs / "r" / "config.json").read_text())
+    (farm.folder / "c.json").write_text(json.dumps({**config, "version": 99}))
+    assert "not a configuration of version 1 (found 99)" in farm.call("run", "--config", "c.json", status=2)
+    (farm.folder / "c.json").write_text(json.dumps({**config, "colour": "red"}))
+    assert "unknown setting colour" in farm.call("run", "--config", "c.json", status=2)
+    (farm.folder / "c.json").write_text("{")
+    assert "is not JSON" in farm.call("run", "--config", "c.json", status=2)
+
+
+def test_a_checkpoint_of_another_configuration(farm: Farm) -> None:
+    farm.call("run", "--name", "a", "--generations", "1", *SMALL)
+    farm.call("run", "--name", "b", "--generations", "1", "--seed", "3", *SMALL)
+    runs = farm.folder / "runs"
+    shutil.copy(runs / "a" / "checkpoint", runs / "b" / "checkpoint")
+    said = farm.call("run", "--resume", "runs/b", "--generations", "2", status=2)
+    assert "is of another configuration: --seed is 0 there and 3 in config.json" in said

@@ -1,0 +1,452 @@
+"""What a user does with finished runs: see them again, film, compare and play them, take the policy elsewhere."""
+
+import contextlib
+import ctypes.util
+import importlib.metadata
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from processes import Farm
+from recordings import read
+from rerun.chunk import RrdReader
+
+import assets
+from farm.errors import ConfigError
+from farm.policies.fourier import CONTROLLERS
+from farm.sim import video
+from farm.sim.rendering import lit
+from farm.sim.viewer import Player
+from farm.tasks.finger_gait.observations import STATES
+from learner import export
+from learner.replay import Conditions, again, stored
+from learner.run_folder import RunFolder
+
+GENERATIONS = 6
+PLAY_POLICY = Path(__file__).parents[2] / "examples" / "play_policy.py"
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
+    """Two small runs, one of them without a recording and with another controller."""
+    farm = Farm(tmp_path_factory.mktemp("done"))
+    farm.call("run", "--name", "a", "--pairs", "4", "--generations", str(GENERATIONS))
+    few = ("--pairs", "3", "--generations", "3", "--no-record")
+    farm.call("run", "--name", "b", "--preset", "thesis", "--features", "60", "--seed", "5", *few)
+    yield farm
+    farm.close()
+
+
+def folder(farm: Farm, name: str = "a") -> RunFolder:
+    return RunFolder.open(farm.folder / "runs" / name)
+
+
+# ---------------------------------------------------------------- replay
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_the_last_policy_gives_the_runs_own_return(done: Farm, name: str) -> None:
+    assert again(folder(done, name)).trajectory.value == done.summary(name)["mean_policy_return"]
+
+
+def test_earlier_policies_give_what_their_generation_said(done: Farm) -> None:
+    # A line of progress.jsonl has the return of the mean that was explored around: that of the generation before.
+    for line in done.progress("a"):
+        shown = again(folder(done), generation=line["generation"] - 1)
+        assert shown.trajectory.value == line["mean_policy_return"]
+        assert shown.trajectory.success == line["mean_policy_success"]
+
+
+def test_friction_changes_the_rollout_and_a_factor_of_one_does_not(done: Farm) -> None:
+    nominal = again(folder(done))
+    assert again(folder(done), Conditions(friction=1.0)).trajectory.value == nominal.trajectory.value
+    slippery = again(folder(done), Conditions(friction=0.05))
+    assert slippery.trajectory.value != nominal.trajectory.value
+
+
+def test_another_object(done: Farm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = assets.path("objects/bar.xml").read_text()
+    (tmp_path / "thick.xml").write_text(text.replace('size="0.011 0.06 0.011"', 'size="0.015 0.045 0.015"'))
+    (tmp_path / "cannonball.xml").write_text(text.replace('mass="0.05"', 'mass="50"'))
+    real, known = assets.path, assets.objects()
+    own = {f"objects/{name}.xml": tmp_path / f"{name}.xml" for name in ("thick", "cannonball")}
+    monkeypatch.setattr(assets, "objects", lambda: [*known, "thick", "cannonball"])
+    monkeypatch.setattr(assets, "path", lambda name: own.get(name) or real(name))
+    shown = again(folder(done), Conditions(object="thick"))
+    assert shown.stored.simulation.scene.object_name == "thick"
+    assert shown.trajectory.value != again(folder(done)).trajectory.value
+    with pytest.raises(ConfigError, match="grip 'index\\+thumb' does not hold object 'cannonball'"):
+        again(folder(done), Conditions(object="cannonball"))
+
+
+def test_a_policy_that_is_not_stored(done: Farm, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(folder(done).path, copy)
+    head, _, rows = (copy / "parameters").read_bytes().partition(b"\n")
+    size = len(rows) // GENERATIONS
+    kept = b"".join(rows[g * size : (g + 1) * size] for g in (1, 3))  # of every second generation
+    (copy / "parameters").write_bytes(head.replace(b'"every": 1', b'"every": 2') + b"\n" + kept)
+    said = done.call("replay", str(copy), "--generation", "3", status=2)
+    assert "generation 3 is not stored" in said
+    assert "2 from 2 to 4 are, the nearest is 2" in said
+    assert len(said.splitlines()) == 1
+    assert stored(RunFolder.open(copy), 6).generation == 6  # the checkpoint's is always there
+    assert np.array_equal(stored(RunFolder.open(copy), 4).mu, stored(folder(done), 4).mu)
+
+
+def test_a_replay_says_what_it_shows(done: Farm, tmp_path: Path) -> None:
+    path = tmp_path / "again.rrd"
+    done.call("replay", "runs/a", "--generation", "2", "--friction", "0.5", "--to", str(path))
+    (batch,) = read(path)["/rollout"]
+    (name,) = [n for n in batch.schema.names if n.endswith(":text")]
+    assert "mean policy after generation 2, friction times 0.5" in batch.column(name).to_pylist()[0][0]
+
+
+# ---------------------------------------------------------------- video
+
+needs_drawing = pytest.mark.skipif(
+    not any(ctypes.util.find_library(name) for name in ("OSMesa", "EGL")),
+    reason="needs OSMesa or EGL (Debian: libosmesa6 or libegl1)",
+)
+
+
+def test_moments_last_as_long_as_they_should() -> None:
+    times = np.arange(151) * 0.01
+    shown = video.moments(times.tolist(), speed=0.25, rest=1.0)
+    assert len(shown) == 1.5 / 0.25 * 30 + 1 + 30
+    assert shown[0] == 0
+    assert shown[-31:] == [150] * 31
+    assert np.all(np.diff(shown) >= 0)
+    assert len(video.moments([0.0, 0.1], speed=10.0, rest=0.0)) == 2
+
+
+@needs_drawing
+def test_a_gif(done: Farm, tmp_path: Path) -> None:
+    from PIL import Image
+
+    path = tmp_path / "a.gif"
+    said = done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "1", "--video", str(path))
+    assert f"video: {path}" in said
+    assert path.stat().st_size < 1.5e6
+    with Image.open(path) as gif:
+        assert gif.size == video.SIZE
+        pictures = []
+        for i in range(gif.n_frames):
+            gif.seek(i)
+            pictures.append(np.array(gif.convert("RGB"), dtype=int))
+            seconds = gif.info["duration"] / 1000
+    assert 0.02 <= seconds <= 1.1
+    changed = np.abs(pictures[0] - pictures[-1]).max(axis=-1) > 60
+    assert 0.005 < changed.mean() < 0.5  # fingers moved, the rest stayed
+    orange = (pictures[0][..., 0] > 180) & (pictures[0][..., 2] < 90) & (pictures[0][..., 1] > 90)
+    assert 0.01 < orange.mean() < 0.2  # the bar is there, and no more than a part of the picture
+
+
+def test_nothing_to_draw_with(done: Farm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    said = done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--video", str(tmp_path / "a.gif"), status=1)
+    assert "MuJoCo cannot draw here" in said.splitlines()[-1]
+    assert len(said.splitlines()) == 3  # and what the replay itself gave
+    assert not (tmp_path / "a.gif").exists()
+
+
+@needs_drawing
+def test_an_mp4(done: Farm, tmp_path: Path) -> None:
+    import imageio_ffmpeg
+
+    path = tmp_path / "a.mp4"
+    done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "2", "--video", str(path))
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
+    assert frames == round(1.5 / 2 * 30) + 1 + 30
+    assert seconds == pytest.approx(frames / 30, abs=0.05)
+
+
+# ---------------------------------------------------------------- compare
+
+
+def test_a_comparison_holds_each_runs_numbers(done: Farm) -> None:
+    said = done.call("compare", "runs/a", "runs/b", "--to", "c.rrd")
+    assert "written to c.rrd; look at it with: farm view c.rrd" in said
+    path = done.folder / "c.rrd"
+    (recording,) = RrdReader(path).recordings()
+    assert (recording.application_id, recording.recording_id) == ("rolloutfarm comparison", "comparison")
+    entities = read(path)
+    for name in ("a", "b"):
+        (batch,) = [b for b in entities[f"/runs/{name}/return"] if "generation" in b.schema.names]
+        (column,) = [n for n in batch.schema.names if n.endswith("scalars")]
+        lines = done.progress(name)
+        assert [v[0] for v in batch.column(column).to_pylist()] == [p["mean_policy_return"] for p in lines]
+        assert batch.column("generation").cast("int64").to_pylist() == [p["generation"] for p in lines]
+        assert batch.column("rollouts").cast("int64").to_pylist() == [p["rollouts"] for p in lines]
+        frames = sum(b.num_rows for b in entities[f"/runs/{name}/world/object"] if "sim_time" in b.schema.names)
+        assert frames == len(again(folder(done, name)).trajectory.times)
+    (batch,) = entities["/table"]
+    (column,) = [n for n in batch.schema.names if n.endswith(":text")]
+    table = batch.column(column).to_pylist()[0][0]
+    assert "| controller | kernel | projected |" in table
+    assert "| seed | 0 | 5 |" in table
+    assert (
+        f"| hash | {done.summary('a')['parameters_sha256'][:8]} | {done.summary('b')['parameters_sha256'][:8]}" in table
+    )
+
+
+def test_a_recording_has_its_runs_properties(done: Farm) -> None:
+    found = {}
+    for entity, batches in read(folder(done).recording).items():
+        if entity.startswith("/__properties/"):
+            for batch in batches:
+                for name in batch.schema.names:
+                    found[f"{entity.rpartition('/')[2]} {name.rpartition(':')[2]}"] = batch.column(name).to_pylist()[0]
+    summary = done.summary("a")
+    assert found["run seed"] == [0]
+    assert found["run controller"] == ["kernel"]
+    assert found["run preset"] == ["own"]
+    assert found["result return"] == [summary["mean_policy_return"]]
+    assert found["result success"] == [summary["mean_policy_success"]]
+
+
+@pytest.mark.slow
+def test_several_recordings_are_a_table_in_the_viewer(done: Farm, tmp_path: Path) -> None:
+    import rerun_cli
+    from rerun.experimental import ViewerClient
+
+    from learner.recording.viewing import free_port, show_table
+
+    other = tmp_path / "other.rrd"
+    done.call("replay", "runs/a", "--to", str(other))
+    files = [str(folder(done).recording), str(other)]
+    port = free_port()
+    binary = Path(rerun_cli.__file__).with_name("rerun")  # `python -m rerun` would only be its parent
+    command = [binary, *files, "--bind", "127.0.0.1", "--port", str(port), "--headless"]
+    home = {name: str(tmp_path) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_RUNTIME_DIR")}
+    with (tmp_path / "viewer.log").open("w+") as log:
+        viewer = subprocess.Popen(command, env={**os.environ, **home}, stdout=log, stderr=log)
+        try:
+            shown = show_table(port, lambda: viewer.poll() is not None)
+            if viewer.poll() is not None:
+                log.seek(0)
+                pytest.skip(f"the viewer needs Vulkan (Debian: mesa-vulkan-drivers libvulkan1): {log.read()[-200:]}")
+            assert shown
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            columns: set[str] = set()
+
+            def drawn() -> bool:
+                client.take_screenshot()  # a viewer without a window draws when it is asked
+                with contextlib.suppress(ConnectionError):  # not drawn yet
+                    columns.update(column.name for column in client.get_table_schema())
+                return bool(columns)
+
+            done.wait_for(drawn)
+        finally:
+            viewer.terminate()
+            viewer.wait(20)
+    assert {"property:run:seed", "property:run:preset", "property:result:return", "property:result:success"} <= columns
+
+
+# ---------------------------------------------------------------- export
+
+
+def bare(farm: Farm, path: Path) -> str:
+    """What the example says in an interpreter where importing any of this project raises."""
+    code = (
+        "import runpy, sys\n"
+        "for package in ('farm', 'learner', 'workers', 'assets'): sys.modules[package] = None\n"
+        f"sys.path.append({str(Path(mujoco.__file__).parents[1])!r})\n"
+        f"sys.argv = ['play_policy.py', {str(path)!r}]\n"
+        f"runpy.run_path({str(PLAY_POLICY)!r}, run_name='__main__')\n"
+    )
+    command = [sys.executable, "-I", "-S", "-c", code]
+    ended = subprocess.run(command, cwd=farm.folder, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def returned(said: str) -> float:
+    return float(said.splitlines()[-1].removeprefix("return "))
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, name: str) -> None:
+    path = done.folder / f"{name}.npz"
+    said = done.call("export", f"runs/{name}", str(path))
+    assert f"written to {path}" in said
+    with np.load(path, allow_pickle=False) as file:
+        assert file["mu"].tobytes() == stored(folder(done, name)).mu.tobytes()
+        assert "file=" not in str(file["mjcf"])
+    assert returned(bare(done, path)) == done.summary(name)["mean_policy_return"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_every_controller_and_state_can_be_exported(farm: Farm, controller: str, state: str) -> None:
+    settings = ("--controller", controller, "--state", state, "--features", "40", "--initial-sigma", "0.3")
+    farm.call("run", "--name", "r", "--pairs", "3", "--generations", "2", "--no-record", *settings)
+    farm.call("export", "runs/r", "p.npz")
+    assert returned(bare(farm, farm.folder / "p.npz")) == farm.summary("r")["mean_policy_return"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("--action", "increment", "--no-clip"),
+        ("--action", "absolute", "--reward", "basic"),
+        ("--state", "joints+contacts", "--contacts-scale", "0.5", "--joints-scale", "2", "--weights", "direct"),
+        ("--controller", "direct", "--features", "20", "--initial-mu", "3", "--initial-sigma", "0.1"),  # drops it
+        ("--controller", "direct", "--features", "20", "--reward", "limited", "--return-scale", "0.3"),
+    ],
+    ids=" ".join,
+)
+def test_other_settings_can_be_exported(farm: Farm, settings: tuple[str, ...]) -> None:
+    farm.call("run", "--name", "r", "--pairs", "3", "--generations", "2", "--no-record", *settings)
+    farm.call("export", "runs/r", "p.npz")
+    assert returned(bare(farm, farm.folder / "p.npz")) == farm.summary("r")["mean_policy_return"]
+
+
+@pytest.mark.slow
+def test_an_exported_policy_in_an_environment_of_its_own(done: Farm, tmp_path: Path) -> None:
+    done.call("export", "runs/a", str(tmp_path / "p.npz"))
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    wanted = [f"{name}=={importlib.metadata.version(name)}" for name in ("mujoco", "numpy")]
+    quiet = ("--quiet", "--disable-pip-version-check")
+    subprocess.run([python, "-m", "pip", "install", *quiet, *wanted], check=True, timeout=170)
+    assert subprocess.run([python, "-c", "import farm"], cwd=tmp_path, capture_output=True, check=False).returncode == 1
+    command = [python, PLAY_POLICY, tmp_path / "p.npz"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True).stdout
+    assert returned(said) == done.summary("a")["mean_policy_return"]
+
+
+# ---------------------------------------------------------------- play
+
+
+def player(farm: Farm) -> Player:
+    policy = stored(folder(farm))
+    simulation = policy.simulation
+    start = simulation.start
+    return Player(lit("bar"), simulation.task, simulation.policy, policy.mu, start.rows[0], start.frames.at([0]))
+
+
+def test_what_is_played_is_the_replay_bit_for_bit(done: Farm) -> None:
+    shown, playing = again(folder(done)), player(done)
+    data = mujoco.MjData(playing.scene.model)
+    seen = [playing.start]
+
+    def step() -> bool:
+        mujoco.mj_step(playing.scene.model, data)
+        seen.append(playing.scene.measure(data))
+        return True
+
+    for _ in range(2):  # nothing of one rollout is left in the next
+        del seen[1:]
+        assert playing.rollout(data, step) == shown.rollouts.outcome.steps[0]
+        for name in ("qpos", "force", "place"):
+            rows = np.concatenate([getattr(frames, name) for frames in seen])
+            assert rows.tobytes() == getattr(shown.frames, name).tobytes(), name
+
+
+@pytest.fixture
+def screen(tmp_path: Path) -> Iterator[str]:
+    """A display of our own without a screen."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("needs Xvfb (Debian: xvfb, libgl1-mesa-dri)")
+    reading, writing = os.pipe()
+    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", "900x700x24", "-nolisten", "tcp"]
+    with (tmp_path / "xvfb.log").open("w") as log:
+        process = subprocess.Popen(command, pass_fds=(writing,), stdout=log, stderr=log)
+    os.close(writing)
+    with os.fdopen(reading) as number:
+        yield f":{number.readline().strip()}"
+    process.terminate()
+    process.wait(10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_play_on_a_display(done: Farm, screen: str, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+    monkeypatch.setenv("DISPLAY", screen)
+    process = done.start("play", "runs/a", "--speed", "10", "--hold", "0")
+    assert process.stdout is not None
+    assert "double-click the object" in process.stdout.readline()
+    assert "the first rollout is over" in process.stdout.readline()
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=30)
+    assert process.returncode == 130, said
+    assert int(said.splitlines()[-1].split()[0]) >= 15
+    assert "Traceback" not in said
+    assert "X Error" not in said
+
+
+def test_play_needs_a_display(done: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    said = done.call("play", "runs/a", status=2)
+    assert "no display to open a window on: farm replay runs/a --video gait.gif draws without one" in said
+    monkeypatch.setenv("DISPLAY", ":987")
+    assert "cannot open a window" in done.call("play", "runs/a", status=1)
+
+
+# ---------------------------------------------------------------- mistakes
+
+MISTAKES = [
+    (("replay", "runs/a", "--generation", "99"), 2, "generation 99 is not stored"),
+    (("replay", "runs/a", "--generation", "-1"), 2, "generation is -1; expected 0 or more"),
+    (("replay", "runs/a", "--object", "cat"), 2, "unknown object 'cat'; known are bar"),
+    (("replay", "runs/a", "--friction", "0"), 2, "friction is 0.0; expected a positive number"),
+    (("replay", "runs/a", "--friction", "nan"), 2, "friction is nan; expected a positive number"),
+    (("replay", "runs/a", "--speed", "0"), 2, "speed is 0.0; expected 0.01 to 10"),
+    (("replay", "runs/a", "--video", "a.avi"), 2, "--video a.avi: expected a name that ends in .gif or .mp4"),
+    (("replay", "runs/a", "--video", "none/a.gif"), 2, "cannot write none/a.gif: there is no folder none"),
+    (("replay", "runs/a", "--to", "/proc/a.rrd"), 1, "cannot write /proc/a.rrd"),
+    (("replay", "runs/a", "--to", "runs/a/run.rrd"), 2, "--to runs/a/run.rrd would replace the run's own recording"),
+    (("replay", "runs/a", "--to", "runs/a/replay.rrd"), 2, "--to runs/a/replay.rrd would replace the run's own"),
+    (("replay", "runs/a", "--to", "runs/a/checkpoint"), 2, "--to runs/a/checkpoint: a recording's name ends in .rrd"),
+    (("compare", "runs/a", "runs/b", "--to", "runs/a/config.json"), 2, "a recording's name ends in .rrd"),
+    (("view", "runs/a/config.json", "--web"), 2, "runs/a/config.json is no recording"),
+    (("compare", "runs/a"), 2, "1 runs to compare; expected 2 to 7"),
+    (("compare", "runs/a", "runs/../runs/a"), 2, "is there twice"),
+    (("compare", "runs/a", "nowhere"), 2, "nowhere is not a run's folder"),
+    (("compare", "runs/a", "runs/b", "--to", "/proc/c.rrd"), 1, "cannot write /proc/c.rrd"),
+    (("view", "runs/a", "nowhere"), 2, "no recording in nowhere"),
+    (("export", "nowhere", "p.npz"), 2, "nowhere is not a run's folder"),
+    (("export", "runs/a", "p.zip"), 2, "p.zip: expected a name that ends in .npz"),
+    (("export", "runs/a", "no/p.npz"), 1, "cannot write no/p.npz: No such file or directory"),
+    (("export", "runs/a", "p.npz", "--generation", "99"), 2, "generation 99 is not stored"),
+    (("play", "nowhere"), 2, "nowhere is not a run's folder"),
+    (("play", "runs/a", "--hold", "-1"), 2, "hold is -1.0; expected 0 to 3600"),
+]
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "line"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
+)
+def test_mistakes(done: Farm, words: tuple[str, ...], status: int, line: str) -> None:
+    said = done.call(*words, status=status, timeout=60)
+    assert line in said
+    assert len(said.strip().splitlines()) == 1, said
+
+
+def test_a_summary_that_is_not_there_yet(done: Farm, tmp_path: Path) -> None:
+    shutil.copytree(folder(done).path, tmp_path / "a")
+    (tmp_path / "a" / "summary.json").unlink()
+    done.call("compare", "runs/a", str(tmp_path / "a"), "--to", str(tmp_path / "c.rrd"))
+    (batch,) = read(tmp_path / "c.rrd")["/table"]
+    (column,) = [n for n in batch.schema.names if n.endswith(":text")]
+    figure = f"{done.summary('a')['mean_policy_return']:.3f}"
+    assert f"| return of the final policy | {figure} | - |" in batch.column(column).to_pylist()[0][0]
+
+
+def test_the_exported_numbers_are_plain(done: Farm) -> None:
+    values = export.contents(stored(folder(done)))
+    assert json.dumps(sorted(values))
+    assert all(np.asarray(value).dtype.kind in "fiU" for value in values.values())

@@ -1,0 +1,246 @@
+"""`farm record`: a recorder elsewhere has what the learner's own has, whoever comes late or goes away."""
+
+import itertools
+import re
+import signal
+import socket
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from processes import SMALL, Farm
+from recordings import content, generations
+from rerun.chunk import RrdReader
+
+from farm.errors import ConfigError
+from farm.net import codec, keys, session
+from farm.net.telemetry import RunHistory
+from learner.commands.record import RecordCommand, record
+from learner.run import free_endpoint
+from learner.run_folder import RunFolder
+
+FILE = Path("recordings/r/run.rrd")
+Process = subprocess.Popen[str]
+
+
+def learner(farm: Farm, endpoint: str, count: int) -> Process:
+    return farm.start("learner", "--name", "r", "--generations", str(count), "--listen", endpoint, *SMALL)
+
+
+def hire(farm: Farm, endpoint: str) -> Process:
+    return farm.start("worker", "--connect", endpoint, "--processes", "1")
+
+
+def leave(worker: Process) -> None:
+    worker.terminate()
+    worker.communicate(timeout=30)
+
+
+def recorder(farm: Farm, endpoint: str, *flags: str) -> Process:
+    """A recorder that has found its run."""
+    process = farm.start("record", "--connect", endpoint, *flags)
+    until(process, "recording run r into recordings/r")
+    return process
+
+
+def until(process: Process, text: str) -> str:
+    """The line with this text, once it is said."""
+    assert process.stdout
+    said = []
+    for line in iter(process.stdout.readline, ""):
+        said.append(line)
+        if text in line:
+            return line
+    raise AssertionError("".join(said))
+
+
+def finish(process: Process, status: int = 0) -> str:
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == status, said
+    assert "Traceback" not in said
+    return said
+
+
+def kept(farm: Farm) -> list[str]:
+    return sorted(path.name for path in (farm.folder / "recordings/r").glob("*.rrd"))
+
+
+def numbers(count: int) -> list[int]:
+    return list(range(1, count + 1))
+
+
+def test_the_same_recording_as_the_learners(farm: Farm) -> None:
+    """Begun before there is a learner, with all there is to record."""
+    endpoint = free_endpoint()
+    process = farm.start("record", "--connect", endpoint)
+    until(process, "nobody answers")
+    flags = ("--name", "r", "--pairs", "3", "--generations", "12", "--traces", "all", "--listen", endpoint)
+    farm.call("run", *flags)
+    said = finish(process)
+    assert "run over after generation 12, all recorded in recordings/r" in said
+    own, other = farm.folder / "runs/r", farm.folder / "recordings/r"
+    assert content(own / "run.rrd") == content(other / "run.rrd")
+    names = {entity for entity, *_ in content(other / "run.rrd")}
+    assert {"/learning/return", "/joints/position", "/tactile/trace/best", "/tactile/traces", "/log"} <= names
+    assert kept(farm) == ["replay.rrd", "run.rrd"]
+    captions = [
+        [str(chunk.to_record_batch()) for chunk in RrdReader(folder / "replay.rrd").stream() if "rollout" in str(chunk)]
+        for folder in (own, other)
+    ]
+    assert len(captions[0]) == len(captions[1]) > 0
+    for name in ("config.json", "summary.json"):
+        assert (own / name).read_bytes() == (other / name).read_bytes()
+
+
+def test_who_joins_late_has_everything(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learning = learner(farm, endpoint, 20)
+    worker = hire(farm, endpoint)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 8)
+    leave(worker)
+    with session.connect((endpoint,), 5, lambda: False) as link:
+        payload = link.ask(keys.history("farm", "r") + "?from=nonsense", 5)
+        assert payload
+        page = codec.decode(payload, RunHistory)
+        assert [report.generation for report in page.reports] == numbers(page.generation)
+        assert page.generation >= 8
+    process = recorder(farm, endpoint, "--run", "r")
+    hire(farm, endpoint)
+    finish(learning)
+    finish(process)
+    assert generations(farm.folder / FILE) == numbers(20)
+    shown = {generation for entity, _, generation, _ in content(farm.folder / FILE) if entity == "/joints/position"}
+    assert shown == set(numbers(20)), "rollouts from before are there too"
+
+
+def test_a_recorder_killed_and_started_again(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learning = learner(farm, endpoint, 30)
+    process = recorder(farm, endpoint)
+    worker = hire(farm, endpoint)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 10)
+    leave(worker)
+    farm.wait_for(lambda: (farm.folder / FILE).stat().st_size > 50_000)
+    process.kill()
+    process.communicate(timeout=10)
+    process = farm.start("record", "--connect", endpoint)
+    line = until(process, "recording run r into recordings/r")
+    found = re.search(r"going on after generation (\d+)", line)
+    assert found
+    assert int(found[1]) >= 1
+    hire(farm, endpoint)
+    finish(learning)
+    finish(process)
+    assert generations(farm.folder / FILE) == numbers(30)
+    assert kept(farm) == ["replay.rrd", "run.rrd"]
+
+
+def test_a_learner_killed_and_resumed(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learning = learner(farm, endpoint, 30)
+    process = recorder(farm, endpoint)
+    hire(farm, endpoint)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 10)
+    learning.kill()
+    learning.communicate(timeout=10)
+    until(process, "the learner of run r is gone, waiting for it to come back")
+    farm.call("learner", "--resume", "runs/r", "--listen", endpoint, "--no-record")
+    said = finish(process)
+    assert "the learner of run r is back, after generation" in said
+    assert generations(farm.folder / FILE) == numbers(30)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_and_gone_on(farm: Farm, number: signal.Signals) -> None:
+    endpoint = free_endpoint()
+    learning = learner(farm, endpoint, 100_000)
+    hire(farm, endpoint)
+    process = recorder(farm, endpoint, "--serve", str(free_port()))
+    until(process, "live: farm view rerun+http://127.0.0.1:")
+    farm.wait_for(lambda: (farm.folder / FILE).stat().st_size > 50_000)
+    process.send_signal(number)
+    begun = time.monotonic()
+    said = finish(process, 130)
+    assert time.monotonic() - begun < 10
+    found = re.search(r"recorded up to generation (\d+) in recordings/r; the same command goes on", said)
+    assert found
+    assert generations(farm.folder / FILE) == numbers(int(found[1]))
+    assert learning.poll() is None
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.slow
+def test_a_frozen_recorder_holds_nobody_up(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learning = learner(farm, endpoint, 200)
+    processes = [recorder(farm, endpoint), farm.start("record", "--connect", endpoint, "--out", "second")]
+    until(processes[1], "recording run r into second/r")
+    hire(farm, endpoint)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 10)
+    processes[0].send_signal(signal.SIGSTOP)
+    frozen = len(farm.progress("r"))
+    farm.wait_for(lambda: len(farm.progress("r")) >= 150)
+    thawed = len(farm.progress("r"))
+    processes[0].send_signal(signal.SIGCONT)
+    finish(learning)
+    for process in processes:
+        finish(process)
+    for folder in ("recordings", "second"):
+        assert generations(farm.folder / folder / "r/run.rrd") == numbers(200)
+    ends = [line["seconds"] for line in farm.progress("r")]
+    still = max(b - a for a, b in itertools.pairwise(ends[frozen:thawed]))
+    assert ends[thawed - 1] - ends[frozen] > 3.0, "frozen for longer than a session's lease"
+    assert still < 1.5
+
+
+def test_folders_and_runs_that_make_no_sense(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    router = farm.start("router", "--listen", endpoint)
+    until(router, "router at")
+    for name in ("a", "b"):
+        farm.start("learner", "--name", name, "--connect", endpoint, *SMALL)
+    farm.wait_for(lambda: len(_runs(endpoint)) == 2)
+    said = farm.call("record", "--connect", endpoint, status=2)
+    assert said == "farm: farm farm has several runs: a, b; choose one with --run\n"
+
+    begun = farm.folder / "recordings/b"
+    begun.mkdir(parents=True)
+    RunFolder(begun).write_config(replace(RunFolder(farm.folder / "runs/b").read_config(), seed=7))
+    strange = farm.folder / "strange/b"
+    strange.mkdir(parents=True)
+    (strange / "letter.txt").touch()
+    for run, out, expected in (
+        ("a", "runs", "runs/a is the learner's own folder, which it records itself: choose another --out"),
+        ("b", "recordings", "recordings/b holds another run of that name, with --seed 7 instead of 0: choose another"),
+        ("b", "strange", "strange/b is no recording's folder, and not empty: choose another --out"),
+        ("b", "runs/b/config.json", "cannot write to .*: Not a directory"),
+    ):
+        command = RecordCommand(connect=(endpoint,), run=run, out=farm.folder / out)
+        with pytest.raises(ConfigError, match=expected):
+            record(command, lambda: False)
+    assert [path.name for path in strange.iterdir()] == ["letter.txt"]
+
+
+def test_flags_that_make_no_sense(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for flags, expected in (
+        ({"file": False}, "--no-file leaves nothing to do: add --serve PORT or --spawn"),
+        ({"spawn": True}, "no display to open a window on: take --serve PORT"),
+        ({"run": ".."}, "run '..' is not a name"),
+        ({"serve": "here"}, "--serve 'here' is not of the form"),
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            RecordCommand(**flags)
+
+
+def _runs(endpoint: str) -> list[str]:
+    with session.connect((endpoint,), 5, lambda: False) as link:
+        return link.tokens(keys.learner_token("farm", "*"), 2)

@@ -1,0 +1,193 @@
+"""What a run leaves behind to look at: recordings, figures, tables; read back and computed again."""
+
+import json
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from processes import Farm, children
+from recordings import generations, read, rows
+from rerun.chunk import RrdReader
+
+from farm import seeds as randomness
+from farm.net.jobs import Job
+from learner.run_folder import RunFolder
+from learner.setup import specification, start
+from workers.backends.cpu import CpuBackend
+
+GENERATIONS = 4
+SMALL = ("--name", "r", "--pairs", "3", "--generations", str(GENERATIONS))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
+    """A small run that keeps all its traces, served while it was learnt."""
+    farm = Farm(tmp_path_factory.mktemp("recorded"))
+    farm.call("run", "--traces", "all", *SMALL)
+    yield farm
+    farm.close()
+
+
+def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
+    folder = RunFolder.open(recorded.folder / "runs" / "r")
+    kept = rows(read(folder.recording)["/tactile/traces"], "data")
+    assert sorted(kept) == list(range(1, GENERATIONS + 1))
+
+    config = folder.read_config()
+    at = start(config, "r")
+    backend = CpuBackend(specification(config, at))
+    state = config.algorithm.restore(at.state)
+    for generation in range(GENERATIONS):
+        eps = config.algorithm.ask(state, randomness.exploration(config.seed, generation))
+        jobs = [
+            Job(
+                index=i,
+                origin="mu",
+                signs=(1, -1),
+                rate="none",
+                eps=row,
+                perturbation=randomness.training(config.seed, generation, i),
+            )  # fmt: skip
+            for i, row in enumerate(eps)
+        ]
+        results = backend.run(state.mu, jobs)
+        expected = np.concatenate([result.traces for result in results])
+        (tensor,) = kept[generation + 1]
+        assert tensor_of(tensor).tobytes() == expected.tobytes()
+        state = config.algorithm.tell(state, eps, np.stack([result.returns for result in results]))
+    assert state.mu.tobytes() == folder.parameters()["mu"][-1].tobytes()
+
+
+def test_new_bests_are_in_the_log(recorded: Farm) -> None:
+    told = {line["generation"]: line["best"] for line in recorded.progress("r") if line["return_max"] == line["best"]}
+    found = {}
+    for batch in read(recorded.folder / "runs/r/run.rrd")["/log"]:
+        [text] = [name for name in batch.schema.names if name.endswith(":text")]
+        numbers = batch.column("generation").cast("int64").to_pylist()
+        for generation, [line] in zip(numbers, batch.column(text).to_pylist(), strict=True):
+            if "new best" in line:
+                found[generation] = line
+    assert told
+    assert found == {generation: f"new best rollout: return {best:.3f}" for generation, best in told.items()}
+
+
+def tensor_of(value: dict[str, Any]) -> np.ndarray[Any, Any]:
+    """A Rerun tensor as an array of float32."""
+    buffer = value["buffer"]
+    values = np.array(buffer, np.float32) if isinstance(buffer, list) else np.frombuffer(buffer, np.float32)
+    return values.reshape(value["shape"])
+
+
+def test_a_recording_and_the_replays(recorded: Farm) -> None:
+    folder = recorded.folder / "runs" / "r"
+    (recording,) = RrdReader(folder / "run.rrd").recordings()
+    assert recording.recording_id == "r"
+    assert sorted(path.name for path in folder.glob("*.rrd")) == ["replay.rrd", "run.rrd"]
+    captions = [text for batch in read(folder / "replay.rrd")["/rollout"] for text in _texts(batch)]
+    assert any("best rollout, generation" in text for text in captions)
+    assert any(f"mean policy after generation {GENERATIONS}" in text for text in captions)
+
+
+def _texts(batch: Any) -> list[str]:
+    (name,) = [n for n in batch.schema.names if n.endswith(":text")]
+    return [text for row in batch.column(name).to_pylist() for text in row or []]
+
+
+def test_figures_are_the_same_everywhere(recorded: Farm) -> None:
+    summary = recorded.summary("r")
+    figures = json.loads(recorded.call("evaluate", "runs/r", "--json"))
+    assert figures["perturbed"]["success_rate"] == summary["robust_success_rate"]
+    assert figures["nominal"]["return_mean"] == summary["mean_policy_return"]
+    assert figures["generation"] == GENERATIONS
+    assert json.loads(recorded.call("runs", "--json")) == [summary]
+    table = recorded.call("runs")
+    assert "finished" in table
+    assert summary["parameters_sha256"][:8] in table
+    said = recorded.call("replay", "runs/r", "--to", "again.rrd")
+    assert f"return {summary['mean_policy_return']:.3f}" in said
+    assert "written to again.rrd; look at it with: farm view again.rrd" in said
+    assert [r.recording_id for r in RrdReader(recorded.folder / "again.rrd").recordings()] == ["r-replay"]
+
+
+def test_a_window_needs_a_display(recorded: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    said = recorded.call("view", "runs/r", status=2)
+    assert "no display to open a window on: farm view runs/r --web serves a browser, or copy" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
+    """One recording in the end, and every generation in it once."""
+    process = farm.start("run", *SMALL[:-1], "30")
+    farm.wait_for(lambda: len(farm.progress("r")) >= 3)
+    process.terminate()
+    said, _ = process.communicate(timeout=30)
+    assert process.returncode == 130, said
+    (farm.folder / "runs" / "r").rename(farm.folder / "runs" / "s")
+    said = farm.call("run", "--resume", "runs/s/")
+    assert farm.summary("s")["run"] == "s"
+    folder = farm.folder / "runs" / "s"
+    assert sorted(path.name for path in folder.glob("*.rrd")) == ["replay.rrd", "run.rrd"]
+    (recording,) = RrdReader(folder / "run.rrd").recordings()
+    assert recording.recording_id == "r"
+    assert generations(folder / "run.rrd") == list(range(1, 31))
+
+
+def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
+    before = recorded.summary("r")
+    said = recorded.call("run", "--resume", "runs/r")
+    assert f"going on after generation {GENERATIONS}" in said
+    after = recorded.summary("r")
+    assert {**after, "reissued": 0} == {**before, "reissued": 0}
+    folder = recorded.folder / "runs" / "r"
+    captions = [text for batch in read(folder / "replay.rrd")["/rollout"] for text in _texts(batch)]
+    assert [text.split(",")[0].split(" after")[0] for text in captions] == ["### best rollout", "### mean policy"]
+    assert generations(folder / "run.rrd") == list(range(1, GENERATIONS + 1))
+
+
+def listeners(port: int) -> set[str]:
+    """Addresses on this machine where somebody listens on a port."""
+    found = set()
+    for name in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
+            address, state = line.split()[1], line.split()[3]
+            host, _, at = address.partition(":")
+            if state == "0A" and int(at, 16) == port:
+                found.add(host)
+    return found
+
+
+def test_the_stream_stays_on_this_machine(farm: Farm) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    process = farm.start("run", *SMALL[:-1], "1000", "--serve", str(port))
+    farm.wait_for(lambda: farm.progress("r"))
+    assert listeners(port) == {"0100007F"}
+    socket.create_connection(("127.0.0.1", port), timeout=5).close()
+    process.terminate()
+    said, _ = process.communicate(timeout=30)
+    assert f"live: farm view rerun+http://127.0.0.1:{port}/proxy   (--web for a browser)" in said
+    assert f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}" in said
+    assert listeners(port) == set()
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_view_takes_its_viewer_with_it(recorded: Farm, ending: signal.Signals) -> None:
+    process = recorded.start("view", "runs/r", "--web")
+
+    def viewers() -> list[int]:
+        return [pid for pid in children(process.pid) if Path(f"/proc/{pid}/exe").resolve().name == "rerun"]
+
+    recorded.wait_for(viewers)
+    [viewer] = viewers()
+    process.send_signal(ending)
+    said, _ = process.communicate(timeout=20)
+    assert process.returncode == 130, said
+    assert not Path(f"/proc/{viewer}").exists()
+    assert "Traceback" not in said

@@ -1,0 +1,53 @@
+"""Routers between learner and workers: zenohd instead of ours, and sites that each have one."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import SMALL, Farm
+
+from farm.commands import certificates
+from learner.run import free_endpoint
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def learns(farm: Farm, reference: dict[str, Any]) -> Callable[..., None]:
+    """Ten generations by a learner that dials one router and workers that dial another, or the same."""
+
+    def run(learner: list[str], worker: list[str]) -> None:
+        farm.start("worker", "--processes", "2", *worker)
+        farm.call("learner", "--name", "r", "--generations", "10", *SMALL, *learner)
+        summary = farm.summary("r")
+        assert summary["workers"] == 2
+        assert summary["parameters_sha256"] == reference["parameters_sha256"]
+
+    return run
+
+
+@pytest.mark.parametrize("zenohd", [False, True], ids=["ours", "zenohd"])
+def test_one_router(farm: Farm, learns: Callable[..., None], zenohd: bool) -> None:
+    endpoint = free_endpoint()
+    farm.start_router(endpoint, zenohd=zenohd)
+    learns(["--connect", endpoint], ["--connect", endpoint])
+
+
+@pytest.mark.parametrize("zenohd", [False, True], ids=["ours", "zenohd"])
+@pytest.mark.parametrize("encrypted", [False, True], ids=["tcp", "tls"])
+def test_two_sites(farm: Farm, tmp_path: Path, learns: Callable[..., None], encrypted: bool, zenohd: bool) -> None:
+    """The learner at one site, workers at the other; the second site's router is there first, and dials until."""
+    here, there, learner, worker = free_endpoint(), free_endpoint(), [], []
+    if encrypted:
+        certificates.main(["new", str(tmp_path / "certs"), "--learner", "127.0.0.1", "--worker", "w"])
+        learner, worker = (["--tls", str(tmp_path / "certs" / name)] for name in ("learner", "worker-w"))
+        here, there = here.replace("tcp", "tls"), there.replace("tcp", "tls")
+    farm.start_router(there, "--connect", here, *learner, zenohd=zenohd)
+    farm.start_router(here, *learner, zenohd=zenohd)
+    learns(["--connect", here, *learner], ["--connect", there, *worker])
+
+
+def test_a_router_that_joins_checks_where(farm: Farm) -> None:
+    said = farm.call("router", "--listen", free_endpoint(), "--connect", "elsewhere:7447", status=2)
+    assert "endpoint 'elsewhere:7447' is not of the form tcp/HOST:PORT" in said

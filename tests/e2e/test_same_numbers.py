@@ -1,0 +1,128 @@
+"""The numbers learnt are the same to the last bit, whatever happens to the farm."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import SMALL, Farm, children
+
+from learner.config import RunConfig
+from learner.run import Place, free_endpoint, learn, open_run
+from learner.scheduler.scheduler import LedgerConfig
+
+CONFIG = RunConfig(generations=10, algorithm=replace(RunConfig().algorithm, pairs=6))
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_any_number_of_workers(farm: Farm, reference: dict[str, Any], workers: int) -> None:
+    farm.call("run", "--name", "r", "--generations", "10", "--workers", str(workers), *SMALL)
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+    assert farm.summary("r")["workers"] == workers
+
+
+@pytest.mark.parametrize("seconds", [1e-6, 10.0])
+def test_any_size_of_chunk(tmp_path: Path, reference: dict[str, Any], seconds: float) -> None:
+    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=LedgerConfig(chunk_seconds=seconds))
+    with open_run(CONFIG, tmp_path / "r", place) as run:
+        for _ in run.learn():
+            pass
+    assert run.summary["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_from_python(tmp_path: Path) -> None:
+    reports = list(learn(CONFIG, tmp_path / "r"))
+    assert [report.progress.generation for report in reports] == list(range(1, 11))
+    assert reports[-1].progress.mean_policy_return == reports[-1].sample.value  # type: ignore[union-attr]
+
+
+def test_a_worker_killed_in_the_middle(farm: Farm, reference: dict[str, Any]) -> None:
+    process = farm.start("run", "--name", "r", "--generations", "10", *SMALL)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 2)
+    for pid in children(process.pid)[:1]:
+        os.kill(pid, signal.SIGKILL)
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    assert "starting another" in said
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_and_resumed(farm: Farm, reference: dict[str, Any], number: signal.Signals) -> None:
+    process = farm.start("run", "--name", "r", "--generations", "10", *SMALL)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 3)
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=10)
+    assert process.returncode == 130, said
+    assert "go on with: farm run --resume" in said
+    assert farm.summary("r")["state"] == "interrupted"
+    assert children(process.pid) == []
+    farm.call("run", "--resume", "runs/r", "--no-record")
+    summary = farm.summary("r")
+    assert summary["parameters_sha256"] == reference["parameters_sha256"]
+    assert summary["robust_success_rate"] == reference["robust_success_rate"]
+    assert [line["generation"] for line in farm.progress("r")] == list(range(1, 11))
+
+
+def test_killed_and_resumed(farm: Farm, reference: dict[str, Any]) -> None:
+    process = farm.start("run", "--name", "r", "--generations", "10", *SMALL)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 3)
+    workers = children(process.pid)
+    process.kill()
+    process.communicate(timeout=10)
+    farm.wait_for(lambda: not any(Path(f"/proc/{pid}/stat").exists() for pid in workers), 10)
+    farm.call("run", "--resume", "runs/r", "--no-record", "--workers", "1")
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+    assert [line["generation"] for line in farm.progress("r")] == list(range(1, 11))
+
+
+def test_extended(farm: Farm, reference: dict[str, Any]) -> None:
+    farm.call("run", "--name", "r", "--generations", "4", *SMALL)
+    farm.call("run", "--resume", "runs/r", "--generations", "10", "--no-record")
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_repeated_from_its_configuration(farm: Farm) -> None:
+    farm.call("run", "--name", "a", "--generations", "2", "--seed", "5", *SMALL)
+    farm.call("run", "--name", "b", "--config", "runs/a/config.json", "--no-record")
+    farm.call("run", "--name", "c", "--config", "runs/a/config.json", "--seed", "6", "--no-record")
+    first, second, third = (farm.summary(run)["parameters_sha256"] for run in "abc")
+    assert first == second != third
+
+
+def test_learner_and_workers_apart(farm: Farm, reference: dict[str, Any]) -> None:
+    endpoint = free_endpoint()
+    learner = farm.start("learner", "--name", "r", "--generations", "10", "--listen", endpoint, *SMALL)
+    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    said, _ = learner.communicate(timeout=120)
+    assert learner.returncode == 0, said
+    assert f"workers join with: farm worker --connect {endpoint}" in said
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_a_learner_that_comes_back_finds_its_workers(farm: Farm, reference: dict[str, Any]) -> None:
+    endpoint = free_endpoint()
+    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    learner = farm.start("learner", "--name", "r", "--generations", "10", "--listen", endpoint, *SMALL)
+    farm.wait_for(lambda: len(farm.progress("r")) >= 3)
+    learner.kill()
+    learner.communicate(timeout=10)
+    farm.call("learner", "--resume", "runs/r", "--listen", endpoint, "--no-record")
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_workers_serve_two_learners(farm: Farm, reference: dict[str, Any]) -> None:
+    first, second = free_endpoint(), free_endpoint()
+    learners = [
+        farm.start("learner", "--name", name, "--generations", "10", "--listen", endpoint, *SMALL)
+        for name, endpoint in (("a", first), ("b", second))
+    ]
+    farm.start("worker", "--connect", first, "--processes", "1")
+    farm.start("worker", "--connect", second, "--processes", "1")
+    for learner in learners:
+        said, _ = learner.communicate(timeout=120)
+        assert learner.returncode == 0, said
+    for name in "ab":
+        assert farm.summary(name)["parameters_sha256"] == reference["parameters_sha256"]

@@ -1,0 +1,232 @@
+"""With certificates only those who should get in do, and only to what is theirs."""
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from processes import SMALL, Farm
+from recordings import generations
+
+from farm.commands import certificates
+from farm.errors import ConfigError, FarmError
+from farm.net import codec, keys, session
+from farm.net.messages import Want
+from farm.net.results import Result, Results
+from farm.net.session import Session
+from farm.net.tls import Bundle, find
+from learner.run import free_endpoint
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An authority with a learner, two workers and a viewer; a foreign one; and an expired worker."""
+    folder = tmp_path_factory.mktemp("certificates")
+    hosts = ("--learner", "127.0.0.1", "--learner", "localhost")
+    certificates.main(["new", str(folder / "own"), *hosts, "--worker", "w1", "--worker", "w2", "--viewer", "eva"])
+    certificates.main(["new", str(folder / "foreign"), *hosts, "--worker", "w1"])
+    authority = certificates._Authority.load(folder / "own" / "ca")
+    authority.issue(folder / "own" / "worker-old", "worker", "old", 0, ())
+    return folder
+
+
+@pytest.fixture(params=["learner", "router", "zenohd"])
+def place(farm: Farm, certs: Path, request: pytest.FixtureRequest) -> tuple[str, list[str]]:
+    """Where to dial, and what the learner is told: all topologies are attacked alike."""
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    tls = ["--tls", str(certs / "own")]
+    if request.param == "learner":
+        return endpoint, ["--listen", endpoint, *tls]
+    farm.start_router(endpoint, *tls, zenohd=request.param == "zenohd")
+    return endpoint, ["--connect", endpoint, *tls]
+
+
+def never() -> bool:
+    return False
+
+
+@contextlib.contextmanager
+def intruder(endpoint: str, bundle: Bundle) -> Iterator[Session]:
+    with session.connect((endpoint,), 5, never, bundle) as opened:
+        yield opened
+
+
+def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Results:
+    """Splendid returns for every pair."""
+    two = np.ones(2, dtype=bool)
+    results = tuple(
+        Result(
+            index=index,
+            trajectory=None,
+            returns=np.full(2, 1000.0),
+            success=two,
+            dropped=~two,
+            failed=~two,
+            clamped=~two,
+            traces=np.zeros((2, 15, 54), dtype="<f4"),
+        )
+        for index in range(count)
+    )
+    return Results.of(results, run=run, incarnation=incarnation, round=round_, worker=worker, traces="extremes")
+
+
+def test_intruders_do_nothing_and_honest_workers_do_not_notice(
+    farm: Farm, certs: Path, place: tuple[str, list[str]], reference: dict[str, object]
+) -> None:
+    endpoint, learner_flags = place
+    own = certs / "own"
+    learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
+    farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
+    watched = find(own, "worker", "w2")
+    with intruder(endpoint, watched) as w2, intruder(endpoint, find(own, "viewer", "eva")) as eva:
+        w2.subscribe("generation", keys.generation("farm", "r"))
+        w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
+        for posing in (w2, eva):
+            posing.token(keys.worker_token("farm", "w1/1-abc"))
+            want = Want(
+                worker="w1/1-abc", credits=100, idle=("r",), version="0", assets="a", canary="c", host="h", cores=2
+            )
+            posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))
+        farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "2")
+        seen = []
+        while learner.poll() is None:
+            with contextlib.suppress(Exception):
+                event = w2.events.get(timeout=0.2)
+                seen.append(event.topic)
+                header = json_of(event.payload)
+                false = lie("w1/1-abc", "r", header["incarnation"], header["round"], 6)
+                for liar in (w2, eva):
+                    liar.publish(keys.result("farm", "r", "w1/1-abc"), codec.encode(false))
+    said, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, said
+    assert "generation" in seen, "the intruder was in a position to lie"
+    assert "stolen" not in seen, "jobs for another worker were read"
+    assert "1-abc" not in said, "nothing of the intruders' got through"
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_a_worker_cannot_pose_as_a_learner(
+    farm: Farm, certs: Path, place: tuple[str, list[str]], reference: dict[str, object]
+) -> None:
+    endpoint, learner_flags = place
+    own, lie, mine = certs / "own", b"a lie", keys.want("farm", "w2/1")
+    learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
+    farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
+    with intruder(endpoint, find(own, "worker", "w2")) as w2, intruder(endpoint, find(own, "learner")) as witness:
+        witness.subscribe("heard", "farm/**")
+        witness.watch("token", "farm/live/**")
+        w2.token(keys.learner_token("farm", "fake"))
+        w2.token(keys.worker_token("farm", "w1/fake"))
+        w2.answer(keys.spec("farm", "r"), lambda: lie)
+        for key in (
+            keys.generation("farm", "r"), keys.generation("farm", "*"), keys.report("farm", "r"),
+            keys.history("farm", "r"), keys.inbox("farm", "w1/1"), keys.inbox("farm", "**"),
+            keys.refused("farm", "w1/1"), keys.refused("farm", "**"), keys.want("farm", "**"),
+            keys.want("farm", "w1/1"), keys.result("farm", "r", "**"), keys.result("farm", "r", "w1/1"), "farm/**",
+            "**",
+        ):  # fmt: skip
+            w2.publish(key, lie)
+        w2.publish(mine, lie)  # this one may, and comes after all others
+        heard = []
+        while mine not in heard:
+            event = witness.events.get(timeout=20)
+            heard.append(event.key)
+        assert [key for key in heard if "live" not in key] == [mine]
+        assert not [key for key in heard if "fake" in key]
+        worker = farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "1")
+        said, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, said
+    worker.terminate()
+    assert "ignored" not in worker.communicate(timeout=20)[0]
+    assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
+
+
+def test_a_viewer_records_and_a_worker_cannot_look(farm: Farm, certs: Path, place: tuple[str, list[str]]) -> None:
+    endpoint, learner_flags = place
+    own = certs / "own"
+    learner = farm.start("learner", "--name", "r", "--generations", "5", *SMALL, *learner_flags)
+    recorder = farm.start("record", "--connect", endpoint, "--tls", str(own), "--name", "eva")
+    assert recorder.stdout
+    assert any("recording run r" in line for line in iter(recorder.stdout.readline, ""))
+    with intruder(endpoint, find(own, "worker", "w2")) as w2:
+        w2.subscribe("report", keys.report("farm", "*"))
+        w2.subscribe("history", keys.history("farm", "*"))
+        assert w2.ask(keys.history("farm", "r"), 1.0) is None
+        farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "1")
+        said, _ = learner.communicate(timeout=60)
+        assert learner.returncode == 0, said
+        assert not len(w2.events)
+    said, _ = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, said
+    assert generations(farm.folder / "recordings/r/run.rrd") == [1, 2, 3, 4, 5]
+
+
+def json_of(payload: bytes) -> dict[str, object]:
+    return msgpack.unpackb(payload, ext_hook=lambda *_: None)
+
+
+@pytest.mark.parametrize("kind", ["none", "foreign", "expired", "plain"])
+def test_who_has_no_good_certificate_is_told_what_to_check(
+    farm: Farm, certs: Path, place: tuple[str, list[str]], kind: str
+) -> None:
+    endpoint, learner_flags = place
+    farm.start("learner", "--name", "r", *SMALL, *learner_flags)
+    farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
+    if kind == "plain":
+        with (
+            pytest.raises(FarmError, match="nobody answers"),
+            session.connect((endpoint.replace("tls/", "tcp/"),), 2, never) as opened,
+        ):
+            refused(opened)
+        return
+    bundle = {
+        "none": Naked(certs / "own" / "worker-w1", "worker", "w1"),
+        "foreign": find(certs / "foreign", "worker", "w1"),
+        "expired": find(certs / "own" / "worker-old", "worker"),
+    }[kind]
+    with pytest.raises(FarmError, match="may refuse our certificate: same authority, still valid, on its roster"):
+        with session.connect((endpoint,), 2, never, bundle) as opened:
+            refused(opened)
+
+
+class Naked(Bundle):
+    """Trusts the farm's authority, but has nothing to show."""
+
+    def dialling(self) -> dict[str, object]:
+        return {"transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem")}
+
+
+def refused(opened: Session) -> None:
+    """A session that opened all the same must be of no use."""
+    until = time.monotonic() + 3
+    while time.monotonic() < until:
+        assert opened.ask(keys.generation("farm", "r"), 0.5) is None
+    raise FarmError("nobody answers; may refuse our certificate: same authority, still valid, on its roster")
+
+
+def test_a_bundle_serves_its_role_only(certs: Path) -> None:
+    with pytest.raises(ConfigError, match="is the bundle of a viewer; a worker's is needed here"):
+        find(certs / "own" / "viewer-eva", "worker")
+    with pytest.raises(ConfigError, match="holds certificates for these workers: old, w1, w2; choose one with --name"):
+        find(certs / "own", "worker")
+    with pytest.raises(ConfigError, match="does not say who may take part"):
+        Bundle(certs / "own" / "worker-w1", "learner", "w1").roster()
+
+
+def test_keys_are_kept_private(certs: Path) -> None:
+    for key in certs.rglob("key.pem"):
+        assert key.stat().st_mode & 0o077 == 0
+
+
+def test_configuration_for_zenohd(farm: Farm, certs: Path) -> None:
+    said = farm.call("router", "--print-config", "--listen", "tls/0.0.0.0:7447", "--tls", str(certs / "own"))
+    config = json.loads(said)
+    assert config["mode"] == "router"
+    assert config["access_control"]["default_permission"] == "deny"
+    assert config["transport"]["link"]["tls"]["enable_mtls"] is True

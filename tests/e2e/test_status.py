@@ -1,0 +1,100 @@
+"""`farm status`, and who is refused."""
+
+import json
+
+import pytest
+from processes import SMALL, Farm
+from rich.console import Console
+
+from farm.commands import status
+from farm.net import codec, keys
+from farm.net.session import listen
+from farm.net.telemetry import RunStatus, WorkerStatus
+from learner.run import free_endpoint
+
+
+def test_runs_and_workers_are_seen(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
+    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.wait_for(lambda: len(farm.progress("r")) > 20)
+    (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
+    assert run["run"] == "r"
+    assert 0 < run["generation"] <= run["generations"] == 100000
+    assert len(run["workers"]) == 2
+    assert all(worker["rollouts"] > 0 and worker["rate"] > 0 for worker in run["workers"])
+    assert run["ignored"].keys() <= {"stale", "doubled"}, "copies of jobs that took long on a busy machine"
+    assert all(worker["ignored"].keys() <= {"stale"} for worker in run["workers"])
+    said = farm.call("status", "--connect", endpoint)
+    assert "100000" in said
+    assert "workers" in said
+
+
+STATUS = RunStatus(
+    run="r", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0, refused=0,
+    ignored={}, workers=(
+        WorkerStatus(
+            worker="w/12345-abcdef", host="[/red]", cores=2, version="[bold]", canary="c", rollouts=1, rate=1.0,
+            seen=0.0, ignored={"stale": 7},
+        ),
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_names_in_brackets_are_shown_as_they_are(width: int) -> None:
+    console = Console(width=width)
+    with console.capture() as shown:
+        console.print(status._tables([STATUS]))
+    for word in ("[/red]", "[bold]", "w/12345-", "rollouts", "stale 7"):
+        assert word in shown.get()
+
+
+def test_learners_of_another_release(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    with listen(endpoint, "farm") as session:
+        session.answer(keys.status("farm", "r"), lambda: codec.encode(STATUS, codec.SCHEMA + 1))
+        said = farm.call("status", "--connect", endpoint, status=1)
+    assert "a learner answers, but what it says cannot be read: schema version 4, this side speaks 3" in said
+
+
+def test_nobody_there(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    said = farm.call("status", "--connect", endpoint, "--timeout", "1", status=1)
+    assert f"nobody answers at {endpoint}" in said
+
+
+def test_status_fails_when_who_is_named_is_missing(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
+    farm.start("worker", "--connect", endpoint, "--processes", "1", "--name", "w")
+    farm.wait_for(lambda: farm.progress("r"))
+    asked = ("status", "--connect", endpoint)
+    farm.call(*asked, "--run", "r", "--worker", "w")
+    assert "no learner of run s answers on farm farm" in farm.call(*asked, "--run", "s", status=1)
+    assert "no worker v is on farm farm" in farm.call(*asked, "--worker", "v", status=1)
+
+
+def test_a_worker_with_other_assets_is_refused_on_both_sides(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learner = farm.start("learner", "--name", "r", "--generations", "5", "--listen", endpoint, *SMALL)
+    code = (
+        "import sys, assets; assets.digest = lambda: 'paw'; from workers.__main__ import main;"
+        f"sys.argv = ['worker', '--connect', '{endpoint}']; sys.exit(main())"
+    )
+    stranger = farm.start_python("-c", code)
+    assert stranger.stdout
+    lines = iter(stranger.stdout.readline, "")
+    line = next(line for line in lines if "does not take" in line)
+    assert "run r does not take this worker: its hand or objects are others" in line
+
+    def refused() -> bool:  # what the worker read in the spec may reach it before its own words reach the learner
+        (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
+        assert run["workers"] == []
+        return run["refused"] == 1
+
+    farm.wait_for(refused)
+    farm.start("worker", "--connect", endpoint, "--processes", "1")
+    said, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, said
+    assert said.count("is refused: its hand or objects are others") == 1

@@ -1,0 +1,343 @@
+"""Experiments as data: the catalogue, series, findings, folders, figures."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.thesis import claims, series, shapes
+from benchmarks.thesis.catalogue import EXPERIMENTS, SETUPS, setup
+from benchmarks.thesis.claims import features_for
+from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer, trial
+from benchmarks.thesis.findings import Data, Finding, judge, verdict
+from benchmarks.thesis.folder import ExperimentFolder, find, over
+from benchmarks.thesis.series import COLUMNS, Series
+from farm import tasks
+from farm.errors import ConfigError
+from farm.net import keys
+from farm.net.stats import Progress
+from learner.config import PRESETS, RunConfig
+from learner.run_folder import RunFolder
+
+
+def made(returns: np.ndarray, success: np.ndarray | None = None, **changes: object) -> Series:
+    """A series of these returns, (trials, generations)."""
+    count = len(returns)
+    columns = {name: returns.astype(float) for name in COLUMNS}
+    columns["mean_policy_success"] = np.zeros_like(returns) if success is None else success.astype(float)
+    values = {
+        "columns": columns, "states": ("finished",) * count, "robust": np.ones(count),
+        "succeeded": columns["mean_policy_success"][:, -1] > 0, "final": returns[:, -1].astype(float), "rollouts": 30,
+        "seconds": np.ones(count), "hashes": ("",) * count,
+    }  # fmt: skip
+    return Series(**{**values, **changes})  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------- the catalogue
+
+
+def test_every_experiment_shows_set_ups_that_exist_and_every_set_up_is_shown():
+    shown = {name for experiment in EXPERIMENTS.values() for name in experiment.curves.values()}
+    assert shown == set(SETUPS)
+
+
+@pytest.mark.parametrize("name", list(SETUPS))
+def test_set_ups_can_be_run(name):
+    assert keys.checked("run", f"{name}-s0")
+    assert tasks.sizes(SETUPS[name].task).observation > 0
+    assert len({json.dumps(str(config)) for config in SETUPS.values()}) == len(SETUPS), "two names for one set-up"
+
+
+def test_a_set_up_is_its_preset_with_what_is_named_changed():
+    changed = setup("thesis", features=7, pairs=3, state="tactile", generations=9)
+    assert (changed.policy.features, changed.algorithm.pairs, changed.task.state) == (7, 3, "tactile")
+    assert changed.generations == 9
+    assert replace(changed.algorithm, pairs=15) == PRESETS["thesis"].algorithm
+    with pytest.raises(TypeError):
+        setup("thesis", fetures=7)
+
+
+def test_trials_differ_in_their_seed_and_may_be_cut_but_not_stretched():
+    config = replace(RunConfig(), generations=20)
+    assert trial(config, 3) == replace(config, seed=3)
+    assert trial(config, 0, 5).generations == 5
+    assert trial(config, 0, 50).generations == 20
+
+
+def test_nothing_is_said_of_a_set_up_without_runs(tmp_path):
+    pytest.importorskip("matplotlib")
+    from benchmarks.thesis.figures import draw
+
+    experiment = EXPERIMENTS["fig-4.5"]
+    nothing = made(np.full((3, 9), np.nan), states=("missing",) * 3, succeeded=np.zeros(3, bool))
+    configs = {label: SETUPS[name] for label, name in experiment.curves.items()}
+    data = Data({"N 50": nothing, "N 15": made(rising(4, -1, 9, 3))}, {}, configs)
+    assert judge(experiment, data) == []
+    assert verdict([]) == "open"
+    said = draw(experiment, data, tmp_path)[1].read_text()
+    assert "N 50: trial 0 missing" in " ".join(re.sub("<[^>]*>", " ", said).split())
+
+
+def test_the_features_that_the_thesis_recommends():
+    """Plage 2016, table 3.2, up to its rounding; 62 numbers where it says 63, and 594 features where it says 560."""
+    assert [features_for(8, e) for e in (0.1, 0.2, 0.3)] == [1600, 280, 93]
+    assert [features_for(17, e) for e in (0.1, 0.2, 0.3)] == [3400, 594, 198]
+    assert [features_for(54, e) for e in (0.1, 0.2, 0.3)] == [10800, 1887, 627]
+    assert features_for(63, 0.1) == 12600
+
+
+# ---------------------------------------------------------------- series
+
+
+def folder_with(path: Path, generations: int, state: str = "finished") -> RunFolder:
+    """A run's folder as a run would leave it."""
+    run = RunFolder.create(path, replace(RunConfig(), generations=9))
+    numbers = dict.fromkeys(Progress.__dataclass_fields__, 0.0)
+    counts = ("generation", "rollouts", "dropped", "failed", "clamped", "reissued", "workers")
+    for g in range(1, generations + 1):
+        told = {**numbers, **dict.fromkeys(counts, g), "return_mean": -g / 7, "mean_policy_success": g > 3}
+        run.append(Progress(**told), np.arange(8.0) * g, np.arange(8.0) / g, 9)
+    run.write_summary({
+        "state": state, "mean_policy_success": True, "robust_success_rate": 0.9, "mean_policy_return": -0.25,
+        "parameters_sha256": "ab", "seconds": 3.0,
+    })  # fmt: skip
+    return run
+
+
+def test_a_series_is_what_the_runs_recorded_and_survives_its_file(tmp_path):
+    runs = [folder_with(tmp_path / "a", 9), folder_with(tmp_path / "b", 4, "diverged"), RunFolder(tmp_path / "none")]
+    read = series.read(runs, replace(RunConfig(), generations=9))
+    series.save(tmp_path / "s.npz", read)
+    for s in (read, series.load(tmp_path / "s.npz")):
+        assert s.states == ("finished", "diverged", "missing")
+        assert s.failures() == ["trial 1 diverged", "trial 2 missing"]
+        np.testing.assert_allclose(s.columns["return_mean"][0], -np.arange(1, 10) / 7, rtol=1e-6)
+        assert np.isnan(s.columns["return_mean"][1, 4:]).all()
+        assert np.isnan(s.columns["return_mean"][2]).all()
+        assert s.columns["mu_2"][0].tolist() == [1.0 * g for g in range(1, 10)]
+        np.testing.assert_allclose(s.columns["sigma_2"][1, :4], 1 / np.arange(1, 5), rtol=1e-6)
+        assert s.learnt.tolist() == [True, True, False]
+        assert s.since[0] == 4
+        assert s.hashes == ("ab", "ab", "")
+        assert s.rollouts == 1  # of its first line
+
+
+def test_what_is_no_series_is_refused_in_one_line(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read"):
+        series.load(tmp_path / "none.npz")
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 torn")
+    with pytest.raises(ConfigError, match="cannot read"):
+        series.load(tmp_path / "bad.npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(ConfigError, match="not a series"):
+        series.load(tmp_path / "other.npz")
+
+
+def test_since_when_a_policy_succeeds_to_the_end():
+    success = np.array([[0, 1, 0, 1, 1], [1, 1, 1, 1, 1], [1, 1, 1, 1, 0], [0, 0, 0, 0, 1]])
+    since = made(np.zeros((4, 5)), success).since
+    np.testing.assert_array_equal(since, [4, 1, np.nan, 5])
+
+
+# ---------------------------------------------------------------- findings
+
+
+def test_a_verdict():
+    yes, no = Finding("", True, ""), Finding("", False, "")
+    assert verdict([yes, yes]) == "reproduced"
+    assert verdict([yes, no]) == "in part"
+    assert verdict([no, no]) == "not reproduced"
+
+
+def rising(at: int, to: float, length: int = 150, trials: int = 5) -> np.ndarray:
+    """Returns that go from -100 to another value at a generation."""
+    return np.tile(np.where(np.arange(1, length + 1) < at, -100.0, to), (trials, 1))
+
+
+def data(*shown: Series, **measured: np.ndarray) -> Data:
+    labels = [chr(97 + i) for i in range(len(shown))]
+    return Data(dict(zip(labels, shown, strict=True)), measured, dict.fromkeys(labels, RunConfig()))
+
+
+def holds(found: list[Finding]) -> list[bool]:
+    return [finding.holds for finding in found]
+
+
+def test_the_race_to_the_bottom_is_told_from_learning():
+    race = rising(80, -20.0)
+    race[:, 110:] = -1e6 * np.arange(1, 41)
+    factor = np.where(np.arange(150) < 110, 1.0, 500.0) * np.ones((1, 5, 1))
+    assert all(holds(claims.race(data(made(race), action=factor))))
+    calm = claims.race(data(made(rising(80, -20.0)), action=np.ones((1, 5, 150))))
+    assert holds(calm) == [True, True, False, False, True]
+    assert holds(claims.race(data(made(rising(20, -20.0)), action=factor)))[0] is False
+
+
+def test_more_features_learn_faster_or_they_do_not():
+    few, some, many = made(rising(151, 0)), made(rising(90, -5)), made(rising(40, -1))
+    for shown, expected in (((few, some, many), True), ((many, some, few), False)):
+        found = holds(claims.features(data(*shown)))
+        assert found[1] is expected
+        assert found[2] is expected
+
+
+def test_scaled_returns_are_compared_after_division():
+    plain = made(rising(15, -1.5), hashes=tuple("abcde"))
+    assert all(holds(claims.scale_free(data(plain, plain, made(100 * rising(15, -1.5))))))
+    other = made(100 * rising(16, -1.5), hashes=tuple("abcdf"))
+    assert holds(claims.scale_free(data(plain, other, other))) == [False, False, True]
+
+
+def test_fewer_pairs_learn_sooner_over_rollouts():
+    many, few = made(rising(50, -1), rollouts=100), made(rising(40, -1), rollouts=30)
+    assert holds(claims.rollouts_count(data(many, few)))[0]
+    slow = made(rising(149, -1), rollouts=30)
+    assert holds(claims.rollouts_count(data(made(rising(5, -1), rollouts=100), slow))) == [False, False]
+
+
+def test_a_rise_is_one_and_when_it_was():
+    flat = -6 + 0.1 * np.random.default_rng(0).random((3, 150))
+    np.testing.assert_array_equal(shapes.rise(made(flat)), [np.nan] * 3)
+    at = shapes.rise(made(rising(60, -1)))
+    assert ((57 <= at) & (at <= 62)).all()
+
+
+def test_only_what_stays_down_has_fallen():
+    up, down = rising(50, -10), rising(50, -10)
+    down[:, 100:] = -500
+    dip = rising(50, -10)
+    dip[:, 80:100] = -500
+    assert [bool(shapes.fallen(made(r)).all()) for r in (up, down, dip)] == [False, True, False]
+
+
+# ---------------------------------------------------------------- folders
+
+
+def test_a_folder_is_one_experiments(tmp_path):
+    out = tmp_path / "out"
+    ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)
+    assert ExperimentFolder.open(out).setups == ("joints-D300", "joints-D1500", "joints-D8000")
+    assert len(ExperimentFolder.prepare(out, ["fig-4.3"], 3, None).todo()) == 9
+    with pytest.raises(ConfigError, match=r"holds fig-4\.3: give another --out"):
+        ExperimentFolder.prepare(out, ["fig-4.5"], 3, None)
+    with pytest.raises(ConfigError, match="begun with all generations"):
+        ExperimentFolder.prepare(out, ["fig-4.3"], 3, 5)
+    with pytest.raises(ConfigError, match="has 3 trials"):
+        ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot write to"):
+        ExperimentFolder.prepare(tmp_path / "file", ["fig-4.3"], 2, None)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.tex").write_text("mine")
+    with pytest.raises(ConfigError, match="holds something else"):
+        ExperimentFolder.prepare(tmp_path / "taken", ["fig-4.3"], 2, None)
+
+
+def test_data_whose_runs_are_gone_is_not_overwritten(tmp_path):
+    """A set-up's data stays while all its runs are gone; with some of them gone nothing is done."""
+    folder = ExperimentFolder.prepare(tmp_path / "out", ["text-8000"], 2, 9)
+    configs = [folder.config("joints-D8000", number) for number in range(2)]
+    for number in range(2):
+        run = folder_with(folder.run("joints-D8000", number).path, 9)
+        run.write_config(configs[number])
+    folder.gather()
+    file = folder.path / "data" / "joints-D8000.npz"
+    before = file.read_bytes()
+    shutil.rmtree(folder.run("joints-D8000", 0).path)
+    with pytest.raises(ConfigError, match="joints-D8000-s0, which is gone"):
+        folder.gather()
+    with pytest.raises(ConfigError, match="is gone"):
+        ExperimentFolder.prepare(tmp_path / "out", ["text-8000"], 2, 9)
+    shutil.rmtree(folder.run("joints-D8000", 1).path)
+    folder.gather()
+    assert file.read_bytes() == before
+    with pytest.raises(ConfigError, match="is gone"):
+        ExperimentFolder.prepare(tmp_path / "out", ["text-8000"], 2, 9)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1}', '{"version": 1, "experiments": ["none"]}',
+                                  '{"version": 1, "experiments": ["fig-4.3"], "trials": "2"}'])  # fmt: skip
+def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "experiment.json").write_text(text)
+    with pytest.raises(ConfigError) as said:
+        ExperimentFolder.open(tmp_path)
+    assert "\n" not in str(said.value)
+
+
+def test_an_unknown_experiment_names_the_known_ones():
+    with pytest.raises(ConfigError, match=r"unknown experiment 'fig-9'; known are fig-4\.1, fig-4\.2"):
+        find("fig-9")
+
+
+def test_runs_that_are_over_are_not_repeated_and_failed_ones_are(tmp_path):
+    for state, expected in (("finished", True), ("diverged", True), ("failed", False), ("interrupted", False)):
+        assert over(folder_with(tmp_path / state, 3, state)) is expected
+    assert not over(RunFolder(tmp_path / "none"))
+
+
+# ---------------------------------------------------------------- figures
+
+
+@pytest.mark.parametrize("name", ["fig-4.1", "fig-4.2", "fig-4.6", "objects", "friction", "chain", "table-3.2"])
+def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
+    pytest.importorskip("matplotlib")
+    from benchmarks.thesis.figures import draw
+
+    experiment = EXPERIMENTS[name]
+    count, rng = len(experiment.curves), np.random.default_rng(0)
+    shown = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
+    if shown:
+        broken = {k: np.where(np.arange(30) < 12, v, np.nan) for k, v in shown[0].columns.items()}
+        shown[0] = replace(shown[0], columns=broken, states=("finished",) * 3 + ("diverged", "missing"))
+    known = dict(zip(experiment.curves, shown, strict=True))
+    configs = {label: SETUPS[name] for label, name in experiment.curves.items()}
+    paths = draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)
+    assert all(path.stat().st_size > 5000 for path in paths)
+    svg = " ".join(re.sub("<[^>]*>", " ", paths[1].read_text()).split())
+    assert experiment.title in svg
+    assert not shown or "trial 3 diverged" in svg
+    again = paths[1].read_bytes()
+    assert draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)[1].read_bytes() == again
+
+
+def measurements(experiment: Experiment, count: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    figure = experiment.figure
+    if isinstance(figure, Transfer):
+        return {"transfer": rng.random((count, 5, len(figure.objects)))}
+    if isinstance(figure, Friction):
+        return {"success": rng.random((count, 5, len(figure.factors))), "factors": np.array(figure.factors)}
+    if isinstance(figure, Chain):
+        return {"reached": rng.random((5, 9)), "acting": np.arange(20) % 2, "force": rng.random((20, 3))}
+    if isinstance(figure, KernelError):
+        sizes = np.array(claims.SIZES)
+        return {"error": rng.random((4, len(figure.features))), "sizes": sizes, "features": np.array(figure.features)}
+    assert isinstance(figure, Curves)
+    return {"action": 1 + rng.random((count, 5, 30)), "saturated": rng.random((count, 5, 30))}
+
+
+@pytest.mark.parametrize("name", [name for name, e in EXPERIMENTS.items() if e.find])
+def test_every_claim_is_held_against_any_data(name):
+    experiment = EXPERIMENTS[name]
+    count = len(experiment.curves)
+    rng = np.random.default_rng(2)
+    shown = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
+    known = dict(zip(experiment.curves, shown, strict=True))
+    assert experiment.find
+    shown_data = Data(known, measurements(experiment, count), dict.fromkeys(known, RunConfig()))
+    found = judge(experiment, shown_data)
+    assert found
+    if known:  # one that ended after three generations is judged as well, one that is missing not at all
+        label, first = next(iter(known.items()))
+        short = {
+            k: np.where((np.arange(5) == 4)[:, None] & (np.arange(30) > 2), np.nan, v) for k, v in first.columns.items()
+        }
+        known[label] = replace(first, columns=short, states=("finished",) * 4 + ("diverged",))
+        assert judge(experiment, shown_data)
+        known[label] = replace(first, states=("finished",) * 4 + ("missing",))
+        assert judge(experiment, shown_data) == []
+    assert all(isinstance(finding.holds, bool) and finding.part and finding.numbers for finding in found)

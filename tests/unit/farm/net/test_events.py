@@ -1,0 +1,53 @@
+"""What subscriptions brought: in order, bounded, and never waited for longer than was asked."""
+
+import queue
+import signal
+import threading
+import time
+from types import FrameType
+
+import pytest
+
+from farm.net.events import Event, Events
+
+
+def event(number: int) -> Event:
+    return Event("inbox", f"k/{number}", b"x")
+
+
+def test_first_come_first_served() -> None:
+    events = Events()
+    for number in range(5):
+        events.put(event(number))
+    assert events.get() == event(0)
+    assert len(events) == 4
+    assert events.waiting(1.0) == [event(number) for number in range(1, 5)]
+    assert events.waiting(0.0) == []
+    with pytest.raises(queue.Empty):
+        events.get(timeout=0.001)
+
+
+def test_who_waits_is_woken() -> None:
+    events = Events()
+    threading.Timer(0.05, events.put, [event(1)]).start()
+    assert events.waiting(20.0) == [event(1)]
+
+
+def test_a_signal_near_the_end_does_not_make_it_wait_for_ever() -> None:
+    """A handler that outlasts the time is what SimpleQueue.get does not survive."""
+    events, told = Events(), threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  as signal wants it
+        told.set()
+        time.sleep(0.1)
+
+    rescue = threading.Timer(10.0, events.put, [event(1)])
+    rescue.start()
+    before = signal.signal(signal.SIGALRM, handle)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        assert events.waiting(0.1) == []
+    finally:
+        signal.signal(signal.SIGALRM, before)
+        rescue.cancel()
+    assert told.is_set()

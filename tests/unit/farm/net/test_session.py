@@ -1,0 +1,33 @@
+"""Sessions on loopback, for real."""
+
+import threading
+from collections.abc import Callable
+
+from farm.net import keys
+from farm.net.session import Session, connect, listen
+from learner.run import free_endpoint
+
+MANY = 600  # more than the 256 that a channel of Zenoh's holds by itself
+
+
+def within(seconds: float, call: Callable[[], None]) -> bool:
+    """Whether a call ends in time; one that does not must not hold up the tests."""
+    over = threading.Event()
+    threading.Thread(target=lambda: (call(), over.set()), daemon=True).start()
+    return over.wait(seconds)
+
+
+def test_many_tokens_are_all_found() -> None:
+    endpoint = free_endpoint()
+    with listen(endpoint, "f") as router, connect((endpoint,), 10, lambda: False) as worker:
+        for i in range(MANY):
+            worker.token(keys.worker_token("f", f"w/{i}"))
+        seen: dict[Session, list[str]] = {}
+
+        def look() -> None:
+            for side in (router, worker):
+                while len(seen.get(side, ())) < MANY:
+                    seen[side] = side.tokens(keys.worker_token("f", "**"), 1.0)
+
+        assert within(30, look), f"it waits for ever, or finds {[len(found) for found in seen.values()]}"
+        assert all(len(set(found)) == MANY for found in seen.values())

@@ -1,0 +1,165 @@
+"""Following a run: real sessions on loopback, a learner's side that loses, repeats and comes back."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from farm.errors import RunError
+from farm.net import codec, keys, session
+from farm.net.session import Session
+from farm.net.telemetry import RunEnd, RunHistory, RunReport
+from learner import config as configs
+from learner.config import RunConfig
+from learner.run import free_endpoint
+from learner.telemetry import subscriber as following
+from learner.telemetry.report_log import History
+from learner.telemetry.subscriber import Follower
+
+
+class Told:
+    """A learner's side: what it published, and what it answers."""
+
+    def __init__(self, link: Session) -> None:
+        self.link, self.history = link, History(page=3000)
+        self.page = RunHistory(
+            run="r", incarnation="one", recording="r", config=configs.to_dict(RunConfig()), generation=0, reports=(),
+            end=None,
+        )  # fmt: skip
+        self.asked: list[int] = []
+        self.after: Callable[[], None] = lambda: None
+        """Done once, behind the next answer."""
+        link.answer_asked(keys.history("farm", "r"), self._answer)
+
+    def _answer(self, asked: str) -> bytes:
+        first = int(asked.removeprefix("from="))
+        self.asked.append(first)
+        reply = codec.encode(replace(self.page, reports=self.history.page(first)))
+        after, self.after = self.after, lambda: None
+        after()
+        return reply
+
+    def report(self, generation: int, *, lost: bool = False) -> None:
+        report = RunReport(
+            run="r", incarnation=self.page.incarnation, generation=generation, progress={}, rate=1.0
+        )  # fmt: skip
+        self.history.add(report)
+        self.page = replace(self.page, generation=generation)
+        if not lost:
+            self.again(report)
+
+    def again(self, report: RunReport) -> None:
+        self.link.publish(keys.report("farm", "r"), codec.encode(report))
+
+    def end(self) -> None:
+        self.page = replace(self.page, end=RunEnd(summary={}, lines=(), best=None, best_generation=0, mean=None))
+        self.link.publish(keys.history("farm", "r"), b"")
+
+
+@pytest.fixture
+def told() -> Iterator[tuple[Told, Follower]]:
+    endpoint = free_endpoint()
+    with session.listen(endpoint, "farm") as link, session.connect((endpoint,), 10, lambda: False) as other:
+        learner = Told(link)
+        follower = Follower(other, "farm", "r")
+        assert follower.begin(lambda: False) == ("r", RunConfig())
+        yield learner, follower
+
+
+def take(reports: Iterator[RunReport | RunEnd], count: int) -> list[int]:
+    return [
+        message.generation for _, message in zip(range(count), reports, strict=False) if isinstance(message, RunReport)
+    ]
+
+
+def test_in_order_and_each_once(told: tuple[Told, Follower]) -> None:
+    learner, follower = told
+    for generation in range(1, 11):
+        learner.report(generation, lost=generation <= 6)
+    reports = follower.follow(0, lambda: False)
+    assert take(reports, 10) == list(range(1, 11))
+    asked = len(learner.asked)
+    learner.report(11)
+    learner.again(learner.history.page(11)[0])
+    learner.report(12)
+    assert take(reports, 2) == [11, 12]
+    assert len(learner.asked) <= asked + 1, "what comes as it should is not asked for"
+    learner.report(13, lost=True)
+    learner.report(14)
+    assert take(reports, 2) == [13, 14]
+    learner.report(15, lost=True)
+    learner.end()
+    assert take(reports, 1) == [15]
+    assert isinstance(next(reports), RunEnd)
+    assert next(reports, None) is None
+
+
+def test_from_where_a_file_ends(told: tuple[Told, Follower]) -> None:
+    learner, follower = told
+    for generation in range(1, 6):
+        learner.report(generation, lost=True)
+    assert take(follower.follow(3, lambda: False), 2) == [4, 5]
+
+
+def test_the_last_report_is_lost_and_nothing_follows(
+    told: tuple[Told, Follower], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner, follower = told
+    monkeypatch.setattr(following, "_QUIET", 0.1)
+    learner.report(1)
+    reports = follower.follow(0, lambda: False)
+    assert take(reports, 1) == [1]
+    learner.after = lambda: learner.report(2, lost=True)  # just when the follower has heard that there is none
+    assert take(reports, 1) == [2]
+    assert learner.asked[-2:] == [2, 2]
+
+
+def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Follower]) -> None:
+    learner, follower = told
+    for generation in range(1, 6):
+        learner.report(generation)
+    reports = follower.follow(0, lambda: False)
+    assert take(reports, 5) == [1, 2, 3, 4, 5]
+    learner.page = replace(learner.page, incarnation="two", generation=3)
+    learner.history = History()
+    for generation in range(1, 4):
+        learner.history.add(RunReport(run="r", incarnation="two", generation=generation, progress={}, rate=1.0))
+    for generation in (4, 5, 6, 7):
+        learner.report(generation)
+    assert take(reports, 2) == [6, 7]
+
+
+def test_what_a_folder_lost_is_not_waited_for(told: tuple[Told, Follower]) -> None:
+    learner, follower = told
+    learner.page = replace(learner.page, generation=4)
+    learner.report(5, lost=True)
+    reports = follower.follow(0, lambda: False)
+    assert take(reports, 1) == [5]
+    learner.page = replace(learner.page, generation=9)
+    learner.end()
+    assert isinstance(next(reports), RunEnd)
+
+
+def test_another_run_of_the_same_name(told: tuple[Told, Follower]) -> None:
+    learner, follower = told
+    learner.report(1)
+    reports = follower.follow(0, lambda: False)
+    assert take(reports, 1) == [1]
+    config = configs.to_dict(RunConfig(seed=5))
+    learner.page = replace(learner.page, incarnation="two", generation=0, config=config)
+    learner.history = History()
+    learner.report(1)
+    with pytest.raises(RunError, match="run r began anew: --seed was 0 and is 5"):
+        next(reports)
+
+
+def test_a_learner_of_another_version(told: tuple[Told, Follower], monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, follower = told
+    monkeypatch.setattr(learner, "page", replace(learner.page, generation="many"))
+    with pytest.raises(RunError, match="the learner of run r cannot be understood: RunHistory.generation"):
+        next(follower.follow(0, lambda: False))
+
+
+def test_stopped(told: tuple[Told, Follower]) -> None:
+    _, follower = told
+    assert list(follower.follow(0, lambda: True)) == []

@@ -1,0 +1,77 @@
+"""What a run reported: in order, page by page, in bounded memory."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from farm.net import codec
+from farm.net.telemetry import RunHistory, RunReport, Trace
+from learner.telemetry.report_log import History
+
+TRACE = 15 * 54 * 4  # bytes of one trace
+
+
+def report(generation: int, rollouts: int = 1) -> RunReport:
+    values = np.full((rollouts, 15, 54), generation, "<f4")
+    traces = (Trace(name="all", values=values),) if rollouts else ()
+    progress = {"generation": generation}
+    return RunReport(run="r", incarnation="i", generation=generation, progress=progress, rate=1.0, traces=traces)
+
+
+def filled(generations: int, memory: int, page: int) -> History:
+    history = History(memory, page)
+    for generation in range(1, generations + 1):
+        history.add(report(generation))
+    return history
+
+
+def read(history: History, begin: int = 1) -> list[list[RunReport]]:
+    """Pages, as a recorder asks for them."""
+    pages = []
+    while page := history.page(begin):
+        pages.append(list(page))
+        begin = page[-1].generation + 1
+    return pages
+
+
+def test_every_generation_once_and_in_order() -> None:
+    pages = read(filled(100, memory=1 << 20, page=10_000))
+    assert [r.generation for page in pages for r in page] == list(range(1, 101))
+    assert len(pages) > 10
+    assert max(len(codec.encode(tuple_of(page))) for page in pages) < 3 * 10_000
+
+
+def tuple_of(page: list[RunReport]) -> object:
+    return RunHistory(
+        run="r", incarnation="i", recording="r", config={}, generation=100, reports=tuple(page), end=None
+    )  # fmt: skip
+
+
+def test_the_oldest_rollouts_go_and_no_statistics() -> None:
+    kept = list(itertools.chain(*read(filled(50, memory=10 * TRACE, page=1 << 20))))
+    assert [r.generation for r in kept] == list(range(1, 51))
+    assert [r.generation for r in kept if r.traces] == list(range(41, 51))
+    assert all(r.progress == {"generation": r.generation} for r in kept)
+
+
+def test_one_report_larger_than_everything() -> None:
+    history = filled(3, memory=10 * TRACE, page=TRACE)
+    history.add(report(4, rollouts=100))
+    assert [r.generation for page in read(history) for r in page] == [1, 2, 3, 4]
+    assert not history.page(4)[0].traces
+    assert len(History(0, 0).page(1)) == 0
+
+
+@pytest.mark.parametrize("begin", [-5, 0, 1])
+def test_from_the_start(begin: int) -> None:
+    assert [r.generation for r in filled(3, 1 << 20, 1 << 20).page(begin)] == [1, 2, 3]
+
+
+def test_generations_that_a_folder_lost() -> None:
+    history = History()
+    for generation in (1, 2, 7, 8, 9):
+        history.add(report(generation, rollouts=0))
+    assert [r.generation for r in history.page(3)] == [7, 8, 9]
+    assert [r.generation for r in history.page(8)] == [8, 9]
+    assert history.page(10) == ()

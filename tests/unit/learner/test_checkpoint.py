@@ -1,0 +1,134 @@
+"""Checkpoints: read back bit for bit, and never half: neither when damaged nor when writing fails."""
+
+import errno
+import os
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from farm.errors import CheckpointError
+from farm.net.jobs import Job
+from learner import checkpoint as checkpoints
+from learner.algorithms import PGPE, PGPEState
+from learner.checkpoint import Checkpoint, load, save
+from learner.config import RunConfig, to_dict
+
+RNG = np.random.default_rng(3)
+P = 12
+
+BEST = Job(index=0, origin="zero", signs=(1,), perturbation=(3, 0, 1, 2), rate="none", eps=RNG.normal(size=P))
+
+EXTREMES = np.array([0.0, -0.0, 5e-324, -1.7e308, np.pi, 1.0 / 3.0] * 2)
+
+
+def checkpoint(**changed: object) -> Checkpoint:
+    state = PGPE(optimiser="adam").init(P)
+    state = replace(state, mu=EXTREMES, sigma=np.abs(EXTREMES) + 1e-300, best=-0.1, baseline=1 / 3, generation=7)
+    values = {
+        "run": "first", "config": to_dict(RunConfig(seed=3)), "state": state.to_dict(), "rollouts": 210, "reissued": 4,
+        "seconds": 12.3456789012345678, "solved": 2, "best": BEST, "best_generation": 5, "canary": "c0",
+        "replayed": False,
+        "frequencies": RNG.normal(size=(5, 8)), "phases": RNG.uniform(size=5),
+    }  # fmt: skip
+    return Checkpoint(**(values | changed))  # type: ignore[arg-type]
+
+
+def bits(value: object) -> object:
+    """Something that is equal only for equal bits."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {key: bits(item) for key, item in value.items()}
+    if isinstance(value, (Checkpoint, Job)):
+        return {field.name: bits(getattr(value, field.name)) for field in fields(value)}
+    return repr(value)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint"
+    save(path, checkpoint())
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("changed", [{}, {"best": None, "replayed": True, "frequencies": np.empty((0, 8))}])
+def test_there_and_back(tmp_path: Path, changed: dict[str, object]) -> None:
+    told = checkpoint(**changed)
+    save(tmp_path / "checkpoint", told)
+    back = load(tmp_path / "checkpoint")
+    assert bits(back) == bits(told)
+    state = PGPE(optimiser="adam").restore(back.state)
+    assert isinstance(state, PGPEState)
+    assert bits(dict(state.to_dict())) == bits(told.state)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"]
+
+
+def test_truncated_anywhere(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "checkpoint"
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(CheckpointError, match="truncated or damaged|not a checkpoint|another version"):
+            load(path)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_flipped_bits(tmp_path: Path, whole: bytes, data: st.DataObject) -> None:
+    damaged = bytearray(whole)
+    for position in data.draw(st.sets(st.integers(0, 8 * len(whole) - 1), min_size=1, max_size=4)):
+        damaged[position // 8] ^= 1 << position % 8
+    path = tmp_path / "checkpoint"
+    path.write_bytes(damaged)
+    with pytest.raises(CheckpointError):
+        load(path)
+
+
+def test_something_appended(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "checkpoint"
+    path.write_bytes(whole + b"\0")
+    with pytest.raises(CheckpointError, match="truncated or damaged"):
+        load(path)
+
+
+def test_of_another_version(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "checkpoint"
+    path.write_bytes(whole.replace(b"checkpoint 1\n", b"checkpoint 2\n", 1))
+    with pytest.raises(CheckpointError, match="of another version; use the release that wrote it"):
+        load(path)
+
+
+def test_of_another_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("learner.checkpoint._SCHEMA", 2)
+    save(tmp_path / "checkpoint", checkpoint())
+    monkeypatch.undo()
+    with pytest.raises(CheckpointError, match="schema version 2"):
+        load(tmp_path / "checkpoint")
+
+
+def test_none_there(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no checkpoint at .*: is this a run's folder"):
+        load(tmp_path / "checkpoint")
+    with pytest.raises(CheckpointError, match="Is a directory"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_failure_leaves_the_old_one(tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    path = tmp_path / "checkpoint"
+    path.write_bytes(whole)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoints.os if call == "fsync" else Path, call, full)
+    with pytest.raises(OSError, match="No space left"):
+        save(path, checkpoint(rollouts=240))
+    monkeypatch.undo()
+    assert path.read_bytes() == whole
+    assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"], "the torn new one takes room"
+    save(path, checkpoint(rollouts=240))
+    assert load(path).rollouts == 240

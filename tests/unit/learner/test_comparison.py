@@ -1,0 +1,88 @@
+"""Runs beside each other: names, differences, results; and what tells a configuration from others."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from farm.errors import ConfigError
+from farm.net.stats import Progress
+from farm.policies.fourier import PolicyConfig
+from learner import comparison
+from learner.comparison import Compared, names, table
+from learner.config import PRESETS, RunConfig, preset_of, properties
+from learner.run_folder import RunFolder
+
+
+def progress(generation: int, success: bool) -> Progress:
+    values = {f.name: 0 if f.type is int else 0.0 for f in dataclasses.fields(Progress)}
+    changed = {"generation": generation, "rollouts": 30 * generation, "mean_policy_success": success, "seconds": 12.4}
+    return Progress(**{**values, "baseline": None, **changed})
+
+
+def compared(name: str, config: RunConfig, successes: list[bool], **summary: object) -> Compared:
+    return Compared(name, config, [progress(g, s) for g, s in enumerate(successes, 1)], summary)
+
+
+def rows(text: str) -> dict[str, list[str]]:
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
+    return {first: rest for first, *rest in cells}
+
+
+def test_a_table_has_what_differs_and_what_came_out() -> None:
+    other = dataclasses.replace(PRESETS["thesis"], seed=7, policy=PolicyConfig(features=99))
+    ended = {"mean_policy_return": -0.0619, "mean_policy_success": True, "robust_success_rate": 0.98}
+    runs = [
+        compared("a", RunConfig(), [False, False, True, True], **ended, parameters_sha256="0123456789abcdef"),
+        compared("b", other, [False, False]),
+        compared("c", RunConfig(seed=1), [True]),
+    ]
+    found = rows(table(runs))
+    assert found[""] == ["**a**", "**b**", "**c**"]
+    assert found["preset"] == ["default", "own", "default"]
+    assert found["seed"] == ["0", "7", "1"]
+    assert found["features"] == ["8000", "99", "8000"]
+    assert found["controller"] == ["kernel", "projected", "kernel"]
+    assert found["generations done"] == ["4", "2", "1"]
+    assert found["rollouts"] == ["120", "60", "30"]
+    assert found["return of the final policy"] == ["-0.062", "-", "-"]
+    assert found["it succeeds"] == ["yes", "-", "-"]
+    assert found["robust success"] == ["98%", "-", "-"]
+    assert found["first success, generation"] == ["2", "-", "0"]  # a generation shows the policy before its update
+    assert found["hash"] == ["01234567", "-", "-"]
+    assert "gamma" not in found  # the same everywhere
+    assert {len(row) for row in found.values()} == {3}
+
+
+def test_names_are_as_short_as_they_can_be() -> None:
+    assert names([Path("/x/runs/a"), Path("/x/runs/b/")]) == ["a", "b"]
+    assert names([Path("/x/runs/a"), Path("/x/more/a"), Path("/x/more/b")]) == ["runs/a", "more/a", "more/b"]
+    with pytest.raises(ConfigError, match="is there twice"):
+        names([Path("/x/a"), Path("/x/b/../a")])
+
+
+def test_a_run_without_a_generation(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "r", RunConfig())
+    with pytest.raises(ConfigError, match="has no generation behind it"):
+        comparison.read([folder])
+
+
+def test_presets_are_known_by_what_they_set() -> None:
+    for name, config in PRESETS.items():
+        assert preset_of(dataclasses.replace(config, seed=9, generations=3)) == name
+        changed = dataclasses.replace(config, task=dataclasses.replace(config.task, gamma=0.5))
+        assert preset_of(changed) == "own"
+    assert properties(RunConfig(seed=4)) == {
+        "preset": "default", "controller": "kernel", "state": "joints", "object": "bar", "seed": 4,
+    }  # fmt: skip
+
+
+def test_stored_means(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "r", RunConfig())
+    for generation in (1, 2, 3):
+        folder.append(progress(generation, False), np.full(4, generation + 0.5), np.ones(4), 3)
+    assert folder.mean(2).tolist() == [2.5] * 4
+    for wanted, nearest in ((9, 3), (-4, 1)):
+        with pytest.raises(ConfigError, match=f"3 from 1 to 3 are, the nearest is {nearest}"):
+            folder.mean(wanted)

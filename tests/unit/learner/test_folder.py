@@ -1,0 +1,225 @@
+"""A run's folder: what is appended is read back exactly, torn ends are cut off, nothing is overwritten."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from farm.errors import CheckpointError, ConfigError
+from farm.net.stats import Progress
+from learner import run_folder as folders
+from learner.algorithms import PGPE
+from learner.checkpoint import Checkpoint
+from learner.config import RunConfig, to_dict
+from learner.run_folder import RunFolder
+
+P = 5
+RNG = np.random.default_rng(1)
+ROWS = {g: (RNG.normal(size=P) * 10.0**g, RNG.uniform(size=P)) for g in range(1, 31)}
+
+
+def progress(generation: int) -> Progress:
+    return Progress(
+        generation=generation, rollouts=30 * generation, return_mean=-1 / generation, return_min=-4e300,
+        return_max=-1e-300, return_std=np.pi, best=-0.1, baseline=None, mean_policy_return=-1 / 3,
+        mean_policy_success=generation % 2 == 0, success_rate=0.25, sigma_mean=2.0, sigma_min=1.0, sigma_max=3.0,
+        mean_norm=8.0, dropped=2, failed=0, clamped=1, reissued=1, workers=3, seconds=1.5 * generation,
+    )  # fmt: skip
+
+
+def checkpoint(generation: int) -> Checkpoint:
+    state = replace(PGPE().init(P), generation=generation)
+    return Checkpoint(
+        run="r", config=to_dict(RunConfig()), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0, solved=0,
+        best=None, best_generation=0, canary=None, replayed=True, frequencies=np.empty((0, 8)), phases=np.empty(0),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "runs" / "r", RunConfig(seed=4))
+
+
+def fill(folder: RunFolder, last: int, first: int = 1, generations: int = 10) -> None:
+    for generation in range(first, last + 1):
+        folder.append(progress(generation), *ROWS[generation], generations)
+
+
+def assert_holds(folder: RunFolder, generations: list[int]) -> None:
+    rows = folder.parameters()
+    assert rows["generation"].tolist() == generations
+    for row in rows:
+        mu, sigma = ROWS[int(row["generation"])]
+        assert row["mu"].tobytes() == mu.tobytes()
+        assert row["sigma"].tobytes() == sigma.tobytes()
+
+
+def test_created_once(folder: RunFolder) -> None:
+    assert folder.name == "r"
+    assert RunFolder.open(folder.path).read_config() == RunConfig(seed=4)
+    with pytest.raises(ConfigError, match="exists and is never overwritten: choose another --name, or --resume"):
+        RunFolder.create(folder.path, RunConfig())
+    assert folder.read_config() == RunConfig(seed=4)
+
+
+def test_where_no_folder_can_be(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot make the run folder .*: Not a directory"):
+        RunFolder.create(tmp_path / "file" / "r", RunConfig())
+    with pytest.raises(ConfigError, match="is not a run's folder: it has no config.json"):
+        RunFolder.open(tmp_path)
+
+
+def test_no_configuration_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(ConfigError, match="cannot write to the run folder .*: No space left on device"):
+        RunFolder.create(tmp_path / "r", RunConfig())
+    assert not (tmp_path / "r").exists()
+
+
+def test_one_process_at_a_time(folder: RunFolder) -> None:
+    with folder.held():
+        with pytest.raises(ConfigError, match="another process is working on the run in"), folder.held():
+            pass
+    with folder.held():
+        pass
+
+
+def test_read_back_exactly(folder: RunFolder) -> None:
+    fill(folder, 10)
+    assert folder.progress() == [progress(g) for g in range(1, 11)]
+    assert_holds(folder, list(range(1, 11)))
+    with (folder.path / "parameters").open("rb") as file:  # as docs/files.md says
+        head = json.loads(file.readline())
+        size = head["parameters"]
+        rows = np.frombuffer(file.read(), [("generation", "<i8"), ("mu", "<f8", size), ("sigma", "<f8", size)])
+    assert (head["version"], head["every"]) == (1, 1)
+    assert rows["generation"].tolist() == list(range(1, 11))
+    assert rows["mu"][3].tobytes() == ROWS[4][0].tobytes()
+
+
+@pytest.mark.parametrize(("limit", "kept"), [(880, 1), (879, 2), (440, 2), (439, 3), (87, 11)])
+def test_beyond_the_limit_every_kth_is_kept(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, limit: int, kept: int
+) -> None:
+    monkeypatch.setattr(folders, "PARAMETERS_LIMIT", limit)  # ten rows of 88 bytes
+    assert folder.every(P, 10) == kept
+    fill(folder, 10)
+    assert folder.every(P, 10) == kept
+    assert_holds(folder, list(range(kept, 11, kept)))
+    assert folder.parameters().nbytes <= limit
+
+
+def test_a_longer_run_keeps_its_rhythm(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders, "PARAMETERS_LIMIT", 440)
+    fill(folder, 10)
+    fill(folder, 30, first=11, generations=30)
+    assert folder.every(P, 30) == 2
+    assert_holds(folder, list(range(2, 31, 2)))
+
+
+def test_torn_ends_are_not_read(folder: RunFolder) -> None:
+    fill(folder, 4)
+    lines, parameters = folder.path / "progress.jsonl", folder.path / "parameters"
+    whole, bytes_ = lines.read_bytes(), parameters.read_bytes()
+    begin = whole.rindex(b"\n", 0, -1) + 1
+    for cut in range(begin, len(whole) - 1):
+        lines.write_bytes(whole[:cut])
+        assert [p.generation for p in folder.progress()] == [1, 2, 3]
+    for cut in range(1, 88):
+        parameters.write_bytes(bytes_[:-cut])
+        assert_holds(folder, [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    "tail", [b"\0" * 50, b"\xff\xfe\n", b"[]\n", b"null\n", b'{"version": 2}\n', b'{"version": 1}\n']
+)
+def test_rubbish_ends_what_is_read(folder: RunFolder, tail: bytes) -> None:
+    fill(folder, 3)
+    with (folder.path / "progress.jsonl").open("ab") as file:
+        file.write(tail)
+    assert [p.generation for p in folder.progress()] == [1, 2, 3]
+    folder.rewind(checkpoint(3))
+    fill(folder, 4, first=4)
+    assert folder.progress() == [progress(g) for g in range(1, 5)]
+
+
+def test_cut_back_to_the_checkpoint(folder: RunFolder) -> None:
+    fill(folder, 5)
+    lines, parameters = folder.path / "progress.jsonl", folder.path / "parameters"
+    after_five = lines.read_bytes(), parameters.read_bytes()
+    fill(folder, 7, first=6)
+    for path, torn in ((lines, b'{"version": 1, "gen'), (parameters, b"\1" * 50)):
+        with path.open("ab") as file:
+            file.write(torn)
+    folder.rewind(checkpoint(5))
+    assert (lines.read_bytes(), parameters.read_bytes()) == after_five
+    folder.rewind(checkpoint(5))
+    assert (lines.read_bytes(), parameters.read_bytes()) == after_five
+    folder.rewind(checkpoint(0))
+    assert folder.progress() == []
+    assert_holds(folder, [])
+    fill(folder, 5)
+    assert (lines.read_bytes(), parameters.read_bytes()) == after_five
+
+
+def test_cut_back_before_the_first_generation(folder: RunFolder) -> None:
+    folder.rewind(checkpoint(0))
+    assert folder.progress() == []
+    assert not (folder.path / "parameters").exists()
+
+
+def test_a_checkpoint_without_generation(folder: RunFolder) -> None:
+    with pytest.raises(CheckpointError, match="holds no generation"):
+        folder.rewind(replace(checkpoint(1), state={"generation": "one"}))
+
+
+def test_parameters_are_begun_whole_or_not_at_all(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A head that was torn would keep the run from going on."""
+
+    def full(path: Path, *_: object) -> None:
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        fill(folder, 1)
+    monkeypatch.undo()
+    folder.rewind(checkpoint(0))
+    fill(folder, 1)
+    assert folder.progress() == [progress(1)]
+    assert_holds(folder, [1])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "has no readable first line"),
+        (b"\x93\n", "has no readable first line"),
+        (b'{"version": 7}\n', "is not of version 1"),
+        (b"3\n", "is not of version 1"),
+    ],
+)
+def test_parameters_that_are_none(folder: RunFolder, content: bytes, words: str) -> None:
+    (folder.path / "parameters").write_bytes(content)
+    with pytest.raises(ConfigError, match=words):
+        folder.parameters()
+
+
+def test_summaries(folder: RunFolder) -> None:
+    assert folder.read_summary() is None
+    folder.write_summary({"run": "r", "best_return": None})
+    assert folder.read_summary() == {"run": "r", "best_return": None}
+    for content in ("", "{", "[]"):
+        (folder.path / "summary.json").write_text(content)
+        assert folder.read_summary() is None
+
+
+def test_a_new_run_can_be_discarded(folder: RunFolder) -> None:
+    folder.discard()
+    assert not folder.path.exists()

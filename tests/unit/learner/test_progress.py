@@ -1,0 +1,45 @@
+"""Lines of progress.jsonl: the names stay, so that what was written can always be read."""
+
+import json
+
+import pytest
+
+from farm.net.stats import Progress
+
+STORED = (
+    '{"version": 1, "generation": 2, "rollouts": 24, "return_mean": -5.45, "return_min": -6.5, "return_max": -4.25, '
+    '"return_std": 0.5, "best": -4.25, "baseline": -5.5, "mean_policy_return": -5.5, "mean_policy_success": false, '
+    '"success_rate": 0.25, "sigma_mean": 0.77, "sigma_min": 0.5, "sigma_max": 1.5, "mean_norm": 15.0, "dropped": 1, '
+    '"failed": 2, "clamped": 3, "reissued": 4, "workers": 5, "seconds": 6.5}'
+)
+"""As version 1 wrote it; a change of names needs another version."""
+
+
+def test_a_stored_line_is_read_back() -> None:
+    read = Progress.from_dict(json.loads(STORED))
+    assert json.dumps(read.to_dict()) == STORED
+    assert (read.generation, read.best, read.mean_policy_success, read.seconds) == (2, -4.25, False, 6.5)
+
+
+def test_no_baseline() -> None:
+    read = Progress.from_dict({**json.loads(STORED), "baseline": None})
+    assert read.baseline is None
+    assert Progress.from_dict(read.to_dict()) == read
+
+
+def test_further_fields_do_no_harm() -> None:
+    assert Progress.from_dict({**json.loads(STORED), "weather": "fine"}) == Progress.from_dict(json.loads(STORED))
+
+
+def test_refused() -> None:
+    values = json.loads(STORED)
+    with pytest.raises(ValueError, match="version 1"):
+        Progress.from_dict({**values, "version": 2})
+    with pytest.raises(ValueError, match="not a line"):
+        Progress.from_dict([])  # type: ignore[arg-type]
+    for wrong in ({"best": "high"}, {"generation": 2.5}, {"baseline": []}, {"rollouts": None}):
+        with pytest.raises(ValueError, match=f"whose {next(iter(wrong))} is"):
+            Progress.from_dict(values | wrong)
+    del values["best"], values["workers"]
+    with pytest.raises(ValueError, match="without best, workers"):
+        Progress.from_dict(values)

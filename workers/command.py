@@ -1,0 +1,58 @@
+"""`farm worker`: worker processes on this machine."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from farm import settings as arguments
+from farm.commands import logs
+from farm.commands.signals import stop_flag
+from farm.errors import ConfigError, FarmError
+from farm.processes import Pool
+from workers.worker import WorkerConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerCommand:
+    """Workers alone: they serve whichever learners they find, until stopped."""
+
+    worker: WorkerConfig = field(default_factory=WorkerConfig)
+    """Where they work."""
+    processes: int | None = None
+    """Worker processes; None: one a core."""
+    log_level: str = "INFO"
+    """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
+
+    def __post_init__(self) -> None:
+        """Check the number."""
+        if self.processes is not None and not 1 <= self.processes <= 4096:
+            raise ConfigError(f"processes is {self.processes}; expected 1 to 4096")
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    command = arguments.parse(WorkerCommand, words, "farm worker")
+    logs.set_up(command.log_level)
+    processes = command.processes or len(os.sched_getaffinity(0))
+    with stop_flag("leaving") as stop, Pool(processes, _flags(command), dict(os.environ)) as pool:
+        while not stop.wait(0.2):
+            ended = pool.tend()
+            if ended and not pool.pids:
+                if max(ended) == 2:
+                    raise ConfigError("the workers could not start; they say why above")
+                raise FarmError("no worker is left; they say why above")
+    return 0
+
+
+def _flags(command: WorkerCommand) -> list[str]:
+    """The same for each process."""
+    config = command.worker
+    flags = [word for endpoint in config.connect for word in ("--connect", endpoint)]
+    flags += ["--farm", config.farm, "--name", config.name, "--backend", config.backend]
+    if config.tls is not None:
+        flags += ["--tls", str(config.tls)]
+    if config.allow_gym:
+        flags.append("--allow-gym")
+    if config.timeout is not None:
+        flags += ["--timeout", str(config.timeout)]
+    return [*flags, "--log-level", command.log_level.upper()]
