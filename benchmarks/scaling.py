@@ -36,9 +36,9 @@ from farm.arrays import FloatArray
 from farm.commands.status import ask
 from farm.net import codec, keys, session
 from farm.net.events import Event, Events
-from farm.net.jobs import Chunk, Job
+from farm.net.work import Chunk, Job
 from farm.net.messages import Spec
-from farm.net.results import Failure, Result, Results, WireTrajectory
+from farm.net.work import Failure, Result, Results, WireTrajectory
 from farm.sim.scene import load
 from learner.run import free_endpoint
 from workers.backends import BACKENDS

@@ -1,3 +1,52 @@
-"""The farm: what is learned, and how learner and workers speak."""
+"""rolloutfarm: policy search on any task, with MuJoCo rollouts from as many workers as you like.
 
-__version__ = "0.2.0.dev0"
+The public names; each is loaded when it is used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any, Final
+
+__version__ = "0.3.0.dev0"
+
+if TYPE_CHECKING:
+    from farm.errors import CheckpointError as CheckpointError
+    from farm.errors import ConfigError as ConfigError
+    from farm.errors import FarmError as FarmError
+    from farm.errors import RunError as RunError
+    from farm.errors import TaskError as TaskError
+    from farm.policies.base import Policy as Policy
+    from farm.policies.base import PolicyConfig as PolicyConfig
+    from farm.settings import Settings as Settings
+    from farm.settings import setting as setting
+    from farm.sim.sim import Backend as Backend
+    from farm.sim.sim import Sim as Sim
+    from farm.tasks.base import Camera as Camera
+    from farm.tasks.base import Channel as Channel
+    from farm.tasks.base import Record as Record
+    from farm.tasks.base import Score as Score
+    from farm.tasks.base import Task as Task
+    from farm.tasks.base import TaskConfig as TaskConfig
+    from farm.tasks.base import TaskSpec as TaskSpec
+
+_WHERE: Final = {
+    "learn": "learner.run", "load": "learner.replay", "RunConfig": "learner.config", "configure": "learner.config",
+    "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
+    "Channel": "farm.tasks.base", "Camera": "farm.tasks.base", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
+    "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",
+    "Algorithm": "learner.algorithms", "SearchState": "learner.algorithms",
+    "Backend": "farm.sim.sim", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",
+    "FarmError": "farm.errors", "ConfigError": "farm.errors", "CheckpointError": "farm.errors",
+    "RunError": "farm.errors", "TaskError": "farm.errors",
+}  # fmt: skip
+
+__all__ = ["__version__", *_WHERE]  # noqa: PLE0604  strings
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401  whatever it is
+    if name not in _WHERE:
+        raise AttributeError(f"module 'farm' has no attribute {name!r}")
+    return getattr(importlib.import_module(_WHERE[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,34 +1,35 @@
 """The front door: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
 
-import importlib
+import os
 import signal
 import sys
 from collections.abc import Sequence
 from typing import Final
 
-from farm import __version__
+from farm import __version__, plugins
 from farm.errors import ConfigError, FarmError, Interrupted
 
 COMMANDS: Final = {
-    "run": "learner and local workers together: learns the gait and records it",
+    "run": "learner and local workers together: learns a task and records it",
     "learner": "the learner alone; workers join it from anywhere",
     "worker": "workers alone; they serve whichever learners are there",
+    "tasks": "tasks, policies, algorithms and backends: what there is, from where, with its settings",
+    "new-task": "writes a task of your own to start from, 30 lines that run",
+    "check": "checks a task of your own: sizes, same bits however batched, rollouts per second, a picture",
     "evaluate": "the learnt mean policy on perturbed starts",
     "replay": "any policy of a run again, at physics rate, into a recording or a video",
-    "compare": "several runs in one recording: curves overlaid, hands side by side",
-    "play": "the learnt policy in MuJoCo's interactive viewer: push the object",
+    "compare": "several runs in one recording: curves overlaid, scenes side by side",
+    "play": "the learnt policy in MuJoCo's interactive viewer: push what moves",
     "export": "the learnt policy as one file for plain MuJoCo and numpy",
+    "sweep": "settings x seeds on one set of workers; a table and a figure",
     "record": "a run's recording made on any machine, over the network",
     "view": "opens the recordings of runs in the Rerun viewer",
-    "status": "which runs and workers a farm has, and how they are doing",
-    "router": "a standing rendezvous that outlives learners",
-    "certificates": "a small certificate authority, for farms of several machines",
     "runs": "a table of the runs in a folder",
+    "status": "which runs and workers a farm has, and how they are doing",
+    "router": "a permanent router that learners and workers connect to",
+    "certificates": "a small certificate authority, for farms of several machines",
 }
-"""Commands and what they are for; each is a module of farm.commands with a function `main`."""
-
-
-_HOME: Final = dict.fromkeys(("status", "router", "certificates"), "farm")
+"""What the built-in commands are for."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,12 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"rolloutfarm {__version__}\n")
         return 0
     try:
-        if name not in COMMANDS:
-            raise ConfigError(f"unknown command {name!r}; known are {', '.join(COMMANDS)} (see farm --help)")
         if arguments is None:  # where a command has no better idea, SIGTERM is as Ctrl-C
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-        module = "workers.command" if name == "worker" else f"{_HOME.get(name, 'learner')}.commands.{name}"
-        return int(importlib.import_module(module).main(words[1:]))
+        return int(plugins.find("commands", name).target(words[1:]))
     except (KeyboardInterrupt, Interrupted) as end:
         if isinstance(end, KeyboardInterrupt):
             sys.stderr.write("farm: stopped before the end\n")
@@ -61,12 +59,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _overview() -> str:
-    rows = "".join(f"  farm {name:<14}{text}\n" for name, text in COMMANDS.items())
+    others = {name: origin for name, origin in plugins.names("commands").items() if name not in COMMANDS}
+    rows = "".join(f"  farm {name:<14}{text}\n" for name, text in (COMMANDS | others).items())
     return (
-        "rolloutfarm: a hand learns to change its grip by touch, on as many machines as you like.\n\n"
+        "rolloutfarm: policy search on any task, with as many MuJoCo workers on as many machines as you like.\n\n"
         f"{rows}\n  farm COMMAND --help says what a command takes; farm --version.\n"
     )
 
 
+def _without_here() -> None:
+    """`python -m farm` puts the current folder first in the path: nothing is imported from there."""
+    if not sys.flags.safe_path and sys.path and sys.path[0] in ("", os.getcwd()):
+        del sys.path[0]
+
+
 if __name__ == "__main__":
+    _without_here()
     sys.exit(main())

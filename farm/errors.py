@@ -5,6 +5,7 @@ FarmError                 anything we can say in one line
     CheckpointError       a run folder that cannot be continued or read
     UnservedError         a run that this machine's workers do not know, lack something for, or may not serve
   MessageError            bytes from the network that are not what they should be
+  TaskError               a task or policy of the user's that gives arrays which make no sense (exit status 1)
   RunError                a run that cannot go on (exit status 1)
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
@@ -42,6 +43,10 @@ class CheckpointError(ConfigError):
 
 class UnservedError(ConfigError):
     """A run that this machine's workers do not know, lack something for, or may not serve; others may."""
+
+
+class TaskError(FarmError):
+    """A task or policy whose arrays make no sense: names the array, what came and what was expected."""
 
 
 class RunError(FarmError):

@@ -19,7 +19,7 @@ class Pool:
 
     def __init__(self, processes: int, arguments: Sequence[str], environment: dict[str, str]) -> None:
         """Start them with these arguments; they end when this process does, however it ends."""
-        self._command = [sys.executable, "-m", "workers", *arguments, "--exit-with-parent"]
+        self._command = [sys.executable, "-P", "-m", "workers", *arguments, "--exit-with-parent"]
         # One thread a process: the cores are shared out among processes.
         self._environment = {**environment, **dict.fromkeys(_ENVIRONMENT, "1")}
         self._restarts = 0

@@ -1,18 +1,152 @@
-"""Command lines made from configuration dataclasses; the only door to tyro."""
+"""Settings as dataclasses: checked, read from flags and from JSON. The only validator, and the only door to tyro."""
 
 import contextlib
+import dataclasses
+import functools
 import io
+import math
 import sys
+import types
 from collections.abc import Sequence
-from typing import Any, TypeVar
-
-import tyro
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from farm.errors import ConfigError
 
 C = TypeVar("C")
 
-_FRAME = "│╭╮╰╯─ \n"
+_FRAME: Final = "│╭╮╰╯─ \n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Base of frozen, keyword-only settings; every value is checked against its annotation and its `setting`."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        check(self)
+
+
+def setting(
+    default: Any,  # noqa: ANN401  of the field's type
+    *,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
+    """A field with bounds: least and most belong to what is allowed, above and below do not."""
+    return field(default=default, metadata={"bounds": (least, most, above, below)})
+
+
+def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
+    """Check each field of a frozen dataclass by its annotation and bounds; whole numbers become floats where wanted.
+
+    Raises:
+      ConfigError: names the first value that makes no sense, and what was expected.
+    """
+    hints = _hints(type(settings))
+    for each in dataclasses.fields(settings):
+        value = getattr(settings, each.name)
+        kinds = _kinds(hints[each.name])
+        if type(value) is int and float in kinds and int not in kinds:
+            value = float(value)
+            object.__setattr__(settings, each.name, value)
+        _check_kind(each.name, value, hints[each.name], kinds)
+        if "bounds" in each.metadata and value is not None:
+            _check_bounds(each.name, value, *each.metadata["bounds"])
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    try:
+        return get_type_hints(kind)
+    except NameError as error:
+        raise ConfigError(f"settings {kind.__qualname__}: {error}") from None
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """The types a value may have; empty where anything goes."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        return tuple(kind for part in get_args(hint) for kind in _kinds(part))
+    if origin is Literal:
+        return (str,)
+    kind = origin or hint
+    return (kind,) if kind in (int, float, bool, str, tuple, type(None)) else ()
+
+
+def _check_kind(name: str, value: object, hint: Any, kinds: tuple[Any, ...]) -> None:  # noqa: ANN401
+    if kinds and type(value) not in kinds:
+        names = ("nothing" if kind is type(None) else kind.__name__ for kind in kinds)
+        raise ConfigError(f"{_flag(name)} is {value!r}; expected {' or '.join(names)}")
+    choices = [known for part in (hint, *get_args(hint)) if get_origin(part) is Literal for known in get_args(part)]
+    if choices and value is not None and value not in choices:
+        raise ConfigError(f"unknown {_flag(name)} {value!r}; known are {', '.join(map(str, choices))}")
+    if type(value) is float and not math.isfinite(value):
+        raise ConfigError(f"{_flag(name)} is {value}; expected a finite number")
+
+
+def _check_bounds(
+    name: str, value: float, least: float | None, most: float | None, above: float | None, below: float | None
+) -> None:
+    inside = (
+        (least is None or value >= least)
+        and (most is None or value <= most)
+        and (above is None or value > above)
+        and (below is None or value < below)
+    )
+    if inside:
+        return
+    if least is not None and most is not None:
+        expected = f"{least:g} to {most:g}" if max(abs(least), abs(most)) < 1e6 else f"{least} to {most}"
+    else:
+        parts = [
+            *([] if least is None else [f"{least:g} or more"]),
+            *([] if above is None else ["a positive number" if above == 0 else f"more than {above:g}"]),
+            *([] if most is None else [f"at most {most:g}"]),
+            *([] if below is None else [f"less than {below:g}"]),
+        ]
+        expected = ", ".join(parts)
+    raise ConfigError(f"{_flag(name)} is {value}; expected {expected}")
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")
+
+
+def to_dict(settings: Any) -> dict[str, Any]:  # noqa: ANN401  any dataclass
+    """Every field by its name, as JSON takes it."""
+    return dataclasses.asdict(settings)
+
+
+def from_dict(kind: type[C], values: object, where: str) -> C:
+    """Settings from a table of JSON; what is missing keeps its default.
+
+    Raises:
+      ConfigError: unknown names, wrong types or impossible values; `where` is named.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where} is {str(values)[:80]!r}; expected a table of settings")
+    known = {each.name: each for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = [str(name)[:80] for name in values if name not in known]
+    if unknown:
+        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known are {', '.join(known) or 'none'}")
+    hints = _hints(kind)  # type: ignore[arg-type]
+    made = {name: _natural(value, hints[name]) for name, value in values.items()}
+    try:
+        return kind(**made)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
+    """A value of JSON as the annotation has it: whole numbers that are floats, lists that are tuples."""
+    if type(value) is list:
+        return tuple(value)
+    return float(value) if type(value) is int and float in _kinds(hint) and int not in _kinds(hint) else value
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
@@ -23,6 +157,8 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
     Raises:
       ConfigError: an unknown flag, or a value of the wrong type, in one line.
     """
+    import tyro  # what only reads a configuration does without
+
     said = io.StringIO()
     extra: dict[str, Any] = {} if default is None else {"default": default}
     try:
@@ -37,7 +173,7 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
 
 def _one_line(box: str, program: str) -> str:
-    """What a box of tyro's says, without frame and repetition."""
+    """The error in a box of tyro's, without frame and repetition."""
     body = [line.strip(_FRAME) for line in box.splitlines()[1:]]
     first = next((i for i, line in enumerate(body) if not line), len(body))
     said = " ".join(body[:first]).strip() or "these arguments make no sense"

@@ -10,11 +10,20 @@ from farm.arrays import FloatArray
 from farm.errors import CheckpointError, MessageError
 from farm.net import codec
 from farm.net.codec import array
-from farm.net.jobs import Job
 
-_MAGIC: Final = b"rolloutfarm checkpoint 1\n"
-_SCHEMA: Final = 1  # of what follows, whichever version messages have
+_MAGIC: Final = b"rolloutfarm checkpoint 2\n"
+_SCHEMA: Final = 2  # of what follows, whichever version messages have
 _DIGEST: Final = hashlib.sha256().digest_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class BestRollout:
+    """A rollout that can be run again."""
+
+    seed: tuple[int, ...] | None
+    """None for nominal conditions."""
+    theta: FloatArray = array("<f8", 1)
+    """Its parameters, (P,)"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,18 +43,20 @@ class Checkpoint:
     """Wall time so far [s]."""
     solved: int
     """Generations in a row in which the mean policy succeeded."""
-    best: Job | None
-    """The best rollout so far, as a job that runs it again."""
+    best: "BestRollout | None"
+    """The best rollout so far."""
     best_generation: int
     """The generation it came from."""
     canary: str | None
     """Digest of the numbers of the machines that simulated; None as long as none has."""
     replayed: bool
     """Whether it has been recorded at physics rate."""
-    frequencies: FloatArray = array("<f8", 2)
-    """Random features W, (D, d)"""
-    phases: FloatArray = array("<f8", 1)
-    """Random features c, (D,)"""
+    code: dict[str, str]
+    """Digests of the code that decides its numbers."""
+    files: dict[str, str]
+    """Texts that its task is made of."""
+    constants: dict[str, Any]
+    """Arrays that its policy is made of."""
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:

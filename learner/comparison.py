@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from farm.errors import ConfigError
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from learner.config import RunConfig, changes, preset_of, settings
 from learner.run_folder import RunFolder
 
@@ -18,7 +18,7 @@ class Compared:
     name: str
     """Its own among them."""
     config: RunConfig
-    progress: Sequence[Progress]
+    progress: Sequence[GenerationStats]
     summary: Mapping[str, Any]
     """Empty as long as there is none."""
 
@@ -92,6 +92,6 @@ def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)
 
 
-def _first_success(progress: Sequence[Progress]) -> str:
+def _first_success(progress: Sequence[GenerationStats]) -> str:
     """After how many updates the mean policy first succeeded."""
     return next((str(p.generation - 1) for p in progress if p.mean_policy_success), "-")

@@ -1,141 +1,187 @@
-"""The configuration of a run: everything its numbers depend on. Pure but for reading the file."""
+"""The configuration of a run: everything its numbers depend on."""
 
 import dataclasses
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args, get_type_hints
+from typing import Any, Final, Literal, cast
 
-from farm import tasks
+from farm import plugins, settings
 from farm.errors import ConfigError
-from farm.policies.fourier import PolicyConfig
+from farm.policies.base import Policy, PolicyConfig
 from farm.seeds import SEEDS
-from farm.tasks.finger_gait.task import TaskConfig
-from learner.algorithms import ALGORITHMS, PGPE, Algorithm, name_of
+from farm.settings import Settings, setting
+from farm.tasks.base import Task, TaskConfig
+from learner.algorithms import Algorithm
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Version of config.json."""
+
+_PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
+"""What is chosen by name and has settings of its own, and the kind of plug-in that it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """A run. Same configuration, same numbers to the last bit, however many workers there are."""
+class RunConfig(Settings):
+    """A run. Same configuration, same numbers to the last bit, however many workers there are.
 
-    task: TaskConfig = field(default_factory=lambda: TaskConfig(perturb=True))
-    """The task."""
-    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(controller="kernel"))
-    """The controller."""
-    algorithm: Algorithm[Any] = field(
-        default_factory=lambda: PGPE(initial_mu=1.75, initial_sigma=0.8, sigma_rule="capped")
-    )
-    """The learning rule."""
-    seed: int = 0
+    What is left out is the first preset of the task: `RunConfig(task="gym:Swimmer-v5")` can be learnt.
+    """
+
+    task: str = "finger-gait"
+    """What is learnt: a name (farm tasks lists them), gym:NAME, or FILE.py:CLASS."""
+    policy: str = ""
+    """The controller: a name (farm tasks lists them), or FILE.py:CLASS."""
+    algorithm: str = ""
+    """The learning rule: a name (farm tasks lists them), or FILE.py:CLASS."""
+    task_config: TaskConfig = cast("TaskConfig", None)  # noqa: RUF009  filled in below
+    """Settings of the task."""
+    policy_config: PolicyConfig = cast("PolicyConfig", None)  # noqa: RUF009
+    """Settings of the policy."""
+    algorithm_config: Algorithm[Any] = cast("Algorithm[Any]", None)  # noqa: RUF009
+    """Settings of the algorithm."""
+    seed: int = setting(0, least=0, most=SEEDS - 1)
     """Seed of everything random in the run."""
-    generations: int = 150
+    generations: int = setting(150, least=0, most=10_000_000)
     """Updates of the search distribution."""
-    stop_when_solved: int | None = None
+    stop_when_solved: int | None = setting(None, least=1)
     """End after so many generations in a row in which the mean policy succeeded."""
     init_from: str | None = None
-    """Start from the mean, sigma and random features of another run: its folder."""
+    """Start from the mean, sigma and constants of another run: its folder."""
     init_sigma: Literal["run", "fresh"] = "run"
     """With init-from: take that run's sigma as well, or start with --initial-sigma."""
     traces: Literal["all", "extremes", "none"] = "extremes"
-    """Tactile traces that are recorded: of all rollouts, of the best and worst of a generation, or none."""
+    """Traces that are recorded: of all rollouts, of the best and worst of a generation, or none."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
-        if not 0 <= self.seed < SEEDS:
-            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
-        if not 0 <= self.generations <= 10_000_000:
-            raise ConfigError(f"generations is {self.generations}; expected 0 to 10000000")
-        self._check_task()
-        if self.stop_when_solved is not None and self.stop_when_solved < 1:
-            raise ConfigError(f"stop-when-solved is {self.stop_when_solved}; expected 1 or more")
-        kinds = {f.name: f.type for f in dataclasses.fields(self)}
-        for name in ("init_sigma", "traces"):
-            value, known = getattr(self, name), get_args(kinds[name])
-            if value not in known:
-                raise ConfigError(f"{name.replace('_', '-')} is {value!r}; known are {', '.join(known)}")
-
-    def _check_task(self) -> None:
-        """See that nothing is asked of a task that it does not have."""
-        if self.stop_when_solved is not None and not tasks.sizes(self.task).success:
-            raise ConfigError(f"--stop-when-solved: {self.task.task} knows returns, but no success")
-        plain = PolicyConfig()
-        if self.task.kind != "finger-gait" and (self.policy.action, self.policy.clip) != (plain.action, plain.clip):
-            raise ConfigError(
-                f"--action and --clip are settings of finger-gait; actions of {self.task.task} are rescaled"
-            )
+        """Fill in what is left out, and check every value."""
+        for name, value in _filled(self).items():
+            object.__setattr__(self, name, value)
+        super().__post_init__()
+        owners: dict[str, str] = {}
+        for part in ("run", *_PARTS):
+            for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
+                if owners.setdefault(name, part) != part:
+                    raise ConfigError(f"setting {name!r} of the {part} {self.task!r} is also the {owners[name]}'s")
 
 
-PRESETS: Final[dict[str, RunConfig]] = {
-    "default": RunConfig(),
-    "thesis": RunConfig(
-        task=TaskConfig(), policy=PolicyConfig(), algorithm=PGPE(normaliser="thesis", sigma_rule="bare")
-    ),
-    "gym": RunConfig(
-        task=TaskConfig(task="gym:Swimmer-v5", gamma=1.0, perturb=True),
-        policy=PolicyConfig(controller="direct", features=50, bandwidth=3.0),
-        algorithm=PGPE(
-            initial_mu=0.0, initial_sigma=0.1, shaping="ranks", optimiser="clipup", learning_rate_mu=0.1,
-            learning_rate_sigma=0.1, sigma_rule="capped", max_speed=0.2,
-        ),
-    ),
+def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
+    return [each.name for each in dataclasses.fields(kind)]
+
+
+def _filled(config: RunConfig) -> dict[str, Any]:
+    """What a configuration leaves out, from the task's first preset."""
+    if all((config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)):
+        return {}
+    table = presets(config.task)
+    given = dict(next(iter(table.values()), {}))
+    out: dict[str, Any] = {}
+    for part, kind in _PARTS.items():
+        name = getattr(config, part) or given.get(part) or _DEFAULT[part]
+        own = getattr(config, f"{part}_config")
+        out |= {part: name, f"{part}_config": own or _part(kind, name, given)}
+    return out
+
+
+_DEFAULT: Final = {"policy": "direct", "algorithm": "pgpe"}
+_GENERAL: Final[Mapping[str, Any]] = {
+    "policy": "direct", "features": 50, "bandwidth": 3.0, "algorithm": "pgpe", "initial_mu": 0.0,
+    "initial_sigma": 0.1, "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.1,
+    "learning_rate_sigma": 0.1, "sigma_rule": "capped", "max_speed": 0.2,
 }  # fmt: skip
-"""Configurations by name: what learns most surely, the thesis' own set-up, and Gymnasium's environments."""
+"""The settings that runs begin with, where the task has none of its own."""
 
 
-def preset_for(kind: str) -> str:
-    """The preset that runs of a kind of task begin with: the one of its name, or `default`."""
-    return kind if kind in PRESETS else "default"
-
-
-def preset(name: str) -> RunConfig:
-    """The configuration of that name.
+def settings_class(kind: str, name: str) -> type[Any]:
+    """The dataclass of a plug-in's settings: its `Config`, or the class itself.
 
     Raises:
-      ConfigError: there is none.
+      ConfigError: there is no such plug-in, or it is of another kind.
     """
-    if name not in PRESETS:
-        raise ConfigError(f"unknown preset {name!r}; known are {', '.join(PRESETS)}")
-    return PRESETS[name]
+    target = plugins.find(kind, name).target
+    base = {"tasks": Task, "policies": Policy}.get(kind)
+    if base is not None and not (isinstance(target, type) and issubclass(target, base)):
+        raise ConfigError(f"{name} is no {base.__name__}: derive its class from farm.{base.__name__}")
+    config = getattr(target, "Config", target)
+    if not dataclasses.is_dataclass(config) or "Config" in vars(target) and _undecorated(config):
+        raise ConfigError(f"settings of {name}: put @dataclass(frozen=True, kw_only=True) on its class")
+    return cast("type[Any]", config)
 
 
-def algorithm(name: str) -> type[Algorithm[Any]]:
-    """The algorithm of that name.
+def _undecorated(config: type) -> bool:
+    return any(name not in _fields(config) for name in vars(config).get("__annotations__", {}))
+
+
+def _part(kind: str, name: str, given: Mapping[str, Any]) -> Any:  # noqa: ANN401  settings of that plug-in
+    config = settings_class(kind, name)
+    known = {each: value for each, value in given.items() if each in _fields(config)}
+    return settings.from_dict(config, known, name)
+
+
+def presets(task: str) -> dict[str, Mapping[str, Any]]:
+    """Settings that runs of a task begin with, by preset and flag; the first one unless told otherwise."""
+    settings_class("tasks", task)
+    own = dict(plugins.find("tasks", task).target.presets)
+    return {name: given or _GENERAL for name, given in own.items()}
+
+
+def configure(task: str = "finger-gait", preset: str | None = None, **changed: Any) -> RunConfig:  # noqa: ANN401
+    """A preset with some settings changed, each by its flag's name.
 
     Raises:
-      ConfigError: there is none.
+      ConfigError: there is no such task, preset or setting, or a value makes no sense.
     """
-    if name not in list(ALGORITHMS):
-        raise ConfigError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
-    return ALGORITHMS[name]
+    table = presets(task)
+    name = preset or next(iter(table))
+    if name not in table:
+        raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
+    return changed_by(RunConfig(task=task), {**table[name], **changed}, fresh=True)
+
+
+def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
+    """A configuration with some settings changed, each by its flag's name.
+
+    A part that is chosen anew (or all, if `fresh`) begins with its own defaults.
+    """
+    parts: dict[str, Any] = {}
+    known = {"task", "policy", "algorithm"}
+    for part, kind in _PARTS.items():
+        name = given.get(part, getattr(config, part))
+        old = getattr(config, f"{part}_config")
+        begin = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
+        own = _fields(settings_class(kind, name))
+        known |= set(own)
+        table = {**begin, **{k: v for k, v in given.items() if k in own}}
+        parts |= {part: name, f"{part}_config": settings.from_dict(settings_class(kind, name), table, name)}
+    run = {k: v for k, v in given.items() if k in _fields(config) and k not in known}
+    if unknown := [k for k in given if k not in known and k not in run]:
+        raise ConfigError(f"unknown setting {', '.join(unknown)}")
+    return replace(config, **parts, **run)
 
 
 _APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved"}
 
 
 def preset_of(config: RunConfig) -> str:
-    """The preset that a configuration is but for its task's name, seed and length, "own" where it is none."""
-    for name, known in PRESETS.items():
-        if {change[0] for change in changes(known, config)} <= _APART:
+    """The preset that a configuration is but for seed and length, "own" where it is none."""
+    for name in presets(config.task):
+        if {change[0] for change in changes(configure(config.task, name), config)} <= _APART:
             return name
     return "own"
 
 
 def properties(config: RunConfig) -> dict[str, str | int]:
-    """What tells a run from others at a glance."""
-    task = {"state": config.task.state, "object": config.task.object}
-    if config.task.kind != "finger-gait":
-        task = {"task": config.task.task}
-    return {"preset": preset_of(config), "controller": config.policy.controller, **task, "seed": config.seed}
+    """What distinguishes a run at a glance."""
+    return {"preset": preset_of(config), "policy": config.policy, "task": config.task, "seed": config.seed}
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """As it stands in config.json and in a checkpoint."""
-    named = {"name": name_of(config.algorithm), **dataclasses.asdict(config.algorithm)}
-    return {"version": VERSION, **dataclasses.asdict(config), "algorithm": named}
+    """As it is in config.json and in a checkpoint."""
+    parts = {part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
+             for part in _PARTS}  # fmt: skip
+    own = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in _PARTS}
+    return {"version": VERSION, **parts, **own}
 
 
 def from_dict(values: object, where: str) -> RunConfig:
@@ -146,13 +192,16 @@ def from_dict(values: object, where: str) -> RunConfig:
     """
     if not isinstance(values, dict) or values.get("version") != VERSION:
         found = values.get("version") if isinstance(values, dict) else None
-        raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {found!r})")
-    try:
-        return _build(RunConfig, {k: v for k, v in values.items() if k != "version"}, "")
-    except (ValueError, TypeError) as error:
-        raise ConfigError(f"{where}: {error}") from None
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(found)[:40]!r})")
+    made: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *_PARTS)}
+    for part, kind in _PARTS.items():
+        table = values.get(part)
+        if not isinstance(table, dict) or type(table.get("name")) is not str:
+            raise ConfigError(f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name")
+        own = {k: v for k, v in table.items() if k != "name"}
+        config = settings.from_dict(settings_class(kind, table["name"]), own, f"{where}: {part}")
+        made |= {part: table["name"], f"{part}_config": config}
+    return settings.from_dict(RunConfig, made, where)
 
 
 def read(path: Path) -> RunConfig:
@@ -165,52 +214,23 @@ def read(path: Path) -> RunConfig:
         values = json.loads(path.read_text("utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path} is not JSON: {error}") from None
     return from_dict(values, str(path))
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Settings that differ: name, old and new value; of another algorithm only those that both have."""
-    before, after = settings(old), settings(new)
+    """Settings that differ: name, old and new value; of another plug-in only those that both have."""
+    before, after = flat(old), flat(new)
     for name, value in before.items():
         if name in after and value != after[name]:
             yield name, value, after[name]
 
 
-def settings(config: RunConfig) -> dict[str, object]:
-    """Every setting by its flag's name; `algorithm` is the algorithm's name."""
-    tables: dict[str, Any] = dataclasses.asdict(config)
-    task, policy, rule = tables.pop("task"), tables.pop("policy"), tables.pop("algorithm")
-    flat = {**task, **policy, "algorithm": name_of(config.algorithm), **rule, **tables}
-    return {name.replace("_", "-"): value for name, value in flat.items()}
-
-
-def _build(kind: type[Any], values: dict[str, Any], prefix: str) -> Any:  # noqa: ANN401  a dataclass of that kind
-    fields = {f.name: f for f in dataclasses.fields(kind)}
-    unknown = [prefix + name for name in values if name not in fields]
-    if unknown:
-        raise ConfigError(f"unknown setting {', '.join(unknown)}")
-    default, hints = kind(), get_type_hints(kind)
-    made = {}
-    for name, value in values.items():
-        nested = getattr(default, name)
-        if dataclasses.is_dataclass(nested):
-            if not isinstance(value, dict):
-                raise ConfigError(f"{prefix}{name} is {value!r}; expected a table of settings")
-            nested_kind = algorithm(value.get("name", "pgpe")) if name == "algorithm" else type(nested)
-            table = {k: v for k, v in value.items() if (name, k) != ("algorithm", "name")}
-            made[name] = _build(nested_kind, table, f"{prefix}{name}.")
-        else:
-            made[name] = _scalar(f"{prefix}{name}", nested, value, hints[name])
-    return kind(**made)
-
-
-def _scalar(name: str, default: object, value: object, kind: object) -> object:
-    """The value, if it is of the default's type (a float may be written as an int), or of an optional's kind."""
-    if isinstance(default, float) and type(value) is int:
-        return float(value)
-    known = get_args(kind) if default is None else (type(default),)
-    if type(value) in known:
-        return value
-    raise ConfigError(f"{name} is {value!r}; expected {' or '.join(k.__name__ for k in known)}")
+def flat(config: RunConfig) -> dict[str, object]:
+    """Every setting by its flag's name."""
+    out: dict[str, Any] = {}
+    for name in _fields(config):
+        value = getattr(config, name)
+        out |= settings.to_dict(value) if name.endswith("_config") else {name: value}
+    return {name.replace("_", "-"): value for name, value in out.items()}

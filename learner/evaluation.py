@@ -1,13 +1,10 @@
-"""The mean policy, by itself: as jobs, and what they gave."""
+"""The mean policy by itself: as jobs, and what they gave."""
 
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from farm import seeds as randomness
-from farm.net.jobs import Job
-from farm.net.results import Result
+from farm import seeds
+from farm.net.work import Jobs
 from farm.sim.trajectory import Trajectory
 
 EVALUATION_ROLLOUTS: Final = 100
@@ -16,15 +13,23 @@ EVALUATION_ROLLOUTS: Final = 100
 EVALUATION_SEED: Final = 0
 """Its seed."""
 
-_ZERO: Final = np.empty(0)  # an eps of zeros, on the wire
+
+@dataclass(frozen=True)
+class Nominal:
+    """The mean policy's rollout under nominal conditions, at physics rate."""
+
+    value: float
+    """Its return."""
+    success: bool | None
+    """None where the task knows no success."""
+    trajectory: Trajectory | None
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """The end of a run: the mean policy, unperturbed and perturbed."""
 
-    mean: Result
-    """One rollout under nominal conditions, at physics rate."""
+    mean: Nominal
     robust_success_rate: float | None
     """Part of the perturbed rollouts that succeeded; None where the task knows no success."""
     robust_return: float
@@ -33,12 +38,7 @@ class Evaluation:
     """The best rollout of the run at physics rate, if it has not been shown yet."""
 
 
-def evaluation_jobs(rollouts: int, seed: int) -> list[Job]:
+def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
     """The mean policy on perturbed starts, and last on the nominal one at physics rate."""
-    trials = [mean_job(i, rate="none", perturbation=randomness.trial(seed, i)) for i in range(rollouts)]
-    return [*trials, mean_job(rollouts, rate="physics", perturbation=None)]
-
-
-def mean_job(index: int, rate: str, perturbation: tuple[int, ...] | None) -> Job:
-    """One rollout of the mean policy."""
-    return Job(index=index, origin="mu", signs=(1,), perturbation=perturbation, rate=rate, eps=_ZERO)
+    trials = Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
+    return Jobs.joined([*([trials] if rollouts else []), Jobs.mean("physics", [None])])

@@ -9,24 +9,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import seeds as randomness
-from farm import tasks
+from farm import seeds
 from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import CheckpointError, RunError
-from farm.net.jobs import Job, Jobs
 from farm.net.messages import Spec
-from farm.net.results import Result
-from farm.net.stats import Progress
-from farm.sim.trajectory import Trajectory
+from farm.net.stats import GenerationStats
+from farm.net.work import Jobs
 from learner import config as configs
 from learner.algorithms import SearchState
-from learner.checkpoint import Checkpoint
-from learner.config import RunConfig
-from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, evaluation_jobs, mean_job
+from learner.checkpoint import BestRollout, Checkpoint
+from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, Nominal, evaluation_jobs
 from learner.run_folder import RunFolder
 from learner.scheduler.dispatcher import Dispatcher
-from learner.scheduler.round import Round
-from learner.setup import specification
+from learner.scheduler.round import RoundResults
+from learner.setup import Problem
 from learner.telemetry.report import Report
 
 log = logging.getLogger(__name__)
@@ -38,22 +34,23 @@ REPLAY_EVERY: Final = 10
 class Learner:
     """One run, from its start or its checkpoint to its end."""
 
-    def __init__(self, config: RunConfig, folder: RunFolder, at: Checkpoint) -> None:
-        """Take up a run where its checkpoint stands: `start`'s for a new one.
+    def __init__(self, problem: Problem, folder: RunFolder, at: Checkpoint) -> None:
+        """Take up a run where its checkpoint is: `start`'s for a new one.
 
         Raises:
           CheckpointError: the checkpoint does not fit the configuration.
         """
         # The replay of the best is shown again: replay.rrd is written anew by whoever ends the run.
-        self.config, self.folder, self._at = config, folder, replace(at, replayed=at.best is None)
+        self.problem, self.config, self.folder = problem, problem.config, folder
+        self._at = replace(at, replayed=at.best is None)
+        self._algorithm = self.config.algorithm_config
         try:
-            self.state: SearchState = config.algorithm.restore(at.state)
+            self.state: SearchState = self._algorithm.restore(at.state)
         except ValueError as error:
             raise CheckpointError(f"{folder.checkpoint}: {error}") from None
         self._before = at.reissued
-        sizes = tasks.sizes(config.task)
-        self._signs = config.algorithm.signs()
-        self._judged, self._keep = sizes.success, config.traces if sizes.fingers else "none"
+        self._signs = self._algorithm.signs()
+        self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.traced else "none"
         folder.save(self._at)
 
     @property
@@ -64,7 +61,7 @@ class Learner:
     @property
     def spec(self) -> Spec:
         """What workers simulate, under the folder's name: copies of a run may go on side by side."""
-        return replace(specification(self.config, self._at), run=self.folder.name)
+        return self.problem.specification(self.folder.name)
 
     @property
     def canary(self) -> str | None:
@@ -94,7 +91,7 @@ class Learner:
             rollouts = len(eps) * len(self._signs)  # the jobs behind them are the mean policy's, and perhaps the best's
             returns = results.returns[:rollouts].reshape(len(eps), len(self._signs))
             before = self.state
-            self.state = self.config.algorithm.tell(before, eps, returns)
+            self.state = self._algorithm.tell(before, eps, returns)
             self._note(before, eps, results, returns, time.monotonic() - begun, farm)
             if not self.over:
                 eps = self._explore(farm)
@@ -111,23 +108,26 @@ class Learner:
             yield Report(
                 progress=progress,
                 rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
-                sample=_trajectory(results[len(eps)]),
+                sample=results.trajectory(len(eps)),
                 traces=_traces(results.traces, returns, self._keep),
-                replay=_trajectory(results[-1]) if len(results) > len(eps) + 1 else None,
+                replay=results.trajectory(len(eps) + 1),
                 replay_generation=last.best_generation,
             )
 
     def evaluate(self, farm: Dispatcher) -> Evaluation:
         """The mean policy at the end of the run."""
-        jobs = evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED)
-        best = self._replay_job(len(jobs))
-        farm.begin(self.state.generation, self.state.mu, Jobs.of([*jobs, *best]))
-        results = farm.collect()
+        jobs = Jobs.joined([evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()])
+        farm.begin(self.state.generation, self.state.mu, jobs)
+        results, last = farm.collect(), EVALUATION_ROLLOUTS
         return Evaluation(
-            mean=results[EVALUATION_ROLLOUTS],
-            robust_success_rate=self._success(results.flags[:EVALUATION_ROLLOUTS]),
-            robust_return=float(np.mean(results.returns[:EVALUATION_ROLLOUTS])),
-            replay=_trajectory(results[-1]) if best else None,
+            mean=Nominal(
+                value=float(results.returns[last]),
+                success=bool(results.flags[last, 0]) if self._judged else None,
+                trajectory=results.trajectory(last),
+            ),
+            robust_success_rate=self._success(results.flags[:last]),
+            robust_return=float(np.mean(results.returns[:last])),
+            replay=results.trajectory(last + 1),
         )
 
     def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
@@ -142,8 +142,8 @@ class Learner:
             "generations": at,
             "rollouts": self._at.rollouts,
             "best_return": self.state.best,
-            "mean_policy_return": float(mean.returns[0]) if mean else None,
-            "mean_policy_success": bool(mean.success[0]) if mean and self._judged else None,
+            "mean_policy_return": mean.value if mean else None,
+            "mean_policy_success": mean.success if mean else None,
             "success_rate": rates[-1] if rates else None,
             "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
             "robust_return": evaluation.robust_return if evaluation else None,
@@ -163,30 +163,29 @@ class Learner:
     def _explore(self, farm: Dispatcher) -> FloatArray:
         """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
         config, state = self.config, self.state
-        eps = config.algorithm.ask(state, randomness.exploration(config.seed, state.generation))
-        seeds = None
-        if config.task.perturb:
-            seeds = [randomness.training(config.seed, state.generation, i) for i in range(len(eps))]
-        mean = mean_job(len(eps), rate="control", perturbation=None)
-        replay = self._replay_job(len(eps) + 1) if state.generation % REPLAY_EVERY == 0 else []
-        jobs = Jobs.exploring(eps, self._signs, seeds, [mean, *replay])
+        eps = self._algorithm.ask(state, seeds.exploration(config.seed, state.generation))
+        drawn = None
+        if config.task_config.perturb:
+            drawn = [seeds.training(config.seed, state.generation, i) for i in range(len(eps))]
+        replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
+        exploring = Jobs.exploring(eps, self._signs, drawn)
+        jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay])
         farm.begin(state.generation, state.mu, jobs, self._keep)
         return eps
 
-    def _perturbation(self, generation: int, index: int) -> tuple[int, ...] | None:
-        return randomness.training(self.config.seed, generation, index) if self.config.task.perturb else None
+    def _seed(self, generation: int, index: int) -> tuple[int, ...] | None:
+        return seeds.training(self.config.seed, generation, index) if self.config.task_config.perturb else None
 
-    def _replay_job(self, index: int) -> list[Job]:
+    def _replay_job(self) -> list[Jobs]:
         """The best rollout so far once more at physics rate, if that has not been done."""
-        at = self._at
-        due = at.best is not None and not at.replayed
-        return [replace(at.best, index=index, rate="physics")] if due and at.best else []
+        best = self._at.best
+        return [] if best is None or self._at.replayed else [Jobs.single(best.theta, "physics", best.seed)]
 
     def _note(
         self,
         before: SearchState,
         eps: FloatArray,
-        results: Round,
+        results: RoundResults,
         returns: FloatArray,
         seconds: float,
         farm: Dispatcher,
@@ -196,9 +195,8 @@ class Learner:
         replayed = self._at.replayed or len(results) > len(eps) + 1
         if before.best is None or returns.max() > before.best:
             row, column = np.unravel_index(int(returns.argmax()), returns.shape)
-            theta = before.mu + self.config.algorithm.signs()[column] * eps[row]
-            seed = self._perturbation(before.generation, int(row))
-            best = Job(index=0, origin="zero", signs=(1,), perturbation=seed, rate="none", eps=theta)
+            theta = before.mu + self._signs[column] * eps[row]
+            best = BestRollout(seed=self._seed(before.generation, int(row)), theta=theta)
             generation, replayed = self.state.generation, False
         self._at = replace(
             self._at,
@@ -207,17 +205,17 @@ class Learner:
             rollouts=self._at.rollouts + returns.size,
             reissued=self._before + farm.reissued,
             seconds=seconds,
-            solved=self._at.solved + 1 if results[len(eps)].success[0] else 0,
+            solved=self._at.solved + 1 if results.flags[returns.size, 0] else 0,
             best=best,
             best_generation=generation,
             canary=farm.admission.canary,
             replayed=replayed,
         )
 
-    def _progress(self, results: Round, returns: FloatArray, farm: Dispatcher) -> Progress:
-        state, flags, mean = self.state, results.flags[: returns.size], results[len(returns)]
-        _, dropped, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
-        return Progress(
+    def _progress(self, results: RoundResults, returns: FloatArray, farm: Dispatcher) -> GenerationStats:
+        state, flags, mean = self.state, results.flags[: returns.size], returns.size
+        _, ended, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
+        return GenerationStats(
             generation=state.generation,
             rollouts=self._at.rollouts,
             return_mean=float(returns.mean()),
@@ -226,14 +224,14 @@ class Learner:
             return_std=float(returns.std()),
             best=float(returns.max()) if state.best is None else state.best,
             baseline=state.baseline,
-            mean_policy_return=float(mean.returns[0]),
-            mean_policy_success=bool(mean.success[0]) if self._judged else None,
+            mean_policy_return=float(results.returns[mean]),
+            mean_policy_success=bool(results.flags[mean, 0]) if self._judged else None,
             success_rate=self._success(flags),
             sigma_mean=float(state.sigma.mean()),
             sigma_min=float(state.sigma.min()),
             sigma_max=float(state.sigma.max()),
             mean_norm=float(np.linalg.norm(state.mu)),
-            dropped=dropped,
+            ended=ended,
             failed=failed,
             clamped=clamped,
             reissued=self._at.reissued,
@@ -245,17 +243,13 @@ class Learner:
         """Part of the rollouts (S, 4) that succeeded, if the task knows success."""
         return float(np.mean(flags[:, 0])) if self._judged else None
 
-    def _save(self, progress: Progress) -> None:
+    def _save(self, progress: GenerationStats) -> None:
         self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
         self.folder.save(self._at)
 
 
-def _trajectory(result: Result) -> Trajectory | None:
-    return result.trajectory.trajectory() if result.trajectory else None
-
-
 def _traces(traces: Mapping[int, AnyArray], returns: FloatArray, keep: str) -> dict[str, AnyArray]:
-    """Those of the rollouts' traces, (T, 54) each, that are kept, by name."""
+    """Those of the rollouts' traces, (T, N) each, that are kept, by name."""
     if keep == "none":
         return {}
     rows = {"best": int(returns.argmax()), "worst": int(returns.argmin())}

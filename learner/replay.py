@@ -9,6 +9,8 @@ print(again(RunFolder.open(Path("runs/first")), Conditions(friction=0.5)).trajec
 from dataclasses import dataclass, replace
 
 import numpy as np
+from farm.tasks.finger_gait.physics import Rollouts, Simulation
+from workers.finger_gait import trajectory, whole
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
@@ -16,13 +18,11 @@ from farm.policies.fourier import Features, Policy
 from farm.sim.trajectory import Trajectory
 from farm.tasks.finger_gait.hand import JOINTS
 from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import Rollouts, Simulation
 from farm.tasks.finger_gait.task import Frames, Perturbation
 from learner import checkpoint as checkpoints
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
 from learner.setup import start
-from workers.finger_gait import trajectory, whole
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,8 @@
 """A run from Python: learner, workers and recording in one call; what `farm run` does.
 
-from learner.run import learn
-from learner.config import RunConfig
+import farm
 
-for report in learn(RunConfig(seed=3), "runs/first", workers=2):
+for report in farm.learn(farm.RunConfig(seed=3), "runs/first", workers=2):
     print(report.progress.mean_policy_return)
 """
 
@@ -12,23 +11,18 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import assets
-from farm import tasks
 from farm.errors import CheckpointError, ConfigError, RunError
 from farm.net import keys, session
-from farm.net.jobs import Job
-from farm.net.results import Result
-from farm.net.session import Session
+from farm.net.session import LISTEN, Session, free_endpoint
 from farm.net.telemetry import WorkerStatus
 from farm.net.tls import Bundle
 from farm.processes import Pool
-from farm.sim.scene import Scene
 from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.algorithms import Diverged
@@ -37,30 +31,28 @@ from learner.config import RunConfig
 from learner.evaluation import Evaluation
 from learner.learner import Learner
 from learner.run_folder import RunFolder
-from learner.scheduler.admission import Admission
 from learner.scheduler.dispatcher import Dispatcher, Stopped
-from learner.scheduler.scheduler import LedgerConfig
-from learner.setup import specification, start
-from learner.telemetry.publisher import Broadcast
+from learner.scheduler.membership import Admission
+from learner.scheduler.scheduler import SchedulerConfig
+from learner.setup import Problem, resumed, start
+from learner.telemetry.publisher import Publisher
 from learner.telemetry.report import Report
-from workers.backends import BACKENDS
-from workers.backends.cpu import CpuBackend
 
 if TYPE_CHECKING:
-    from learner.recording.run import Recording
+    from learner.recording.run import RunRecording
 
 log = logging.getLogger(__name__)
 
-LISTEN: Final = "tcp/127.0.0.1:7447"
-"""Where a learner listens unless told otherwise."""
+MESSAGE_LIMIT: Final = 32 << 20
+"""What a mean may take in a message [bytes]; a chunk holds it and eps besides."""
 
 _REMEMBERED: Final = 5.0  # [s] for which a router may believe that a killed learner is still there
 _TEND: Final = 0.5  # [s] between two looks at the worker processes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
-    """Where a run stands on the network and on this machine; no number depends on it."""
+class Placement:
+    """Where a run is on the network and on this machine; no number depends on it."""
 
     workers: int = 0
     """Local worker processes."""
@@ -77,12 +69,12 @@ class Place:
     trusted: bool = False
     """Listen to other machines without certificates."""
     mixed: bool = False
-    """Admit workers whose machines round differently."""
+    """Admit workers whose machines round differently, and code that has changed since the run began."""
     record: bool = True
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
     """Stream live at this host and port."""
-    ledger: LedgerConfig = field(default_factory=LedgerConfig)
+    scheduler: SchedulerConfig = field(default_factory=SchedulerConfig)
     """How jobs are cut into chunks, and when they are given out again."""
 
 
@@ -93,8 +85,8 @@ class Run:
         self,
         learner: Learner,
         farm: Dispatcher,
-        broadcast: Broadcast,
-        recording: "Recording | None",
+        broadcast: Publisher,
+        recording: "RunRecording | None",
         pool: Pool | None,
     ) -> None:
         """Made by `open_run`."""
@@ -143,10 +135,9 @@ class Run:
                 yield report
             evaluation = self.learner.evaluate(self._farm)
             if self._recording:
-                mean = evaluation.mean.trajectory
                 self._recording.end(
                     self.learner.state.generation,
-                    None if mean is None else mean.trajectory(),
+                    evaluation.mean.trajectory,
                     evaluation.replay,
                     self.learner.best_generation,
                 )
@@ -183,7 +174,7 @@ def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bo
       ConfigError: the folder exists, or a setting makes no sense.
       RunError: the run failed.
     """
-    place = Place(workers=workers, listen=free_endpoint(), record=record)
+    place = Placement(workers=workers, listen=free_endpoint(), record=record)
     with open_run(config, Path(folder), place) as run:
         yield from run.learn()
 
@@ -192,13 +183,12 @@ def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bo
 def open_run(
     config: RunConfig,
     path: Path,
-    place: Place,
+    place: Placement,
     *,
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Run]:
     """Everything a run needs, opened in an order that leaves nothing behind when a part fails."""
-    sizes, scene = tasks.sizes(config.task), tasks.scene(config.task)
     folder = RunFolder(path)
     keys.checked("run", folder.name)
     if place.record or place.serve:
@@ -206,9 +196,10 @@ def open_run(
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())
-        at = _resumed(folder, config) if resume else start(config, folder.name)
+        problem, at = _resumed(folder, config, mixed=place.mixed) if resume else start(config, folder.name)
+        check_size(problem)
         if place.workers:
-            BACKENDS[place.backend](specification(config, at))  # says in time what no worker could simulate
+            problem.runner().close()  # says in time what no worker could simulate
         link = stack.enter_context(_session(place, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:
@@ -218,8 +209,8 @@ def open_run(
             if resume:
                 folder.rewind(at)
                 folder.write_config(config)
-            learner = Learner(config, folder, at)
-            recording = stack.enter_context(_recording(place, learner, scene)) if place.record or place.serve else None
+            learner = Learner(problem, folder, at)
+            recording = stack.enter_context(_recording(place, learner)) if place.record or place.serve else None
             stack.enter_context(_log_file(folder))
         except (ConfigError, OSError) as error:
             if not resume:
@@ -233,27 +224,27 @@ def open_run(
             place.farm,
             learner.spec,
             config.generations,
-            None if place.workers else how_to_join(place, config),
+            None if place.workers else how_to_join(place, problem),
             tend,
-            Admission(assets.digest(), learner.canary, mixed=place.mixed),
-            sizes.shapes(len(scene.bodies)),
-            place.ledger,
+            Admission(learner.canary, mixed=place.mixed),
+            (problem.spec.trace, problem.spec.shapes(len(problem.scene.bodies))),
+            place.scheduler,
         )
         if place.workers:
             flags = [
-                *_worker_flags(place, config),
+                *_worker_flags(place, problem),
                 "--backend",
                 place.backend,
                 "--log-level",
                 "WARNING",
             ]  # what they do, the learner says
             tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
-        broadcast = stack.enter_context(closing(Broadcast(link, place.farm, farm.incarnation, learner)))
+        broadcast = stack.enter_context(closing(Publisher(link, place.farm, farm.incarnation, learner)))
         yield Run(learner, farm, broadcast, recording, tend.pool)
 
 
-def _resumed(folder: RunFolder, config: RunConfig) -> Checkpoint:
-    """The checkpoint to go on from.
+def _resumed(folder: RunFolder, config: RunConfig, *, mixed: bool) -> tuple[Problem, Checkpoint]:
+    """The checkpoint to go on from, and what its run searches for.
 
     Raises:
       CheckpointError: it cannot be used, or belongs to another configuration.
@@ -265,14 +256,7 @@ def _resumed(folder: RunFolder, config: RunConfig) -> Checkpoint:
             raise CheckpointError(
                 f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
             )
-    return at
-
-
-def free_endpoint() -> str:
-    """An endpoint on this machine with a port that nobody uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return resumed(config, at, folder.path, mixed=mixed), at
 
 
 class _Tending:
@@ -290,7 +274,7 @@ class _Tending:
         return self._stopped()
 
 
-def _check_alone(link: Session, place: Place, run: str, stopped: Callable[[], bool]) -> None:
+def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[], bool]) -> None:
     """See that no other learner has a run of this name behind the same router: they would void each other's work.
 
     Raises:
@@ -302,24 +286,24 @@ def _check_alone(link: Session, place: Place, run: str, stopped: Callable[[], bo
             raise ConfigError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
 
 
-def _session(place: Place, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
+def _session(place: Placement, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
     if place.connect:
         return session.connect(place.connect, None, stopped, place.tls)
     return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted)
 
 
-def _worker_flags(place: Place, config: RunConfig) -> list[str]:
+def _worker_flags(place: Placement, problem: Problem) -> list[str]:
     endpoints = place.connect or (place.listen,)
     farm = ["--farm", place.farm] if place.farm != "farm" else []
-    gym = ["--allow-gym"] if config.task.kind == "gym" else []
-    return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), *farm, *gym]
+    files = [word for path in problem.files for word in ("--allow-file", str(path))]
+    return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), *farm, *files]
 
 
-def how_to_join(place: Place, config: RunConfig) -> str:
+def how_to_join(place: Placement, problem: Problem) -> str:
     """The command by which workers join."""
-    host = socket.gethostname()  # of an address that means all of them, others need the name
+    host = socket.gethostname()  # for an address that means all of them, other machines need the name
     flags = [
-        flag.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:") for flag in _worker_flags(place, config)
+        flag.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:") for flag in _worker_flags(place, problem)
     ]
     tls = ["--tls", "worker-NAME"] if place.tls else []
     return " ".join(["farm worker", *flags, *tls])
@@ -346,17 +330,30 @@ def _log_file(folder: RunFolder) -> Iterator[None]:
 
 
 @contextmanager
-def _recording(place: Place, learner: Learner, scene: Scene) -> "Iterator[Recording]":
-    from learner.recording.run import Recording
+def _recording(place: Placement, learner: Learner) -> "Iterator[RunRecording]":
+    from learner.recording.run import RunRecording
 
-    recording = Recording(
+    problem = learner.problem
+    recording = RunRecording(
         learner.folder.recording if place.record else None, replay=learner.folder.replay, run=learner.run,
-        config=learner.config, scene=scene, done=learner.state.generation, serve=place.serve,
+        config=learner.config, spec=problem.spec, scene=problem.scene, camera=problem.task.camera,
+        done=learner.state.generation, serve=place.serve,
     )  # fmt: skip
     try:
         yield recording
     finally:
         recording.finish()
+
+
+def check_size(problem: Problem) -> None:
+    """See that a mean fits into a message.
+
+    Raises:
+      ConfigError: it does not; says the largest size that does.
+    """
+    size, most = problem.policy.size, MESSAGE_LIMIT // 8
+    if size > most:
+        raise ConfigError(f"the policy has {size} parameters; at most {most} fit into a message")
 
 
 def check_rerun() -> None:
@@ -366,18 +363,4 @@ def check_rerun() -> None:
       ConfigError: it is not; says what to install.
     """
     if importlib.util.find_spec("rerun") is None:
-        raise ConfigError("recording needs rerun-sdk: pip install 'rolloutfarm[learner]', or go without by --no-record")
-
-
-def simulate(folder: RunFolder, jobs: Sequence[Job]) -> tuple[int, list[Result]]:
-    """Run jobs around a run's mean in this process.
-
-    Returns:
-      the generation the mean is of, and the results in the jobs' order.
-
-    Raises:
-      ConfigError: the run cannot be read.
-    """
-    at = checkpoints.load(folder.checkpoint)
-    backend = CpuBackend(specification(folder.read_config(), at))
-    return int(at.state["generation"]), backend.run(at.state["mu"], jobs)
+        raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or go without by --no-record")

@@ -27,7 +27,7 @@ import numpy as np
 
 from farm.arrays import FloatArray, IntArray
 from farm.errors import CheckpointError, ConfigError
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.checkpoint import Checkpoint
@@ -145,7 +145,7 @@ class RunFolder:
             return None
         return summary if isinstance(summary, dict) else None
 
-    def append(self, progress: Progress, mu: FloatArray, sigma: FloatArray, generations: int) -> None:
+    def append(self, progress: GenerationStats, mu: FloatArray, sigma: FloatArray, generations: int) -> None:
         """Add a generation to progress.jsonl and parameters."""
         with (self.path / "progress.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(progress.to_dict()) + "\n")
@@ -159,7 +159,7 @@ class RunFolder:
             with path.open("ab") as binary:
                 binary.write(row.tobytes())
 
-    def progress(self) -> list[Progress]:
+    def progress(self) -> list[GenerationStats]:
         """Every whole line of progress.jsonl."""
         try:
             lines = (self.path / "progress.jsonl").read_text("utf-8", "replace").splitlines()
@@ -168,7 +168,7 @@ class RunFolder:
         out = []
         for line in lines:
             try:
-                out.append(Progress.from_dict(json.loads(line)))
+                out.append(GenerationStats.from_dict(json.loads(line)))
             except ValueError:
                 break  # torn by a crash, or of another version: nothing behind it is trusted
         return out

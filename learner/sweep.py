@@ -24,9 +24,9 @@ from typing import Any, Final, Protocol
 from benchmarks.thesis.folder import ExperimentFolder
 from farm.errors import RunError
 from farm.net import session
+from farm.net.session import free_endpoint
 from farm.processes import Pool
 from learner import config as configs
-from learner.run import free_endpoint
 from learner.run_folder import RunFolder
 
 log = logging.getLogger(__name__)

@@ -11,16 +11,16 @@ import atheris
 with atheris.instrument_imports(include=["farm"]):
     from farm.errors import MessageError
     from farm.net import codec
-    from farm.net.jobs import Chunk, Generation
-    from farm.net.messages import Refusal, Spec, Want
-    from farm.net.results import Failure, Results
+    from farm.net.work import Chunk, RoundHeader
+    from farm.net.messages import Refusal, Spec, WorkRequest
+    from farm.net.work import Failure, Results
     from farm.net.telemetry import RunStatus
 
-KINDS = (Chunk, Failure, Generation, Refusal, Results, RunStatus, Spec, Want)
+KINDS = (Chunk, Failure, RoundHeader, Refusal, Results, RunStatus, Spec, WorkRequest)
 
 
 def one(data: bytes) -> None:
-    kind = KINDS[data[0] % len(KINDS)] if data else Want
+    kind = KINDS[data[0] % len(KINDS)] if data else WorkRequest
     with contextlib.suppress(MessageError):
         codec.decode(data[1:], kind)
 

@@ -1,57 +1,81 @@
 """A fingerprint of this machine's numbers: a few rollouts, compared bit for bit.
 
-Processors, compilers and library versions round differently. Machines with the same canary digest
-give the same numbers for the same jobs; the canary goes through everything that a rollout is made
-of: products and cosines of the policy, taxels, contact points, rewards, grips, perturbed physics.
+Processors, compilers and library versions may round differently. Machines with the same digest give the same numbers
+for the same jobs; the rollouts go through contacts, constraints, actuators, changed model fields, random starts, and
+every built-in policy's arithmetic.
 """
 
 import hashlib
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from farm import seeds as randomness
-from farm.policies.fourier import Features, Policy, PolicyConfig
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import Simulation
-from farm.tasks.finger_gait.task import Perturbation, TaskConfig
+from farm import plugins, seeds
+from farm.arrays import FloatArray
+from farm.policies.base import Policy
+from farm.rollouts import Runner
+from farm.sim.sim import Sim
+from farm.tasks.base import Task, TaskConfig
 
-_CONTROLLERS: Final = ("direct", "projected", "kernel", "cosine")
-_STATE: Final = "joints+tactile"
-_FEATURES: Final = 300
-_STEPS: Final = 5
+_POLICIES: Final = {"direct": {"features": 300}, "projected": {"features": 300}, "kernel": {}, "cosine": {"features": 9}}
+
+
+class Canary(Task):
+    """Two fingers that knock a ball about."""
+
+    xml = """
+<mujoco>
+  <option timestep="0.01" integrator="implicitfast" cone="elliptic"/>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1" condim="4"/>
+    <body pos="0 0 0.06"><freejoint/><geom type="ellipsoid" size="0.05 0.04 0.06" condim="4" mass="0.1"/></body>
+    <body pos="0.12 0 0.05" euler="0 10 5">
+      <joint name="a" axis="0 1 0" range="-60 60" damping="0.1"/><geom type="capsule" size="0.01 0.05"/>
+      <body pos="0 0 0.05"><joint name="b" axis="1 0 0" damping="0.1"/><geom type="box" size="0.01 0.02 0.03"/></body>
+    </body>
+  </worldbody>
+  <actuator><position joint="a" kp="3"/><position joint="b" kp="2"/></actuator>
+  <sensor><framequat objtype="xbody" objname="world"/></sensor>
+</mujoco>"""
+    steps, substeps = 6, 10
+
+    def reset(self, sim: Sim, row: int, rng: np.random.Generator | None) -> None:
+        """Push the ball, and change its mass."""
+        sim.qvel[row, :6] = (-0.8, 0.1, 0.0, 1.0, 2.0, 3.0)
+        if rng is not None:
+            sim.qvel[row, :3] += rng.normal(0.0, 0.2, 3)
+            sim.expand("body_mass")[row, 1] *= rng.uniform(0.8, 1.2)
+            sim.expand("geom_friction")[row] *= rng.uniform(0.8, 1.2)
+
+    def reward(self, sim: Sim, action: FloatArray) -> FloatArray:
+        """Anything that depends on everything."""
+        squares = (sim.qpos * sim.qpos).sum(axis=1) + (sim.qfrc_constraint * sim.qfrc_constraint).sum(axis=1)
+        reward: FloatArray = np.sqrt(squares) - 0.1 * (action * action).sum(axis=1)
+        return reward
 
 
 @cache
 def digest() -> str:
-    """SHA-256 of what the canary's rollouts gave; takes some tenths of a second, once a process."""
+    """SHA-256 of what the rollouts gave; takes some tenths of a second, once per process."""
     said = hashlib.sha256()
-    size = STATES[_STATE].size
-    task = TaskConfig(state=_STATE, steps=_STEPS)
-    perturbation = Perturbation.draw(np.random.default_rng(randomness.trial(0, 0)), _STEPS)
-    simulation = None
-    for controller in _CONTROLLERS:
-        config = PolicyConfig(controller=controller, features=_FEATURES)
-        policy = Policy(config, size, _features(config, size))
-        if simulation is None:
-            simulation = Simulation(task, policy)
-        simulation.policy = policy
-        theta = 0.3 * _numbers(2 * policy.size).reshape(2, policy.size)
-        rollouts = simulation.run(theta, [None, perturbation])
-        for values in (rollouts.outcome.returns, rollouts.outcome.terms, rollouts.frames.qpos, rollouts.actions):
+    task = Canary(TaskConfig())
+    spec, runner = task.spec(), None
+    for name, settings in _POLICIES.items():
+        kind: Any = plugins.find("policies", name).target
+        config = kind.Config(**settings)
+        drawn = {key: _numbers(values.shape) for key, values in kind.draw(config, spec, seeds.features(0)).items()}
+        policy: Policy = kind(config, spec, drawn)
+        runner = runner or Runner(task, policy)
+        runner.policy = policy
+        rollouts = runner.rollouts(0.3 * _numbers((2, policy.size)), [None, seeds.trial(0, 0)])
+        for values in (rollouts.returns, rollouts.actions, rollouts.frames["qpos"]):
             said.update(np.ascontiguousarray(values).tobytes())
     return said.hexdigest()
 
 
-def _features(config: PolicyConfig, size: int) -> Features:
-    """Features that do not depend on a random generator's version."""
-    count = 0 if config.controller == "kernel" else config.features
-    frequencies = _numbers(count * size).reshape(count, size)
-    return Features(frequencies=frequencies, phases=np.pi * (1.0 + _numbers(count)))
-
-
-def _numbers(count: int) -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
+def _numbers(shape: tuple[int, ...]) -> FloatArray:
     """Spread over (-1, 1), the same everywhere: multiples of the golden ratio, in whole numbers."""
+    count = int(np.prod(shape))
     whole = (np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(12)
-    return whole.astype(np.float64) / 2.0**51 - 1.0
+    return (whole.astype(np.float64) / 2.0**51 - 1.0).reshape(shape)

@@ -11,23 +11,23 @@ import secrets
 import socket
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from farm import __version__
+import numpy as np
+
+from farm import __version__, rollouts
 from farm.errors import ConfigError, FarmError, MessageError, UnservedError, brief
 from farm.net import codec, keys
 from farm.net.events import Event
-from farm.net.jobs import Chunk, Generation, Job
-from farm.net.messages import Refusal, Spec, Want
-from farm.net.results import Failure, Results
+from farm.net.messages import Refusal, Spec, WorkRequest
 from farm.net.session import Session, check_endpoint, connect
 from farm.net.tls import Bundle, find
-from farm.sim import scene
-from workers import fingerprint as canary
-from workers.backends import BACKENDS, Backend
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
+from farm.rollouts import Runner, served
+from workers import fingerprint
 
 log = logging.getLogger(__name__)
 
@@ -57,9 +57,9 @@ class WorkerConfig:
     timeout: float | None = None
     """Give up when nobody answers for so long at the start [s]; None: keep trying."""
     backend: str = "cpu"
-    """What simulates: cpu."""
-    allow_gym: bool = False
-    """Serve runs of Gymnasium's environments as well (--task gym:NAME), of those that are installed here."""
+    """What simulates: a name, or FILE.py:CLASS."""
+    allow_file: tuple[Path, ...] = ()
+    """Serve runs whose task or policy is a class in this file, repeatable; it must be the same file as the learner's."""
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""
@@ -75,8 +75,10 @@ class WorkerConfig:
             check_endpoint(endpoint, encrypted=self.tls is not None)
         keys.checked("farm", self.farm)
         keys.checked("worker", self.name)
-        if self.backend not in BACKENDS:
-            raise ConfigError(f"unknown backend {self.backend!r}; known are {', '.join(BACKENDS)}")
+        rollouts.backend(self.backend)
+        for path in self.allow_file:
+            if not path.is_file():
+                raise ConfigError(f"--allow-file {path}: there is no such file")
         if self.timeout is not None and not 0 <= self.timeout < float("inf"):
             raise ConfigError(f"timeout is {self.timeout}; expected a number of seconds")
 
@@ -90,7 +92,7 @@ class WorkerConfig:
 class _Served:
     """What a worker knows of one run."""
 
-    header: Generation | None = None
+    header: RoundHeader | None = None
     chunks: deque[Chunk] = field(default_factory=deque)
     busy: float = field(default_factory=time.monotonic)
     """When it last had work, or we said that it has none [s]."""
@@ -120,8 +122,9 @@ class Worker:
         self._config = config
         self._session = session
         self._runs: OrderedDict[str, _Served] = OrderedDict()
-        self._backends: OrderedDict[str, Backend | Exception] = OrderedDict()
-        self._assets, self._canary = scene.digest(), canary.digest()
+        self._runners: OrderedDict[str, Runner | Exception] = OrderedDict()
+        self._backend = rollouts.backend(config.backend)
+        self._canary = fingerprint.digest()
         self._spoke = time.monotonic()
         self._told: set[str] = set()
         self._ignored: Counter[str] = Counter()
@@ -160,7 +163,7 @@ class Worker:
 
     def _take(self, event: Event) -> None:
         if event.topic == "generation":
-            self._begin(codec.decode(event.payload, Generation))
+            self._begin(codec.decode(event.payload, RoundHeader))
         elif event.topic == "inbox":
             self._accept(codec.decode(event.payload, Chunk))
         elif event.topic == "refused":
@@ -196,7 +199,7 @@ class Worker:
             self._told.add(text)
             log.log(level, "%s", text)
 
-    def _begin(self, header: Generation) -> None:
+    def _begin(self, header: RoundHeader) -> None:
         """A new round: work of older ones is void."""
         run = self._served(header.run)
         old = run.header
@@ -211,7 +214,7 @@ class Worker:
         if not _belongs(chunk, run.header):
             payload = self._session.ask(keys.generation(self._config.farm, chunk.run), _ASK)
             if payload is not None:
-                self._begin(codec.decode(payload, Generation))
+                self._begin(codec.decode(payload, RoundHeader))
         if _belongs(chunk, run.header) and len(run.chunks) < _HELD:
             self._make_room(chunk)
             run.chunks.append(chunk)
@@ -232,7 +235,7 @@ class Worker:
             raise MessageError(f"run {run[:40]}: {_RUNS} runs are served already", "large")
         return self._runs.setdefault(run, _Served())
 
-    def _make_room(self, message: Generation | Chunk) -> None:
+    def _make_room(self, message: RoundHeader | Chunk) -> None:
         """See that there is memory for it: what was kept longest for other runs goes, and is asked for again.
 
         Raises:
@@ -262,63 +265,58 @@ class Worker:
     def _run(self, chunk: Chunk) -> None:
         header = self._runs[chunk.run].header
         assert header is not None
-        backend = self._backend(header)
+        runner = self._runner(header)
         self._runs[chunk.run].busy = time.monotonic()
-        if backend is None:
+        if runner is None:
             return
-        if isinstance(backend, Exception):
-            for index in [None] if isinstance(backend, UnservedError) else chunk.indices.tolist():
-                self._fail(chunk, index, backend)
+        if isinstance(runner, Exception):
+            for index in [None] if isinstance(runner, UnservedError) else chunk.indices.tolist():
+                self._fail(chunk, index, runner)
             return
-        jobs = chunk.split()
-        if len(header.mu) != backend.parameters or (len(chunk.eps) and chunk.eps.shape[1] != backend.parameters):
-            log.warning("ignored jobs of run %s: not %d parameters", chunk.run, backend.parameters)
+        size = runner.policy.size
+        if len(header.mu) != size or (len(chunk.eps) and chunk.eps.shape[1] != size):
+            log.warning("ignored jobs of run %s: not %d parameters", chunk.run, size)
             return
+        jobs = chunk.take(np.argsort(chunk.indices).tolist())
         try:
-            self._do(chunk, backend, header, jobs)
+            self._do(chunk, runner, header, jobs)
         except Exception:  # whatever it was, others may be able to, and the learner decides
             log.exception("a chunk of run %s failed; trying its jobs one by one", chunk.run)
-            for job in jobs:
+            for at, index in enumerate(jobs.indices.tolist()):
                 try:
-                    self._do(chunk, backend, header, [job])
+                    self._do(chunk, runner, header, jobs.take([at]))
                 except Exception as error:
-                    self._fail(chunk, job.index, error)
+                    self._fail(chunk, index, error)
         self._runs[chunk.run].busy = time.monotonic()
 
-    def _do(self, chunk: Chunk, backend: Backend, header: Generation, jobs: Sequence[Job]) -> None:
+    def _do(self, chunk: Chunk, runner: Runner, header: RoundHeader, jobs: Jobs) -> None:
         """Run some of a chunk's jobs and say what they gave."""
-        results = backend.run(header.mu, jobs)
-        for job, result in zip(jobs, results, strict=True):  # the learner takes results to be what it asked for
-            asked, given = (len(job.signs), job.rate == "none"), (len(result.returns), result.trajectory is None)
-            if (job.index, *asked) != (result.index, *given):
-                raise ValueError(f"result {result.index} of the backend is not what job {job.index} asks for")
+        given = runner.run(header.mu, jobs, header.traces)
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
-        self._answer(chunk, Results.of(results, traces=header.traces, **head))
+        self._answer(chunk, Results.carrying(given, jobs, **head))
 
-    def _backend(self, header: Generation) -> Backend | Exception | None:
+    def _runner(self, header: RoundHeader) -> Runner | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
-        if header.spec not in self._backends:
+        if header.spec not in self._runners:
             payload = self._session.ask(keys.spec(self._config.farm, header.run), _ASK)
             if payload is None or hashlib.sha256(payload).hexdigest() != header.spec:
                 log.warning("run %s does not tell what it simulates; its jobs wait", header.run)
                 return None
             try:
                 spec = codec.decode(payload, Spec)
-                if spec.task.startswith("gym") and not self._config.allow_gym:
-                    raise UnservedError(f"this worker serves no {spec.task[:80]}: start it with --allow-gym")
-                self._backends[header.spec] = BACKENDS[self._config.backend](spec)
+                self._runners[header.spec] = Runner(*served(spec, self._config.allow_file), self._backend.engine)
                 log.info("serving run %s", header.run)
             except Exception as error:  # the learner is told, and decides
                 log.error("cannot serve run %s: %s", header.run, error, exc_info=not isinstance(error, FarmError))
                 if not isinstance(error, FarmError):
                     return error  # short of memory, say: another time it may go
-                self._backends[header.spec] = error
-        self._backends.move_to_end(header.spec)
-        while len(self._backends) > _KEEP:
-            _, oldest = self._backends.popitem(last=False)
+                self._runners[header.spec] = error
+        self._runners.move_to_end(header.spec)
+        while len(self._runners) > _KEEP:
+            _, oldest = self._runners.popitem(last=False)
             if not isinstance(oldest, Exception):
                 oldest.close()
-        return self._backends[header.spec]
+        return self._runners[header.spec]
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
         text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
@@ -329,13 +327,12 @@ class Worker:
         self._session.publish(keys.result(self._config.farm, chunk.run, self.id), codec.encode(message))
 
     def _want(self, *, idle: tuple[str, ...], credits: int | None = None) -> None:
-        capacity, self._spoke = BACKENDS[self._config.backend].capacity, time.monotonic()
-        message = Want(
+        self._spoke = time.monotonic()
+        message = WorkRequest(
             worker=self.id,
-            credits=2 * capacity if credits is None else credits,
+            credits=2 * self._backend.capacity if credits is None else credits,
             idle=idle,
             version=__version__,
-            assets=self._assets,
             canary=self._canary,
             host=socket.gethostname(),
             cores=os.cpu_count() or 1,
@@ -344,9 +341,9 @@ class Worker:
         self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=not idle)
 
 
-def _belongs(chunk: Chunk, header: Generation | None) -> bool:
+def _belongs(chunk: Chunk, header: RoundHeader | None) -> bool:
     return header is not None and (chunk.incarnation, chunk.round) == (header.incarnation, header.round)
 
 
-def _bytes(message: Generation | Chunk) -> int:
+def _bytes(message: RoundHeader | Chunk) -> int:
     return sum(getattr(value, "nbytes", 0) for value in vars(message).values())

@@ -11,9 +11,8 @@ from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.net import keys
-from farm.net.session import listen, router_settings
+from farm.net.session import LISTEN, listen, router_settings
 from farm.net.tls import find
-from learner.run import LISTEN
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,9 @@ from farm.commands.signals import stop_flag
 from farm.commands.tables import compact, wide
 from farm.errors import FarmError, MessageError
 from farm.net import codec, keys
-from farm.net.session import Session, connect
+from farm.net.session import LISTEN, Session, connect
 from farm.net.telemetry import RunStatus
 from farm.net.tls import find
-from learner.run import LISTEN
 
 _ANSWER = 1.0  # [s] that learners have to answer
 

@@ -1,14 +1,13 @@
 """Who takes part and what is simulated, as learner and workers tell each other. Pure; bytes by `farm.net.codec`.
 
-Everything on the wire is soft state: any message may be lost, doubled or late. Whatever belongs to work (`farm.net.jobs`,
-`farm.net.results`) carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
+Everything on the wire is soft state: any message may be lost, doubled or late. Whatever belongs to work (`farm.net.work`,
+`farm.net.work`) carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
 """
 
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from farm.arrays import FloatArray
-from farm.net.codec import array
+import numpy as np
 
 _SHORT: Final = 250  # characters; names have up to 100, a worker's is two of them
 _KINDS: Final = 20  # of messages that a worker ignores
@@ -16,7 +15,7 @@ _RUNS: Final = 1000  # that a worker serves
 
 
 @dataclass(frozen=True, kw_only=True)
-class Want:
+class WorkRequest:
     """A worker's credits, worker to learners."""
 
     worker: str
@@ -27,8 +26,6 @@ class Want:
     """Runs that it holds nothing of, and has not for a while: what their learners believe it holds is lost."""
     version: str
     """Release of the worker's software."""
-    assets: str
-    """Digest of its hand and objects."""
     canary: str
     """Digest of the numbers its machine gives."""
     host: str
@@ -39,7 +36,7 @@ class Want:
 
     def __post_init__(self) -> None:
         """Check the number, and that what is remembered of a worker is short."""
-        for said in (self.worker, self.version, self.assets, self.canary, self.host):
+        for said in (self.worker, self.version, self.canary, self.host):
             if len(said) > _SHORT or not said.isprintable():
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
         if len(self.idle) > _RUNS:
@@ -53,19 +50,36 @@ class Want:
 
 @dataclass(frozen=True, kw_only=True)
 class Spec:
-    """What a run simulates; told once, kept by workers under its digest. It names things, it never carries code."""
+    """What a run simulates; sent once, kept by workers under its digest. It names code, it never carries any."""
 
     run: str
     task: str
-    """finger-gait, or gym:NAME."""
+    """A name, NAME:VARIANT, or FILE.py:CLASS."""
     task_config: dict[str, Any]
+    policy: str
+    """A name, or FILE.py:CLASS."""
     policy_config: dict[str, Any]
+    code: dict[str, str]
+    """Digests of the code of `task`, `policy` and `simulation`."""
     release: str = ""
-    """Of the package that the task comes from, empty for the farm's own."""
-    frequencies: FloatArray = array("<f8", 2)
-    """Random features W, (D, d)"""
-    phases: FloatArray = array("<f8", 1)
-    """Random features c, (D,)"""
+    """Package and version of the task's class, empty for the farm's own and for files."""
+    policy_release: str = ""
+    """The same for the policy's."""
+    task_release: str = ""
+    """Of what the task itself is made with, as its TaskSpec says."""
+    files: dict[str, str] = field(default_factory=dict)
+    """Texts that the task is made of, by name: models, objects."""
+    constants: dict[str, Any] = field(default_factory=dict)
+    """Arrays that the policy is made of, by name."""
+
+    def __post_init__(self) -> None:
+        """Check the tables that hold more than settings."""
+        for table in (self.code, self.files):
+            if any(type(name) is not str or type(text) is not str for name, text in table.items()):
+                raise ValueError("a text that is none")
+        for name, values in self.constants.items():
+            if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f8") or not np.isfinite(values).all():
+                raise ValueError(f"constant {str(name)[:40]!r} that is no array of finite float64")
 
 
 @dataclass(frozen=True, kw_only=True)

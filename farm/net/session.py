@@ -10,6 +10,7 @@ import ipaddress
 import json
 import logging
 import resource
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -77,6 +78,17 @@ def _reachable(host: str) -> bool:
         return not ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return host != "localhost"
+
+
+LISTEN: Final = "tcp/127.0.0.1:7447"
+"""Where a learner listens unless told otherwise."""
+
+
+def free_endpoint() -> str:
+    """An endpoint on this machine with a port that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Session:

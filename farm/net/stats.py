@@ -3,12 +3,12 @@
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final, cast
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Version of a line of progress.jsonl."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class GenerationStats:
     """One generation. Returns, rates and counts are over its 2N exploring rollouts."""
 
     generation: int
@@ -41,8 +41,8 @@ class Progress:
     """Largest sigma."""
     mean_norm: float
     """Euclidean norm of mu after the update."""
-    dropped: int
-    """Rollouts that dropped the object."""
+    ended: int
+    """Rollouts that the task ended before their last step."""
     failed: int
     """Rollouts whose physics blew up."""
     clamped: int
@@ -59,7 +59,7 @@ class Progress:
         return {"version": VERSION, **asdict(self)}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Progress":
+    def from_dict(cls, values: dict[str, Any]) -> "GenerationStats":
         """Read a line back.
 
         Raises:

@@ -5,9 +5,7 @@ from typing import Any
 
 from farm.arrays import AnyArray
 from farm.net.codec import array
-from farm.net.results import WireTrajectory
-from farm.tasks.finger_gait.hand import FINGERS
-from farm.tasks.finger_gait.touch import TAXELS
+from farm.net.work import WireTrajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,16 +57,16 @@ class Line:
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """Tactile traces of some of a generation's rollouts."""
+    """Traces of some of a generation's rollouts."""
 
     name: str
     """`best` and `worst` are of one rollout, `all` of all."""
     values: AnyArray = array("<f4", 3)
-    """[N], (R, T, 54)"""
+    """(R, T, N)"""
 
     def __post_init__(self) -> None:
         """Check name and shape."""
-        if self.name not in ("best", "worst", "all") or self.values.shape[2] != len(FINGERS) * TAXELS:
+        if self.name not in ("best", "worst", "all"):
             raise ValueError(f"traces {self.name[:40]!r} of shape {self.values.shape}")
         if self.name != "all" and len(self.values) != 1:
             raise ValueError(f"traces {self.name!r} of {len(self.values)} rollouts")
@@ -122,6 +120,8 @@ class RunHistory:
     """Name that the run began with, the id of its recording."""
     config: dict[str, Any]
     """As in config.json."""
+    files: dict[str, str]
+    """Texts that its task is made of."""
     generation: int
     """Generations that are over; where the last report is an earlier one, ask on from there."""
     reports: tuple[RunReport, ...]

@@ -1,162 +1,131 @@
-"""Controllers on random Fourier features (thesis 3.2 and 3.5.4), and what an action means.
+"""Controllers on random Fourier features (thesis 3.2 and 3.5.4), and the kernel they approximate. Pure, batched.
 
-Pure, batched. One action a_i for each of A controlled joints, the hand's eight or an environment's:
+One action a_i for each of A controlled joints or actuators:
 
-    direct     a_i = theta_i . z(x)                      D parameters a joint (thesis 3.7)
-    projected  a_i = z(theta_i) . z(x)                   d parameters a joint (thesis 3.8)
-    kernel     a_i = exp(-|theta_i - x|^2 / (2 h^2))     d parameters a joint: the limit D -> infinity of `projected`
-    cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters a joint (thesis 5.2, future work)
+    direct     a_i = theta_i . z(x)                      D parameters an action (thesis 3.7)
+    projected  a_i = z(theta_i) . z(x)                   d parameters an action (thesis 3.8)
+    kernel     a_i = exp(-|theta_i - x|^2 / (2 h^2))     d parameters an action: the limit D -> infinity of `projected`
+    cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters an action (thesis 5.2, future work)
 
     z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
-
-A rollout's numbers must not depend on who shares its batch. Matrix products over a batch do that (they change
-their order of summation with the shape), so sums here are spelt out or run row by row.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from farm.arrays import FloatArray
-from farm.errors import ConfigError
-from farm.tasks.finger_gait.hand import LOWER, UPPER
-
-CONTROLLERS: Final = ("direct", "projected", "kernel", "cosine")
-_TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target a number that MuJoCo takes
+from farm.policies.base import Policy, PolicyConfig, check_constants
+from farm.settings import setting
+from farm.tasks.base import TaskSpec
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyConfig:
-    """The controller."""
+class KernelConfig(PolicyConfig):
+    """Settings of the kernel controller."""
 
-    controller: Literal["direct", "projected", "kernel", "cosine"] = "projected"
-    """How parameters and state make an action (thesis 3.7, 3.8; kernel: projected at infinite D; cosine: 5.2)."""
-    features: int = 8000
-    """Number of random Fourier features, D (the kernel controller needs none)."""
-    bandwidth: float = 1.0
-    """Width h of the Gaussian kernel, in units of the state."""
-    action: Literal["offset", "absolute", "increment"] = "offset"
-    """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
-    clip: bool = True
-    """Clip joint targets to the joints' ranges."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        if self.controller not in CONTROLLERS:
-            raise ConfigError(f"unknown controller {self.controller!r}; known are {', '.join(CONTROLLERS)}")
-        if not 1 <= self.features <= 10_000_000:
-            raise ConfigError(f"features is {self.features}; expected 1 to 10000000")
-        if not 0 < self.bandwidth < np.inf:
-            raise ConfigError(f"bandwidth is {self.bandwidth}; expected a positive number")
-        if self.action not in ("offset", "absolute", "increment"):
-            raise ConfigError(f"unknown action {self.action!r}; known are offset, absolute, increment")
+    bandwidth: float = setting(1.0, above=0.0)
+    """Width h of the Gaussian kernel, in units of the observation."""
 
 
-@dataclass(frozen=True)
-class Features:
-    """Frequencies and phases of a feature map; drawn once a run and carried with it."""
+@dataclass(frozen=True, kw_only=True)
+class FeaturesConfig(KernelConfig):
+    """Settings of controllers on random features."""
 
-    frequencies: FloatArray
-    """W, (D, d)"""
-    phases: FloatArray
-    """c [rad], (D,)"""
-
-    @classmethod
-    def draw(cls, config: PolicyConfig, state_size: int, rng: np.random.Generator) -> "Features":
-        """Draw them (none for the kernel controller)."""
-        count = 0 if config.controller == "kernel" else config.features
-        frequencies = rng.standard_normal((count, state_size))
-        return cls(frequencies=frequencies, phases=rng.uniform(0.0, 2.0 * np.pi, count))
+    features: int = setting(8000, least=1, most=10_000_000)
+    """Number of random Fourier features, D."""
 
 
-class Policy:
-    """Deterministic controllers for a batch of parameter vectors."""
+class Kernel(Policy):
+    """Gaussian kernel between parameters and observation: a_i = exp(-|theta_i - x|^2 / (2 h^2))."""
 
-    def __init__(
-        self,
-        config: PolicyConfig,
-        state_size: int,
-        features: Features,
-        limits: tuple[FloatArray, FloatArray] = (LOWER, UPPER),
-    ) -> None:
-        """Keep the feature map ready to use; limits are the least and greatest action, (A,) each."""
-        self.config = config
-        self._lower, self._upper = limits
-        self.state_size = state_size
-        # One contiguous row a state component: W x is then d multiply-adds of (D,) vectors, in order.
-        self._rows = np.ascontiguousarray((features.frequencies / config.bandwidth).T)
-        self._phases = features.phases
-        self._scale = np.sqrt(2.0 / max(len(features.phases), 1))
-
-    @property
-    def joint_parameters(self) -> int:
-        """Parameters a joint."""
-        return self.state_size if self.config.controller in ("projected", "kernel") else len(self._phases)
+    Config: ClassVar[type[PolicyConfig]] = KernelConfig
 
     @property
     def size(self) -> int:
-        """Length P of a parameter vector."""
-        return len(self._lower) * self.joint_parameters
+        """A times d."""
+        return self.spec.action * self.spec.observation
 
-    def weights(self, theta: FloatArray) -> FloatArray:
-        """What of the parameters does not change during a rollout, (B, P) -> (B, A, D or d)."""
-        theta = np.ascontiguousarray(theta).reshape(len(theta), len(self._lower), -1)
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """Centres of the kernels, (B, A, d)."""
+        return _by_action(theta, self.spec.action)
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions in (0, 1]."""
+        difference = np.ascontiguousarray(prepared) - np.ascontiguousarray(x)[:, None, :]
         with np.errstate(over="ignore", invalid="ignore"):
-            if self.config.controller == "projected":
-                return np.stack([[self.features(joint) for joint in rollout] for rollout in theta])
-            if self.config.controller == "cosine":
-                return np.cos(theta)
-            return theta
+            squares = (difference * difference).sum(axis=-1)
+            return np.exp(squares * (-0.5 / self.config.bandwidth**2))
 
-    def actions(self, weights: FloatArray, x: FloatArray) -> FloatArray:
-        """Raw actions.
 
-        Args:
-          weights: (B, A, D or d) from `weights`.
-          x: (B, d) states.
+class Direct(Policy):
+    """Weights of random features: a_i = theta_i . z(x) (thesis 3.7)."""
 
-        Returns:
-          (B, A), of the hand [rad]; may be huge or not finite with the direct controller.
-        """
-        weights, x = np.ascontiguousarray(weights), np.ascontiguousarray(x)  # numpy sums in the order of the memory
+    Config: ClassVar[type[PolicyConfig]] = FeaturesConfig
+
+    def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
+        """Keep the feature map ready to use."""
+        super().__init__(config, spec, constants)
+        count = self.config.features
+        check_constants(constants, {"frequencies": (count, spec.observation), "phases": (count,)})
+        # One contiguous row for each number of x: W x is then d multiply-adds of (D,) vectors, in order.
+        self._rows = np.ascontiguousarray((constants["frequencies"] / self.config.bandwidth).T)
+        self._scale = np.sqrt(2.0 / count)
+
+    @classmethod
+    def draw(cls, config: PolicyConfig, spec: TaskSpec, rng: np.random.Generator) -> dict[str, FloatArray]:
+        """Frequencies W (D, d) and phases c (D,)."""
+        assert isinstance(config, FeaturesConfig)
+        frequencies = rng.standard_normal((config.features, spec.observation))
+        return {"frequencies": frequencies, "phases": rng.uniform(0.0, 2.0 * np.pi, config.features)}
+
+    @property
+    def size(self) -> int:
+        """A times D."""
+        return self.spec.action * len(self.constants["phases"])
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """Weights of the features, (B, A, D)."""
+        return _by_action(theta, self.spec.action)
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions; may be huge or not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
-            if self.config.controller == "kernel":
-                return self._kernel(weights, x)
-            return np.stack([(w * self.features(row)).sum(axis=-1) for w, row in zip(weights, x, strict=True)])
+            return np.stack([(w * self.features(row)).sum(axis=-1) for w, row in zip(prepared, x, strict=True)])
 
     def features(self, x: FloatArray) -> FloatArray:
-        """z(x) of one state, (d,) -> (D,)."""
-        angle = self._phases.copy()
+        """z(x) of one observation, (d,) -> (D,)."""
+        angle = self.constants["phases"].copy()
         for row, value in zip(self._rows, x, strict=True):
             angle += row * value
         return self._scale * np.cos(angle)
 
-    def _kernel(self, theta: FloatArray, x: FloatArray) -> FloatArray:
-        difference = theta - x[:, None, :]
-        squares = (difference * difference).sum(axis=-1)
-        return np.exp(squares * (-0.5 / self.config.bandwidth**2))
 
-    def targets(self, actions: FloatArray, start: FloatArray, last: FloatArray) -> FloatArray:
-        """Joint targets.
+class Projected(Direct):
+    """The kernel, approximated by random features: a_i = z(theta_i) . z(x) (thesis 3.8)."""
 
-        Args:
-          actions: (B, 8) raw actions [rad].
-          start: (8,) commands of the start grip [rad].
-          last: (B, 8) targets of the step before [rad].
+    @property
+    def size(self) -> int:
+        """A times d."""
+        return self.spec.action * self.spec.observation
 
-        Returns:
-          (B, 8) [rad], finite.
-        """
-        base = {"offset": start, "absolute": 0.0, "increment": last}[self.config.action]
-        targets = base + actions
-        targets[np.isnan(targets)] = 0.0
-        if self.config.clip:
-            return np.minimum(np.maximum(targets, self._lower), self._upper)
-        return np.minimum(np.maximum(targets, -_TARGET_LIMIT), _TARGET_LIMIT)
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """Features of the parameters, (B, A, D)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            joints = _by_action(theta, self.spec.action)
+            return np.stack([[self.features(joint) for joint in rollout] for rollout in joints])
 
-    def rescaled(self, actions: FloatArray) -> FloatArray:
-        """Raw actions (B, A) between the limits: -1 is the least action, 1 the greatest, beyond is clipped."""
-        part = np.minimum(np.maximum(actions, -1.0), 1.0)
-        part[np.isnan(part)] = 0.0
-        return self._lower + (self._upper - self._lower) * (0.5 * (part + 1.0))
+
+class Cosine(Direct):
+    """Bounded weights of random features: a_i = cos(theta_i) . z(x) (thesis 5.2)."""
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """Weights of the features, (B, A, D)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.cos(_by_action(theta, self.spec.action))
+
+
+def _by_action(theta: FloatArray, actions: int) -> FloatArray:
+    return np.ascontiguousarray(theta).reshape(len(theta), actions, -1)

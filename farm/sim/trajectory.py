@@ -1,8 +1,7 @@
-"""One rollout as it is shown: where everything was and what was felt, frame by frame. Pure."""
+"""One rollout as it is shown: where everything was, what was done and what was felt, frame by frame. Pure."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,36 +10,39 @@ from farm.arrays import FloatArray
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """A rollout at control rate or at physics rate; frame 0 is the moment of release, or of a reset.
+    """A rollout at control rate or at physics rate; frame 0 is its start.
 
-    F frames, B drawn bodies (in the order of `Scene.bodies`); a rollout that ended early has fewer frames. Shapes
-    are the finger gait's: an environment of Gymnasium has no joints (F, 0), no fingers (F, 0, ...), its actions as
-    targets (F, A), and one term (F, 1).
+    F frames, B drawn bodies (in the order of `Scene.bodies`), A actions, K reward terms; a rollout that ended early
+    has fewer frames.
     """
 
     times: FloatArray
-    """Since the release [s], (F,)"""
+    """Since the start [s], (F,)"""
     bodies: FloatArray
     """Position [m] and quaternion wxyz of each drawn body in the world, (F, B, 7)"""
-    joints: FloatArray
-    """Joint positions [rad], (F, 8)"""
-    targets: FloatArray
-    """Joint targets that led there [rad], (F, 8)"""
-    images: FloatArray
-    """Taxels [N], (F, 3, 18)"""
-    points: FloatArray
-    """Contact points in each fingertip's frame [fingertip radii], (F, 3, 3)"""
+    actions: FloatArray
+    """The policy's actions that led there, (F, A); zero at the start"""
     terms: FloatArray
-    """Reward terms of the control step that led there, (F, 5); zero at the release"""
+    """Reward terms of the control step that led there, (F, K); zero at the start"""
+    channels: Mapping[str, FloatArray]
+    """What the task's channels show, by name, (F, *shape)"""
     value: float
     """The rollout's return"""
     success: bool | None
-    """Whether the gait succeeded; None where the task knows no success"""
+    """Whether it succeeded; None where the task knows no success"""
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Every array over the frames but the times: bodies, actions, terms, then `channels/NAME`."""
+        own = {"bodies": self.bodies, "actions": self.actions, "terms": self.terms}
+        return own | {f"channels/{name}": values for name, values in self.channels.items()}
 
 
 def joined(rollouts: Sequence[Trajectory]) -> Trajectory:
-    """The frames of at least one rollout after another; what is of a whole rollout is the last one's."""
+    """The frames of at least one rollout after another; return and success are the last one's."""
     last = rollouts[-1]
-    names = [field.name for field in fields(last) if isinstance(getattr(last, field.name), np.ndarray)]
-    frames: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in rollouts]) for name in names}
-    return replace(last, **frames)
+    frames = {name: np.concatenate([getattr(r, name) for r in rollouts]) for name in ("times", *_OWN)}
+    channels = {name: np.concatenate([r.channels[name] for r in rollouts]) for name in last.channels}
+    return replace(last, **frames, channels=channels)
+
+
+_OWN = ("bodies", "actions", "terms")

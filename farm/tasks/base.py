@@ -1,43 +1,309 @@
-"""What both sides must know of a task before anything is simulated. Pure."""
+"""What a task is: one class in one file, and what everybody else may know of it."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
-from farm.arrays import FloatArray
-from farm.tasks.finger_gait.touch import TAXELS
+import numpy as np
+
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.errors import ConfigError
+from farm.settings import Settings, setting
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from farm.sim.sim import Engine, MakeEngine, Sim
+
+STEPS_LIMIT: Final = 10_000
+"""Control steps of a rollout, at most."""
+
+Kind = Literal["scalars", "flags", "images", "arrows", "points"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Channel:
+    """Something that a rollout shows besides its bodies: n curves, pictures, arrows or points in each frame."""
+
+    name: str
+    """Its place in recordings, for example `contacts/force`."""
+    kind: Kind
+    """What a frame holds, with the shape that goes with it:
+
+    scalars (n,)        curves
+    flags   (n,)        0 or 1, drawn as lanes
+    images  (n, h, w)   pictures; with `places` also points on bodies
+    arrows  (n, 6)      start [m], and vector [unit]
+    points  (n, 4)      position [m], and value [unit]
+    """
+    shape: tuple[int, ...]
+    """Of a frame."""
+    labels: tuple[str, ...] = ()
+    """Names of the n; without: their numbers."""
+    unit: str = ""
+    top: float = 1.0
+    """Value drawn in the brightest colour (images, points, painted geometries) [unit]."""
+    colours: tuple[tuple[int, int, int], ...] = ()
+    """Red, green, blue of each of the n, 0 to 255; without: a palette's."""
+    bodies: tuple[str, ...] = ()
+    """Bodies in whose frames the n arrows, points or places are; without: the world's."""
+    places: FloatArray | None = None
+    """Where an image's pixels lie on its body [m], (n, h * w, 3)."""
+    length: float = 0.01
+    """An arrow's length [m/unit]."""
+    longest: float = 0.1
+    """Longer arrows are cut here [m]."""
+    geoms: tuple[str, ...] = ()
+    """Geometries that a video paints by these n scalars: white at 0, their colour from `top` on."""
+    trace: bool = False
+    """Whether it travels with results: of the best and the worst rollout of a generation, or of all."""
+
+    def __post_init__(self) -> None:
+        """Check the shape."""
+        sizes = {"scalars": 1, "flags": 1, "images": 3, "arrows": 2, "points": 2}
+        if self.kind not in sizes or len(self.shape) != sizes[self.kind]:
+            raise ConfigError(f"channel {self.name}: kind {self.kind!r} of shape {self.shape}; see Channel.kind")
+        last = {"arrows": 6, "points": 4}.get(self.kind, self.shape[-1])
+        if self.shape[-1] != last or min(self.shape) < 1:
+            raise ConfigError(f"channel {self.name}: {self.kind} of shape {self.shape}; expected (n, {last})")
+        for what in ("labels", "colours", "bodies", "geoms"):
+            if len(getattr(self, what)) not in (0, self.shape[0]):
+                raise ConfigError(f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels, or numbers from 1."""
+        return self.labels or tuple(str(i + 1) for i in range(self.shape[0]))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sizes:
-    """How large a task's numbers are, and what it has."""
+class Camera:
+    """Where pictures of a task are taken from, as MuJoCo's free camera has it."""
+
+    lookat: tuple[float, float, float]
+    """[m]"""
+    distance: float
+    """[m]"""
+    azimuth: float = 120.0
+    """[deg]"""
+    elevation: float = -15.0
+    """[deg]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig(Settings):
+    """Settings that every task has; a task's own `Config` adds to them."""
+
+    steps: int = setting(0, least=0, most=STEPS_LIMIT)
+    """Control steps of a rollout; 0: the task's own number."""
+    gamma: float = setting(1.0, above=0.0, most=1.0)
+    """Discount factor of the return, per control step."""
+    perturb: bool = True
+    """Train on random starts and conditions (both rollouts of a pair alike)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TaskSpec:
+    """What both sides must know of a task before anything is simulated."""
 
     observation: int
-    """Length d of the state x."""
-    lower: FloatArray
-    """Least action, (A,)."""
-    upper: FloatArray
-    """Greatest action, (A,)."""
+    """Length d of the observation x."""
+    action: int
+    """Length A of the action."""
     steps: int
     """Control steps of a rollout, at most."""
     period: float
     """A control step [s]."""
-    terms: tuple[str, ...]
+    terms: tuple[str, ...] = ("reward",)
     """What a reward is made of."""
-    joints: int = 0
-    """Joint positions that a trajectory shows."""
-    fingers: int = 0
-    """Fingertips that feel; with them there are tactile traces."""
     success: bool = False
     """Whether a rollout succeeds or does not; else there are returns alone."""
+    channels: tuple[Channel, ...] = ()
+    """What a rollout shows."""
     release: str = ""
-    """Release of the package that the task comes from, empty for the farm's own."""
+    """Release of the package that the task comes from; empty for the farm's own and for files."""
 
     def shapes(self, bodies: int) -> dict[str, tuple[int, ...]]:
-        """Shape of a frame of each of a trajectory's arrays, where so many bodies are drawn."""
-        return {
-            "bodies": (bodies, 7),
-            "joints": (self.joints,),
-            "targets": (len(self.lower),),
-            "images": (self.fingers, TAXELS),
-            "points": (self.fingers, 3),
-            "terms": (len(self.terms),),
-        }
+        """Shape of a frame of each of a trajectory's arrays, by the names of `Trajectory.arrays`."""
+        own = {"bodies": (bodies, 7), "actions": (self.action,), "terms": (len(self.terms),)}
+        return own | {f"channels/{channel.name}": channel.shape for channel in self.channels}
+
+    @property
+    def traced(self) -> tuple[Channel, ...]:
+        """The channels that travel with results."""
+        return tuple(channel for channel in self.channels if channel.trace)
+
+    @property
+    def trace(self) -> tuple[int, int]:
+        """Shape of a rollout's trace: control steps, and numbers of each (0 where nothing travels)."""
+        return self.steps, sum(int(np.prod(channel.shape)) for channel in self.traced)
+
+
+@dataclass(frozen=True)
+class Record:
+    """Whole rollouts, for tasks that score them at once: T control steps of B rollouts, zero after the end."""
+
+    frames: Mapping[str, FloatArray]
+    """What `Task.measure` gave after each step, (B, T, ...)"""
+    start: Mapping[str, FloatArray]
+    """And at the start, (B, ...)"""
+    actions: FloatArray
+    """(B, T, A)"""
+    steps: IntArray
+    """Control steps each lasted, its last included, (B,)"""
+    failed: BoolArray
+    """Whether the physics blew up in the last of them, (B,)"""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What rollouts are worth."""
+
+    terms: FloatArray
+    """Reward terms, zero after the end, (B, T, K)"""
+    success: BoolArray | None = None
+    """(B,), None where the task knows no success"""
+
+
+class Task:
+    """A task: what is simulated, what a policy sees and does, and what that is worth.
+
+    A subclass says as little as it needs: `xml` and `reward` are enough. Everything is batched: B rollouts at a time,
+    whose numbers must not depend on each other. `sim` is the batch as named live arrays (`farm.sim.sim.Sim`): a task
+    sees nothing else of a simulator. The object holds no state of a rollout; what must be remembered lives in
+    `sim.own`, arrays (B, ...) that follow the rollouts as others end.
+    """
+
+    Config: ClassVar[type[TaskConfig]] = TaskConfig
+    """The task's own settings: flags, help and config.json follow from its fields."""
+    xml: ClassVar[str] = ""
+    """MJCF of what is simulated; or override `files` or `compiled`."""
+    steps: int = 100
+    """Control steps of a rollout."""
+    substeps: int = 1
+    """Physics steps in each."""
+    channels: tuple[Channel, ...] = ()
+    """What a rollout shows besides bodies, actions and reward terms."""
+    camera: Camera | None = None
+    """Where pictures are taken from; without: from beside what moves."""
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"default": {}}
+    """Settings that runs begin with, by preset and flag; the first is the one that is taken unless told otherwise."""
+    return_scale: float = 1.0
+    """Factor of the return."""
+    takes: ClassVar[str] = ""
+    """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
+
+    def __init__(self, config: TaskConfig | None = None, variant: str = "", files: Mapping[str, str] | None = None):
+        """Take settings, the name behind the colon, and the texts that a run carries (without: this machine's)."""
+        self.config: Any = self.Config() if config is None else config
+        self.variant = variant
+        if self.config.steps:
+            self.steps = self.config.steps
+        self.sources: Mapping[str, str] = self.files() if files is None else files
+        self._model: mujoco.MjModel | None = None
+
+    # What is simulated
+
+    def files(self) -> dict[str, str]:
+        """Texts that decide numbers and travel with a run, by name."""
+        return {"model.xml": self.xml} if self.xml else {}
+
+    @property
+    def model(self) -> "mujoco.MjModel":
+        """The compiled model; made once."""
+        if self._model is None:
+            self._model = self.compiled()
+        return self._model
+
+    def compiled(self) -> "mujoco.MjModel":
+        """Compile the model from `sources`."""
+        from farm.sim.scene import compiled
+
+        if "model.xml" not in self.sources:
+            raise ConfigError(f"task {type(self).__name__} has no model: give it `xml`, an MJCF text")
+        return compiled(self.sources["model.xml"], type(self).__name__)
+
+    def engine(self, backend: "MakeEngine") -> "Engine":
+        """What simulates: the backend's engine for the model, unless the task brings one."""
+        return backend(self.model)
+
+    def setup(self, sim: "Sim") -> None:
+        """Simulate what all rollouts need and none changes, once, before the first of them."""
+
+    # A rollout
+
+    def prepare(self, sim: "Sim", rngs: Sequence[np.random.Generator | None]) -> None:
+        """Bring every rollout of the batch to its start; one generator each, None for nominal conditions."""
+        for row, rng in enumerate(rngs):
+            self.reset(sim, row, rng)
+
+    def reset(self, sim: "Sim", row: int, rng: np.random.Generator | None) -> None:
+        """Bring one rollout to its start, from the model's own; `rng` is its own, None for nominal conditions."""
+
+    def observe(self, sim: "Sim") -> FloatArray:
+        """What the policy sees, (B, d); qpos and qvel unless overridden."""
+        return np.concatenate([sim.qpos, sim.qvel], axis=1)
+
+    def act(self, sim: "Sim", action: FloatArray) -> FloatArray:
+        """Controls of raw actions (B, A); -1 to 1 rescaled to the actuators' ranges unless overridden."""
+        low, high = self.limits
+        return rescaled(action, low, high)
+
+    def reward(self, sim: "Sim", action: FloatArray) -> FloatArray | dict[str, FloatArray]:
+        """Reward of the control step that just ended, (B,); or named terms that add up to it."""
+        raise NotImplementedError
+
+    def ended(self, sim: "Sim") -> BoolArray | None:
+        """Which rollouts end here, (B,); None: none before its last step."""
+        return None
+
+    def success(self, sim: "Sim") -> BoolArray | None:
+        """Which rollouts, ending here, succeeded, (B,); None where there is no success."""
+        return None
+
+    def measure(self, sim: "Sim") -> dict[str, FloatArray]:
+        """What is kept of every frame, (B, ...) each: values of channels, or what `score` and `show` need."""
+        return {}
+
+    # Whole rollouts
+
+    def score(self, record: Record) -> Score | None:
+        """Score whole rollouts at once instead of by `reward` and `success`; None: do not."""
+        return None
+
+    def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Values of the channels from what was measured, any leading shape; those measured under their names."""
+        return {channel.name: frames[channel.name] for channel in self.channels}
+
+    # What others know of it
+
+    @property
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest control of each actuator, (nu,) each; -1 and 1 where it has no range."""
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        low, high = self.model.actuator_ctrlrange.T
+        return np.where(limited, low, -1.0), np.where(limited, high, 1.0)
+
+    @property
+    def period(self) -> float:
+        """A control step [s]."""
+        return float(self.model.opt.timestep) * self.substeps
+
+    def spec(self) -> TaskSpec:
+        """What both sides must know; found by looking at one rollout's start unless overridden."""
+        from farm.tasks.loop import probe
+
+        return probe(self)
+
+
+def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Raw actions (B, A) between limits: -1 is the least, 1 the greatest; beyond is clipped, nan is the middle."""
+    part = np.minimum(np.maximum(action, -1.0), 1.0)
+    part[np.isnan(part)] = 0.0
+    return low + (high - low) * (0.5 * (part + 1.0))
+
+
+def flat(channels: Sequence[Channel], values: Mapping[str, AnyArray]) -> AnyArray:
+    """Channels' values (..., *shape) side by side as float32, (..., K): a trace."""
+    parts = [values[c.name].reshape(*values[c.name].shape[: -len(c.shape)], -1) for c in channels]
+    return np.concatenate(parts, axis=-1).astype("<f4")

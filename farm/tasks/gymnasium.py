@@ -1,72 +1,256 @@
-"""Closed-loop rollouts in a MuJoCo environment of Gymnasium, one at a time.
+"""MuJoCo environments of Gymnasium as tasks, by name: `--task gym:Swimmer-v5`. A door to gymnasium.
 
-A rollout's numbers depend on (environment, controller parameters, seed of the reset) alone. One at a time is
-what Gymnasium offers; what is many at a time is the farm's workers.
+Only registered names are taken: one that names a module to import (`module:Name-v0`) is refused. An environment
+steps its own simulation, so this task brings an engine of its own.
 """
 
-from typing import Final
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
+import mujoco
 import numpy as np
 
-from farm import gym
-from farm.arrays import FloatArray
-from farm.policies.fourier import Policy
-from farm.sim.scene import Scene
-from farm.tasks.finger_gait.rewards import RETURN_FLOOR
-from farm.tasks.finger_gait.task import TaskConfig
-from workers.episodes import Episode, Episodes
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.errors import ConfigError
+from farm.sim.scene import quiet
+from farm.sim.sim import Engine, MakeEngine, Sim
+from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec, rescaled
+
+if TYPE_CHECKING:
+    import gymnasium
 
 NOMINAL: Final = 0
-"""Seed of the reset where there is no perturbation."""
+"""Seed of the reset under nominal conditions."""
+
+_NAME: Final = re.compile(r"([\w.-]{1,60}/)?[\w.-]{1,60}-v\d{1,4}", re.ASCII)
+_LIMIT: Final = 100_000  # numbers of an observation
+_ROWS: Final = 16  # environments that are stepped in turn
+_UNSTABLE: Final = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 
 
-class Environment(Episodes):
-    """Runs one run's jobs in an environment."""
+class Environment(Task):
+    """A MuJoCo environment of Gymnasium: its own physics, observations and rewards."""
 
-    def __init__(self, config: TaskConfig, policy: Policy) -> None:
-        """Make the environment.
+    takes = "NAME"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "default": {
+            "policy": "direct", "features": 50, "bandwidth": 3.0, "initial_mu": 0.0, "initial_sigma": 0.1,
+            "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.1, "learning_rate_sigma": 0.1,
+            "sigma_rule": "capped", "max_speed": 0.2,
+        },
+    }  # fmt: skip
+
+    def __init__(self, config: Any = None, variant: str = "", files: Mapping[str, str] | None = None) -> None:  # noqa: ANN401
+        """Check the environment's name, and look at its spaces.
 
         Raises:
-          ConfigError: it is not to be had on this machine.
+          ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
         """
-        self._env = gym.make(config)
-        super().__init__(config, policy, Scene(self._env.unwrapped.model))  # type: ignore[attr-defined]
-        self._kind = self._env.action_space.dtype
+        super().__init__(config, variant, files)
+        if ":" in variant:
+            raise ConfigError(f"task 'gym:{variant[:80]}' names a module to import, which is refused; take gym:NAME-vN")
+        if not _NAME.fullmatch(variant):
+            raise ConfigError(f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN")
+        self.steps = self._horizon()
+
+    @cached_property
+    def _first(self) -> "gymnasium.Env[Any, Any]":
+        return make(self.variant)
+
+    def _horizon(self) -> int:
+        """Control steps of a rollout."""
+        wanted, _ = self.config.steps, self._first  # made first: it says what is wrong with the name
+        import gymnasium
+
+        own = gymnasium.spec(self.variant).max_episode_steps
+        if own and wanted > own:
+            raise ConfigError(f"--steps {wanted}: task gym:{self.variant} ends after {own}")
+        if not (own or wanted):
+            raise ConfigError(f"task gym:{self.variant} ends at no number of steps: give it one with --steps")
+        return min(wanted or STEPS_LIMIT, own or STEPS_LIMIT)
+
+    def compiled(self) -> mujoco.MjModel:
+        """The environment's own model."""
+        model: mujoco.MjModel = self._first.unwrapped.model  # type: ignore[attr-defined]
+        return model
+
+    @property
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest action, (A,) each."""
+        space: Any = self._first.action_space
+        return space.low.astype(float), space.high.astype(float)
+
+    @property
+    def period(self) -> float:
+        """A control step [s]."""
+        return float(self._first.unwrapped.dt)  # type: ignore[attr-defined]
+
+    def spec(self) -> TaskSpec:
+        """What the environment's spaces say."""
+        import gymnasium
+
+        space: Any = self._first.observation_space
+        return TaskSpec(
+            observation=space.shape[0], action=len(self.limits[0]), steps=self.steps, period=self.period,
+            release=f"gymnasium {gymnasium.__version__}",
+        )  # fmt: skip
+
+    def engine(self, backend: MakeEngine) -> Engine:  # noqa: ARG002  an environment has its own physics
+        """Environments that step themselves."""
+        return EnvironmentEngine(self.variant)
+
+    def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
+        """Reset each environment with a seed of its own."""
+        assert isinstance(sim.engine, EnvironmentEngine)
+        for row, rng in enumerate(rngs):
+            sim.engine.seed(row, reset_seed(rng))
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """The environment's observation, (B, d)."""
+        values: FloatArray = sim.observation
+        return values
+
+    def act(self, sim: Sim, action: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Actions rescaled to the environment's bounds, (B, A)."""
+        return rescaled(action, *self.limits)
+
+    def reward(self, sim: Sim, action: FloatArray) -> FloatArray:  # noqa: ARG002
+        """The environment's reward, (B,)."""
+        values: FloatArray = sim.reward
+        return values
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where the environment terminated, (B,)."""
+        return np.asarray(sim.terminated)
+
+
+def make(name: str) -> "gymnasium.Env[Any, Any]":
+    """The environment of that name, without a time limit of its own.
+
+    Raises:
+      ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
+    """
+    try:
+        import gymnasium
+        from gymnasium.envs.mujoco import MujocoEnv
+    except ImportError:
+        raise ConfigError(f"task gym:{name} needs gymnasium: pip install 'gymnasium[mujoco]'") from None
+    quiet()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that there is a newer version, mostly
+            env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True)
+    except Exception as error:  # whatever an environment may raise
+        raise ConfigError(f"task gym:{name}: {' '.join(str(error).split())}") from None
+    space, actions = env.observation_space, env.action_space
+    if not isinstance(env.unwrapped, MujocoEnv):
+        raise ConfigError(f"task gym:{name}: not an environment of MuJoCo")
+    box = gymnasium.spaces.Box
+    if not isinstance(space, box) or len(space.shape) != 1 or space.shape[0] > _LIMIT:
+        raise ConfigError(f"task gym:{name}: observations are {space}; expected a box of one dimension")
+    if not isinstance(actions, box) or len(actions.shape) != 1 or not actions.is_bounded():
+        raise ConfigError(f"task gym:{name}: actions are {actions}; expected a bounded box of one dimension")
+    return env
+
+
+class EnvironmentEngine:
+    """Environments side by side, one for each row; each steps its own simulation."""
+
+    def __init__(self, name: str) -> None:
+        """Make the first; others follow as they are needed."""
+        self.size = _ROWS
+        self._name = name
+        self._envs = [make(name)]
+        first: Any = self._envs[0]
+        self.model: mujoco.MjModel = first.unwrapped.model
+        self._kind = first.action_space.dtype
+        self._seeds = [NOMINAL] * _ROWS
+        self._bad = np.zeros(_ROWS, dtype=bool)
+        self._fields: dict[str, AnyArray] = {
+            "ctrl": np.zeros((_ROWS, first.action_space.shape[0])),
+            "qpos": np.zeros((_ROWS, self.model.nq)),
+            "observation": np.zeros((_ROWS, first.observation_space.shape[0])),
+            "reward": np.zeros(_ROWS),
+            "terminated": np.zeros(_ROWS, dtype=bool),
+        }
+
+    def field(self, name: str) -> AnyArray:
+        """A live array over all rows."""
+        if name not in self._fields:
+            raise AttributeError(f"an environment's sim has no {name!r}; it has {', '.join(self._fields)}")
+        return self._fields[name]
+
+    def reset(self, ids: IntArray) -> None:
+        """Make as many environments as there are rows; `seed` resets them."""
+        while len(self._envs) < len(ids):
+            self._envs.append(make(self._name))
+
+    def seed(self, row: int, seed: int) -> None:
+        """Reset an environment to the start that a seed gives."""
+        self._seeds[row] = seed
+        x, _ = self._envs[row].reset(seed=seed)
+        self._take(row, x, 0.0)
+
+    def step(self, ids: IntArray, count: int) -> None:
+        """Step environments by control steps."""
+        for row in ids.tolist():
+            for _ in range(count):
+                x, reward, terminated, *_ = self._envs[row].step(self._fields["ctrl"][row].astype(self._kind))
+                self._take(row, x, float(reward), terminated=bool(terminated))
+
+    def _take(self, row: int, x: AnyArray, reward: float, *, terminated: bool = False) -> None:
+        env: Any = self._envs[row].unwrapped
+        self._bad[row] = not (np.isfinite(x).all() and np.isfinite(reward)) or blown_up(env)
+        self._fields["observation"][row], self._fields["qpos"][row] = x, env.data.qpos
+        self._fields["reward"][row], self._fields["terminated"][row] = reward, terminated
+
+    def play(self, ids: IntArray, controls: FloatArray) -> None:
+        """Environments are stepped by actions alone."""
+        raise NotImplementedError
+
+    def forward(self, ids: IntArray) -> None:
+        """An environment's outputs are there after each step."""
+
+    def copy(self, sources: IntArray) -> None:
+        """Reset row i with the seed of row sources[i]."""
+        self.reset(sources)
+        seeds = [self._seeds[source] for source in sources.tolist()]
+        for row, (source, seed) in enumerate(zip(sources.tolist(), seeds, strict=True)):
+            if row != source or self._seeds[row] != seed:
+                self.seed(row, seed)
+
+    def blown_up(self, ids: IntArray) -> BoolArray:
+        """Where the physics blew up, or a number is not finite."""
+        return self._bad[ids]
+
+    def expand(self, name: str) -> AnyArray:
+        """An environment's model is its own."""
+        raise NotImplementedError(name)
+
+    def set_const(self, ids: IntArray) -> None:
+        """There is nothing to follow."""
 
     def close(self) -> None:
-        """Give back the environment."""
-        self._env.close()
-
-    def episode(self, theta: FloatArray, perturbation: tuple[int, ...] | None) -> Episode:
-        """One rollout of a controller (P,) from the start that a perturbation's seed gives."""
-        weights = self.policy.weights(theta[None])
-        x, _ = self._env.reset(seed=reset_seed(perturbation))
-        qpos, actions, rewards = [self._qpos()], [], []
-        value, failed, over = 0.0, False, False
-        while not over:
-            action = self.policy.rescaled(self.policy.actions(weights, np.asarray(x, dtype=float)[None]))[0]
-            x, reward, terminated, truncated, _ = self._env.step(action.astype(self._kind))
-            gain = float(reward)
-            failed = not (np.isfinite(x).all() and np.isfinite(gain)) or gym.blown_up(self._env)
-            value += self.gamma ** len(rewards) * gain
-            qpos.append(self._qpos())
-            actions.append(action)
-            rewards.append(gain)
-            over = failed or terminated or truncated or len(rewards) == self.sizes.steps
-        return Episode(
-            value=RETURN_FLOOR if failed or not value >= RETURN_FLOOR else value,
-            failed=failed,
-            qpos=np.array(qpos),
-            actions=np.array(actions),
-            rewards=np.array(rewards),
-        )
-
-    def _qpos(self) -> FloatArray:
-        return np.array(self._env.unwrapped.data.qpos)  # type: ignore[attr-defined]
+        """Close the environments."""
+        for env in self._envs:
+            env.close()
 
 
-def reset_seed(perturbation: tuple[int, ...] | None) -> int:
-    """Seed of an environment's reset: always the same one, or 128 bits drawn from the perturbation's seed."""
-    if perturbation is None:
+def reset_seed(rng: np.random.Generator | None) -> int:
+    """Seed of an environment's reset: always the same one, or 128 bits drawn from the generator's own seed."""
+    if rng is None:
         return NOMINAL
-    return int.from_bytes(np.random.SeedSequence(perturbation).generate_state(4).astype("<u4").tobytes(), "little")
+    words = rng.bit_generator.seed_seq.generate_state(4)  # type: ignore[attr-defined]
+    return int.from_bytes(words.astype("<u4").tobytes(), "little")
+
+
+def blown_up(env: Any) -> bool:  # noqa: ANN401  an unwrapped environment
+    """Whether MuJoCo met numbers out of bounds since the last reset (it goes on from the start, as if nothing were)."""
+    return any(env.data.warning[kind].number for kind in _UNSTABLE)

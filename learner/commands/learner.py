@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from farm.net.session import LISTEN
 from learner.commands.learning import learn
 from learner.commands.options import LearnerOptions, parse
 from learner.config import RunConfig
-from learner.run import LISTEN, Place
+from learner.run import Placement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,5 +23,5 @@ class LearnerCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, begin = parse(LearnerCommand, words, "farm learner")
-    place = Place() if command.learner.tls is None else Place(listen=LISTEN.replace("tcp/", "tls/"))
+    place = Placement() if command.learner.tls is None else Placement(listen=LISTEN.replace("tcp/", "tls/"))
     return learn(command.learner, command.run, place, resumed, begin)

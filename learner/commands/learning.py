@@ -10,14 +10,14 @@ from farm.net.tls import find
 from learner.commands import display, options, recordings
 from learner.commands.options import LearnerOptions
 from learner.config import RunConfig
-from learner.run import Place, Run, how_to_join, open_run
+from learner.run import Placement, Run, how_to_join, open_run
 from learner.run_folder import RunFolder
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM, as of a shell."""
 
 
-def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunFolder | None, begin: RunConfig) -> int:
+def learn(chosen: LearnerOptions, config: RunConfig, place: Placement, resumed: RunFolder | None, begin: RunConfig) -> int:
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up("WARNING" if chosen.quiet and chosen.log_level == "INFO" else chosen.log_level)
     place = replace(place, connect=chosen.connect, farm=chosen.farm, record=chosen.record)
@@ -46,14 +46,14 @@ def learn(chosen: LearnerOptions, config: RunConfig, place: Place, resumed: RunF
     return INTERRUPTED if run.summary["state"] == "interrupted" else 0
 
 
-def _announcement(run: Run, place: Place) -> list[str]:
+def _announcement(run: Run, place: Placement) -> list[str]:
     """What begins, and how to join and look on."""
     folder, at = run.learner.folder, run.learner.state.generation
     lines = [f"run {folder.path}" + (f", going on after generation {at}" if at else "")]
     if place.record:
         lines[0] += "; farm view shows it at any time"
     if not place.workers:
-        lines.append(f"workers join with: {how_to_join(place, run.learner.config)}")
+        lines.append(f"workers join with: {how_to_join(place, run.learner.problem)}")
     if run.live is not None:
         lines += recordings.look_on(run.live)
     kept = folder.every(run.learner.state.mu.size, run.learner.config.generations)
@@ -62,7 +62,7 @@ def _announcement(run: Run, place: Place) -> list[str]:
     return lines
 
 
-def _conclusion(run: Run, place: Place) -> list[str]:
+def _conclusion(run: Run, place: Placement) -> list[str]:
     """What came out, and what to do next."""
     summary, folder = run.summary, run.learner.folder.path
     lines = []

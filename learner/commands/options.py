@@ -5,15 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from farm import settings as arguments
+from farm import plugins, settings
 from farm.errors import ConfigError
 from farm.net import keys
 from farm.net.session import check_endpoint
-from farm.tasks import TASKS
 from learner import config as configs
-from learner.algorithms import name_of
 from learner.commands.display import Style
-from learner.config import RunConfig, changes, preset_for
+from learner.config import RunConfig, changes
 from learner.run_folder import RunFolder
 
 
@@ -21,10 +19,8 @@ from learner.run_folder import RunFolder
 class LearnerOptions:
     """Where a run comes from, where it goes, and who may watch."""
 
-    preset: str = "default"
-    """Settings to begin with: default | thesis; gym with gym: tasks."""
-    algorithm: str | None = None
-    """Learning algorithm, by name: pgpe. Another than the one to begin with has its own settings, at its defaults."""
+    preset: str | None = None
+    """Settings to begin with, by name (farm tasks NAME lists a task's); None: the task's first."""
     config: Path | None = None
     """Settings to begin with: a config.json (other flags override it)."""
     resume: Path | None = None
@@ -48,7 +44,7 @@ class LearnerOptions:
     trust_network: bool = False
     """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
     mixed: bool = False
-    """Admit workers whose machines round differently: faster than waiting for equal ones, but not repeatable."""
+    """Admit workers whose machines round differently, and resume although code has changed: not repeatable."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     quiet: bool = False
@@ -96,24 +92,11 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     """The configuration that other flags change, and the run to resume.
 
     Raises:
-      ConfigError: two of --preset, --config and --resume, or one that cannot be used, or is for another task.
+      ConfigError: two of --preset, --config and --resume, or one that cannot be used.
     """
-    task = _value(words, "--task") or ""
-    kind = task.partition(":")[0]
-    fitting = preset_for(kind)
-    begin, folder = _origin(words, fitting)
-    if kind in TASKS and fitting != preset_for(begin.task.kind):
-        raise ConfigError(f"--task {task} over settings for {begin.task.task}: begin with --preset {fitting}")
-    if kind in TASKS and kind != begin.task.kind:  # its steps are the other task's
-        begin = replace(begin, task=replace(begin.task, task=task, steps=0))
-    chosen = _value(words, "--algorithm")
-    if chosen is not None and chosen != name_of(begin.algorithm):
-        begin = replace(begin, algorithm=configs.algorithm(chosen)())
-    return begin, folder
-
-
-def _origin(words: Sequence[str], preset: str) -> tuple[RunConfig, RunFolder | None]:
     chosen = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
+    named = {name: _value(words, f"--{name}") for name in ("task", "policy", "algorithm")}
+    parts = {name: value for name, value in named.items() if value is not None}
     given = [f"--{name}" for name, value in chosen.items() if value is not None]
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} exclude each other: each says what to begin with")
@@ -121,8 +104,15 @@ def _origin(words: Sequence[str], preset: str) -> tuple[RunConfig, RunFolder | N
         folder = RunFolder.open(Path(chosen["resume"]))
         return folder.read_config(), folder
     if chosen["config"] is not None:
-        return configs.read(Path(chosen["config"])), None
-    return configs.preset(chosen["preset"] or preset), None
+        return configs.changed_by(configs.read(Path(chosen["config"])), parts), None
+    begin = configs.configure(parts.pop("task", RunConfig.task), chosen["preset"])
+    return configs.changed_by(begin, parts), None
+
+
+def _resolved(parts: dict[str, str]) -> dict[str, str]:
+    """Names of plug-ins as config.json has them: a file's with its whole path."""
+    kinds = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
+    return {part: plugins.find(kinds[part], name).name for part, name in parts.items()}
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
@@ -153,17 +143,29 @@ def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None
 
 def run_name(options: LearnerOptions, config: RunConfig) -> str:
     """The new run's name."""
-    fitting = preset_for(config.task.kind)
-    what = options.config.stem if options.config else options.preset if fitting == "default" else fitting
-    task = config.task.task.replace(":", "-").replace("/", "-")
+    what = options.config.stem if options.config else options.preset or next(iter(configs.presets(config.task)))
+    task = plugins.find("tasks", config.task).wire.replace(".py:", "-").replace(":", "-").replace("/", "-")
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     return keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
 
 
 def parse(
-    kind: type[arguments.C], words: Sequence[str], program: str
-) -> tuple[arguments.C, RunFolder | None, RunConfig]:
+    kind: type[settings.C], words: Sequence[str], program: str
+) -> tuple[settings.C, RunFolder | None, RunConfig]:
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
+    words = _with_names(words)
     begin, resumed = origin(words)
     default = replace(kind(), run=begin)  # type: ignore[type-var]
-    return arguments.parse(kind, words, program, default), resumed, begin
+    return settings.parse(kind, words, program, default), resumed, begin
+
+
+def _with_names(words: Sequence[str]) -> list[str]:
+    """The words, with plug-ins in files named by their whole paths: a run can then be repeated from anywhere."""
+    out = list(words)
+    for flag, kind in (("--task", "tasks"), ("--policy", "policies"), ("--algorithm", "algorithms")):
+        for i, word in enumerate(out):
+            if word == flag and i + 1 < len(out):
+                out[i + 1] = plugins.find(kind, out[i + 1]).name
+            elif word.startswith(f"{flag}="):
+                out[i] = f"{flag}={plugins.find(kind, word.partition('=')[2]).name}"
+    return out

@@ -14,10 +14,11 @@ from farm.commands.screen import display
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError
 from farm.net import keys, session
+from farm.net.session import LISTEN
 from farm.net.tls import find
 from learner.commands import options, recordings
 from learner.commands.learning import INTERRUPTED
-from learner.run import LISTEN, check_rerun
+from learner.run import check_rerun
 
 if TYPE_CHECKING:
     from learner.recording.remote import Remote
@@ -88,7 +89,7 @@ def main(words: Sequence[str]) -> int:
 def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
     """Follow a run to its end, or until stopped."""
     from learner.recording.remote import open_remote
-    from learner.telemetry.subscriber import Follower, find_run
+    from learner.telemetry.subscriber import Subscriber, find_run
 
     bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
     endpoints = command.connect or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"),)
@@ -96,7 +97,7 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
         # The session goes first: the learner waits for that at the end, while the file is still being merged.
         with session.connect(endpoints, None, stopped, bundle) as link:
             run = command.run or find_run(link, command.farm, stopped)
-            follower = Follower(link, command.farm, run)
+            follower = Subscriber(link, command.farm, run)
             name, config = follower.begin(stopped)
             path = command.out / run if command.file else None
             remote = kept.enter_context(open_remote(path, name=name, config=config, serve=command.address))

@@ -3,24 +3,25 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from farm import rollouts
 from farm.errors import ConfigError
+from farm.net.session import free_endpoint
 from learner.commands.learning import learn
 from learner.commands.options import LearnerOptions, parse
 from learner.config import RunConfig
-from learner.run import Place, free_endpoint
-from workers.backends import BACKENDS
+from learner.run import Placement
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunCommand:
-    """Learner and local workers together: learns the gait and records it."""
+    """Learner and local workers together: learns a task and records it."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
     """Where the run comes from and where it goes."""
     workers: int = 2
     """Worker processes on this machine."""
     backend: str = "cpu"
-    """What they simulate with: cpu."""
+    """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
     run: RunConfig = field(default_factory=RunConfig)
     """The run."""
 
@@ -28,8 +29,7 @@ class RunCommand:
         """Check the number."""
         if not 0 <= self.workers <= 1024:
             raise ConfigError(f"workers is {self.workers}; expected 0 to 1024")
-        if self.backend not in BACKENDS:
-            raise ConfigError(f"unknown backend {self.backend!r}; known are {', '.join(BACKENDS)}")
+        rollouts.backend(self.backend)
 
 
 def main(words: Sequence[str]) -> int:
@@ -37,5 +37,5 @@ def main(words: Sequence[str]) -> int:
     command, resumed, begin = parse(RunCommand, words, "farm run")
     if command.learner.tls is not None:
         raise ConfigError("farm run is for one machine; with --tls start farm learner and farm worker")
-    place = Place(workers=command.workers, backend=command.backend, listen=free_endpoint())
+    place = Placement(workers=command.workers, backend=command.backend, listen=free_endpoint())
     return learn(command.learner, command.run, place, resumed, begin)

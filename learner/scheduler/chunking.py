@@ -11,7 +11,7 @@ _SAMPLES = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class LedgerConfig:
+class SchedulerConfig:
     """How jobs are handed out, and when one is given to a second worker or given up."""
 
     chunk_seconds: float = 0.2
@@ -46,10 +46,10 @@ class LedgerConfig:
                 raise ValueError(f"{name} is {value!r}, expected an integer of 1 or more")
 
 
-class Pace:
+class Chunking:
     """The running median of seconds per job, over the last answers of all workers."""
 
-    def __init__(self, config: LedgerConfig) -> None:
+    def __init__(self, config: SchedulerConfig) -> None:
         self._config = config
         self._samples: deque[float] = deque(maxlen=_SAMPLES)
         self._median: float | None = None  # until it is asked for

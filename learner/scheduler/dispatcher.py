@@ -18,19 +18,14 @@ from farm.errors import MessageError, RunError, brief
 from farm.net import codec, keys
 from farm.net.codec import M
 from farm.net.events import Event
-from farm.net.jobs import Chunk, Generation, Jobs
-from farm.net.messages import Refusal, Spec, Want
-from farm.net.results import Failure, Results
+from farm.net.messages import Refusal, Spec, WorkRequest
 from farm.net.session import Session
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from farm.net.telemetry import RunStatus, WorkerStatus
-from farm.tasks.finger_gait.hand import FINGERS
-from farm.tasks.finger_gait.touch import TAXELS
-from learner.scheduler.admission import Admission
-from learner.scheduler.attendance import Attendance
-from learner.scheduler.census import Census
-from learner.scheduler.round import Round
-from learner.scheduler.scheduler import Ledger, LedgerConfig
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
+from learner.scheduler.membership import Admission, Attendance, Census
+from learner.scheduler.round import RoundResults
+from learner.scheduler.scheduler import Scheduler, SchedulerConfig
 
 log = logging.getLogger(__name__)
 
@@ -58,8 +53,8 @@ class Dispatcher:
         how_to_join: str | None,
         stopped: Callable[[], bool],
         admission: Admission,
-        shapes: Mapping[str, tuple[int, ...]],
-        ledger: LedgerConfig | None = None,
+        sizes: tuple[tuple[int, int], Mapping[str, tuple[int, ...]]],
+        scheduler: SchedulerConfig | None = None,
     ) -> None:
         """Show the run on the network: subscriptions first, the liveliness token last.
 
@@ -71,31 +66,30 @@ class Dispatcher:
           how_to_join: the command by which workers join, for when there are none; None where they join by themselves.
           stopped: asked now and then, true ends the collecting.
           admission: who may take part.
-          shapes: of a trajectory's frames.
-          ledger: how jobs are cut into chunks, and when they are given out again.
+          sizes: shape of a trace, and of a frame of each of a trajectory's arrays.
+          scheduler: how jobs are cut into chunks, and when they are given out again.
         """
         self.run = spec.run
         self.ignored: Counter[str] = Counter()
         """Messages not counted, by kind: stale, doubled, foreign, absent, refused, bad, large, version, flood."""
         self.admission = admission
         self._session, self._farm, self._stopped = session, farm, stopped
-        self._ledger = Ledger(ledger or LedgerConfig())
+        self._scheduler = Scheduler(scheduler or SchedulerConfig())
         self._how_to_join = how_to_join
-        self._trace = (spec.task_config["steps"], len(FINGERS) * TAXELS)
-        self._shapes = shapes
+        self._trace, self._shapes = sizes
         self._incarnation = secrets.token_hex(8)
         self._spec = codec.encode(spec)
-        self._header = Generation(
+        self._header = RoundHeader(
             run=self.run, incarnation=self._incarnation, round=0, generation=0,
             spec=hashlib.sha256(self._spec).hexdigest(), traces="none", mu=_NOTHING,
         )  # fmt: skip
-        self._round: Round | None = None
+        self._round: RoundResults | None = None
         self._told: set[str] = set()
         self._attendance = Attendance()
         self._refused: dict[str, str] = {}
         self._declined: set[str] = set()
         self._census = Census()
-        self._progress: Progress | None = None
+        self._progress: GenerationStats | None = None
         self._generations, self._status, self._status_due = generations, b"", 0.0
         self._alone = time.monotonic()
         session.subscribe("want", keys.want(farm, "**"))
@@ -115,7 +109,7 @@ class Dispatcher:
     @property
     def workers(self) -> tuple[str, ...]:
         """Workers that take part, sorted."""
-        return tuple(sorted(self._ledger.workers))
+        return tuple(sorted(self._scheduler.workers))
 
     def census(self) -> tuple[WorkerStatus, ...]:
         """Workers that take part, with what they did lately."""
@@ -124,7 +118,7 @@ class Dispatcher:
     @property
     def reissued(self) -> int:
         """Jobs given out again since the start."""
-        return self._ledger.reissued
+        return self._scheduler.reissued
 
     def begin(self, generation: int, mu: FloatArray, jobs: Jobs, traces: str = "none") -> None:
         """Announce a round and hand out its first jobs.
@@ -133,18 +127,18 @@ class Dispatcher:
           generation: updates done.
           mu: (P,).
           jobs: all of them, by index.
-          traces: which tactile traces of the exploring rollouts are wanted, one of TRACES.
+          traces: which traces of the exploring rollouts are wanted, one of TRACES.
         """
-        self._header = Generation(
+        self._header = RoundHeader(
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
             generation=generation, spec=self._header.spec, traces=traces, mu=mu,
         )  # fmt: skip
         self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
-        self._round = Round(jobs, traces, self._trace, self._shapes)
-        self._ledger.begin(len(jobs))
+        self._round = RoundResults(jobs, traces, self._trace, self._shapes)
+        self._scheduler.begin(len(jobs))
         self._hand_out()
 
-    def collect(self) -> Round:
+    def collect(self) -> RoundResults:
         """Wait for the results of the round that has begun.
 
         Raises:
@@ -152,7 +146,7 @@ class Dispatcher:
           Stopped: the user asked to end.
         """
         assert self._round is not None
-        while not self._ledger.complete:
+        while not self._scheduler.complete:
             for event in self._events():
                 self._take(event)
             self._hand_out()
@@ -164,7 +158,7 @@ class Dispatcher:
 
     def _events(self) -> list[Event]:
         """What came, after waiting for it until the next deadline."""
-        due = self._ledger.next_deadline(time.monotonic())
+        due = self._scheduler.next_deadline(time.monotonic())
         return self._session.events.waiting(_WAIT if due is None else max(0.001, min(due, _WAIT)))
 
     def _take(self, event: Event) -> None:
@@ -181,10 +175,10 @@ class Dispatcher:
     def _asked(self, event: Event) -> None:
         sender = keys.tail(event.key, keys.want(self._farm, ""))
         try:
-            want = _decode(event, Want)
+            want = _decode(event, WorkRequest)
         except MessageError as error:
             # It cannot read why either, but will say that it cannot. Who takes part has our release: that was another.
-            if error.kind == "version" and sender not in self._ledger.workers:
+            if error.kind == "version" and sender not in self._scheduler.workers:
                 self._refuse(sender, str(error))
             raise
         if want.worker != sender:
@@ -193,7 +187,7 @@ class Dispatcher:
         if self._attendance.asked(want, time.monotonic()):
             self._admit(want)
 
-    def _admit(self, want: Want) -> None:
+    def _admit(self, want: WorkRequest) -> None:
         refusal = self.admission.refusal(want)
         if refusal is not None:
             self._refuse(want.worker, refusal)
@@ -201,10 +195,10 @@ class Dispatcher:
         self._refused.pop(want.worker, None)
         if want.worker in self._declined:
             return
-        if want.worker not in self._ledger.workers:
+        if want.worker not in self._scheduler.workers:
             log.info("worker %s joined (release %s)", want.worker, want.version)
         now = time.monotonic()
-        self._ledger.want(want.worker, want.credits, now, idle=self.run in want.idle)
+        self._scheduler.want(want.worker, want.credits, now, idle=self.run in want.idle)
         self._census.asked(want, now)
 
     def _refuse(self, worker: str, reason: str) -> None:
@@ -223,7 +217,7 @@ class Dispatcher:
         self._attendance.left(worker)
         self._refused.pop(worker, None)
         self._declined.discard(worker)
-        if worker in self._ledger.workers:
+        if worker in self._scheduler.workers:
             again = self._forget(worker)
             log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
 
@@ -271,7 +265,7 @@ class Dispatcher:
         if place is None:
             self._ignore("bad", f"of {message.worker}: results that do not fit their jobs")
             return
-        verdicts = self._ledger.results(message.worker, message.jobs.tolist(), time.monotonic())
+        verdicts = self._scheduler.results(message.worker, message.jobs.tolist(), time.monotonic())
         new = np.array([verdict == "new" for verdict in verdicts])
         self._round.put(message, place, new)
         if new.any():
@@ -287,37 +281,37 @@ class Dispatcher:
             self.ignored["bad"] += 1
             return
         self._warn(f"worker {failure.worker} failed at a job: {failure.error}")
-        if self._ledger.error(failure.worker, failure.index, time.monotonic()):
-            [job] = self._round.jobs.take([failure.index]).split()
+        if self._scheduler.error(failure.worker, failure.index, time.monotonic()):
+            seed = self._round.jobs.take([failure.index]).seeds()[0]
             raise RunError(
-                f"pair {failure.index} of generation {self._header.generation} (perturbation seed {job.perturbation}) "
-                f"failed wherever it was tried, last with {failure.error}"
+                f"job {failure.index} of generation {self._header.generation} (seed {seed}) failed wherever it was "
+                f"tried, last with {failure.error}"
             )
 
     def _does_not_serve(self, worker: str, reason: str) -> None:
         """A worker that is here but does not serve this run: others may."""
-        if worker in self._ledger.workers:
+        if worker in self._scheduler.workers:
             self._warn(f"worker {worker} does not serve this run: {reason}")
             self._declined.add(worker)
             self._forget(worker)
 
     def _forget(self, worker: str) -> int:
         """It takes part no longer; how many of its jobs go to others."""
-        again = self._ledger.lost(worker)
+        again = self._scheduler.lost(worker)
         self._census.left(worker)
-        if not self._ledger.workers:
+        if not self._scheduler.workers:
             self.admission.deserted()
         return again
 
     def _hand_out(self) -> None:
         assert self._round is not None
-        for worker, indices in self._ledger.assign(time.monotonic()):
+        for worker, indices in self._scheduler.assign(time.monotonic()):
             # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
             head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
             chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices), **head))
             self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
-    def report(self, progress: Progress) -> None:
+    def report(self, progress: GenerationStats) -> None:
         """Take in how the last generation went, for people who ask."""
         self._progress = progress
 
@@ -337,8 +331,8 @@ class Dispatcher:
             generations=self._generations,
             return_mean=last.return_mean if last else None,
             mean_policy_return=last.mean_policy_return if last else None,
-            open=self._ledger.remaining,
-            reissued=self._ledger.reissued,
+            open=self._scheduler.remaining,
+            reissued=self._scheduler.reissued,
             refused=len(self._refused) + len(self._declined),
             ignored=dict(self.ignored),
             workers=self.census(),
@@ -347,7 +341,7 @@ class Dispatcher:
 
     def _tell_when_alone(self) -> None:
         now = time.monotonic()
-        if self._ledger.workers or self._how_to_join is None:
+        if self._scheduler.workers or self._how_to_join is None:
             self._alone = now
         elif now - self._alone > _PATIENCE:
             log.warning("no workers; start some with: %s", self._how_to_join)

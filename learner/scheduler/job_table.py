@@ -1,6 +1,6 @@
 """The books of one round: where each job is and what each worker holds, without any policy.
 
-A job that is not done is in exactly one place: pending, out, full or failed. `Ledger` decides
+A job that is not done is in exactly one place: pending, out, full or failed. `Scheduler` decides
 what moves; here it moves. Times are seconds of the ledger's clock.
 """
 
@@ -30,7 +30,7 @@ class Worker:
     speaks again."""
 
 
-class Books:
+class JobTable:
     """Jobs, workers, and the queues the jobs are in."""
 
     def __init__(self, copies: int) -> None:

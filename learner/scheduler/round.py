@@ -1,16 +1,16 @@
 """A round's jobs, and what came of them: one array of each kind over all rollouts, in the jobs' order. Pure."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.net.jobs import Jobs
-from farm.net.results import Result, Results, WireTrajectory, traced
+from farm.net.work import Jobs, Results, WireTrajectory, traced
+from farm.sim.trajectory import Trajectory
 
 
-class Round:
+class RoundResults:
     """Jobs 0..n-1 and their results, S rollouts in all; a result is written where it belongs, whenever it comes."""
 
     def __init__(self, jobs: Jobs, traces: str, trace: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]) -> None:
@@ -18,8 +18,8 @@ class Round:
 
         Args:
           jobs: all of them, by index.
-          traces: which tactile traces are wanted, one of TRACES.
-          trace: steps and taxels of one.
+          traces: which traces are wanted, one of TRACES.
+          trace: shape of one, control steps and numbers.
           shapes: of a trajectory's frames.
         """
         self.jobs, self._traces, self._trace, self._shapes = jobs, traces, trace, shapes
@@ -31,28 +31,22 @@ class Round:
         self.returns: FloatArray = np.zeros(count)
         """(S,)"""
         self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
-        """success, dropped, failed, clamped, (S, 4)"""
+        """success, ended, failed, clamped, (S, 4)"""
         self.traces: dict[int, AnyArray] = {}
-        """Tactile traces [N] of the rollouts that brought one, (T, 54) each"""
+        """Traces of the rollouts that brought one, (T, N) each"""
 
     def __len__(self) -> int:
         """How many jobs."""
         return len(self.jobs)
 
-    def __getitem__(self, index: int) -> Result:
-        """One job's result, without traces; the arrays are views."""
-        at = index + len(self) if index < 0 else index
-        rows = slice(self._starts[at], self._starts[at + 1])
-        success, dropped, failed, clamped = self.flags[rows].T
-        return Result(
-            index=at, trajectory=self._trajectories.get(at), returns=self.returns[rows], success=success,
-            dropped=dropped, failed=failed, clamped=clamped,
-            traces=np.empty((rows.stop - rows.start, 0, self._trace[1]), "<f4"),
-        )  # fmt: skip
+    def rows(self, job: int) -> slice:
+        """Which rollouts are a job's."""
+        return slice(self._starts[job], self._starts[job + 1])
 
-    def __iter__(self) -> Iterator[Result]:
-        """Job by job."""
-        return (self[index] for index in range(len(self)))
+    def trajectory(self, job: int) -> Trajectory | None:
+        """What a job showed, if anything."""
+        found = self._trajectories.get(job)
+        return None if found is None else found.trajectory()
 
     def place(self, results: Results) -> "Place | None":
         """Where these belong.

@@ -17,10 +17,10 @@ import math
 from collections.abc import Container, Sequence, Set
 from typing import Literal, NamedTuple, TypeAlias
 
-from learner.scheduler.chunking import LedgerConfig, Pace
-from learner.scheduler.job_table import Books, Worker
+from learner.scheduler.chunking import Chunking, SchedulerConfig
+from learner.scheduler.job_table import JobTable, Worker
 
-__all__ = ["Assignment", "Ledger", "LedgerConfig", "Verdict"]
+__all__ = ["Assignment", "Scheduler", "SchedulerConfig", "Verdict"]
 
 Verdict: TypeAlias = Literal["new", "doubled", "stale"]
 
@@ -36,13 +36,13 @@ class Assignment(NamedTuple):
     indices: tuple[int, ...]
 
 
-class Ledger:
+class Scheduler:
     """The books of one round after another, and who gets what when."""
 
-    def __init__(self, config: LedgerConfig) -> None:
+    def __init__(self, config: SchedulerConfig) -> None:
         self._config = config
-        self._pace = Pace(config)
-        self._books = Books(config.copies)
+        self._chunking = Chunking(config)
+        self._table = JobTable(config.copies)
         self._begun = False
         self._reissued = 0
         self._now = -math.inf
@@ -51,17 +51,17 @@ class Ledger:
     @property
     def complete(self) -> bool:
         """Whether a round has begun and all its jobs are done."""
-        return self._begun and not self._books.open
+        return self._begun and not self._table.open
 
     @property
     def remaining(self) -> int:
         """Jobs of this round that are not done."""
-        return len(self._books.open)
+        return len(self._table.open)
 
     @property
     def workers(self) -> Set[str]:
         """Names of the known workers."""
-        return self._books.workers.keys()
+        return self._table.workers.keys()
 
     @property
     def reissued(self) -> int:
@@ -73,7 +73,7 @@ class Ledger:
         if jobs < 0:
             raise ValueError(f"jobs is {jobs}, expected 0 or more")
         self._begun = True
-        self._books.begin(jobs, self._now - self._pace.patience)
+        self._table.begin(jobs, self._now - self._chunking.patience)
         self._seen = -math.inf
 
     def want(self, worker: str, credits: int, now: float, *, idle: bool = False) -> None:
@@ -89,20 +89,20 @@ class Ledger:
         if credits < 0:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
         self._tick(now)
-        known = self._books.workers.setdefault(worker, Worker(credits))
+        known = self._table.workers.setdefault(worker, Worker(credits))
         known.credits, known.benched = credits, False
         if idle:
             known.answered = self._now
-            self._reissued += self._books.release(worker, self._now)
+            self._reissued += self._table.release(worker, self._now)
 
     def lost(self, worker: str) -> int:
         """Forget a worker; return how many of its jobs are pending again."""
-        if worker not in self._books.workers:
+        if worker not in self._table.workers:
             return 0
         self._seen = -math.inf
-        count = self._books.release(worker, self._now)
+        count = self._table.release(worker, self._now)
         self._reissued += count
-        del self._books.workers[worker]
+        del self._table.workers[worker]
         return count
 
     def results(self, worker: str, indices: Sequence[int], now: float) -> list[Verdict]:
@@ -113,8 +113,8 @@ class Ledger:
         """
         self._tick(now)
         self._learn(worker, indices)
-        ours = [0 <= index < self._books.size for index in indices]
-        new = iter(self._books.finish(worker, [index for index, our in zip(indices, ours, strict=True) if our]))
+        ours = [0 <= index < self._table.size for index in indices]
+        new = iter(self._table.finish(worker, [index for index, our in zip(indices, ours, strict=True) if our]))
         return ["stale" if not our else "new" if next(new) else "doubled" for our in ours]
 
     def error(self, worker: str, index: int, now: float) -> bool:
@@ -125,11 +125,11 @@ class Ledger:
         then it is issued again, elsewhere if possible. Who is not known counts for nothing.
         """
         self._tick(now)
-        counts, again = self._books.fail(worker, index, self._now)
+        counts, again = self._table.fail(worker, index, self._now)
         self._reissued += again
-        if worker in self._books.workers:
-            self._books.workers[worker].answered = self._now
-        return counts and self._books.hopeless(index, self._config.max_errors)
+        if worker in self._table.workers:
+            self._table.workers[worker].answered = self._now
+        return counts and self._table.hopeless(index, self._config.max_errors)
 
     def assign(self, now: float) -> list[Assignment]:
         """Return the chunks to send now, within the credits, and count them as sent.
@@ -138,12 +138,12 @@ class Ledger:
         one to work on and one to go on with; the rest waits here, so that all end together.
         """
         self._tick(now)
-        size = self._pace.chunk(self._books.waiting, len(self._books.workers))
-        chunks = self._again(self._books.failed, size)
+        size = self._chunking.chunk(self._table.waiting, len(self._table.workers))
+        chunks = self._again(self._table.failed, size)
         chunks += self._first_time(size)
-        if not self._books.any_pending():
-            chunks += self._again(self._books.out, size)
-            chunks += self._again(self._books.full, size)
+        if not self._table.any_pending():
+            chunks += self._again(self._table.out, size)
+            chunks += self._again(self._table.full, size)
         self._seen = self._now
         return chunks
 
@@ -153,7 +153,7 @@ class Ledger:
         Overdue jobs that the last `assign` could not place wait for news: a result, a worker.
         """
         dues: list[float] = []
-        for queue in (self._books.out, self._books.full, self._books.failed):
+        for queue in (self._table.out, self._table.full, self._table.failed):
             wait = self._wait(queue)
             ahead = (since + wait for since in queue.values() if since + wait > self._seen)
             dues.extend(due for due in (next(ahead, None),) if due is not None)
@@ -165,29 +165,29 @@ class Ledger:
 
     def _learn(self, worker: str, indices: Sequence[int]) -> None:
         """Learn the time per job: since the worker was able to begin, over the jobs it did."""
-        known = self._books.workers.get(worker)
+        known = self._table.workers.get(worker)
         if known is None:
             return
         sent = [known.held[index] for index in set(indices) if index in known.held]
         if sent:
-            self._pace.learn((self._now - max(known.answered, min(sent))) / len(sent))
+            self._chunking.learn((self._now - max(known.answered, min(sent))) / len(sent))
             known.answered = self._now
 
     def _first_time(self, size: int) -> list[Assignment]:
         """Hand out pending jobs in chunks, lowest index first; where there are too few for two chunks each, evenly."""
-        free = self._books.free(2 * size) if self._books.any_pending() else []
+        free = self._table.free(2 * size) if self._table.any_pending() else []
         load = sum(held for held, _ in free)
         chunks: list[Assignment] = []
-        while free and self._books.any_pending():
+        while free and self._table.any_pending():
             held, name = heapq.heappop(free)
             # Two chunks fit into the credits, so that one travels while the other is computed.
-            credits = self._books.workers[name].credits
+            credits = self._table.workers[name].credits
             chunk = min(size, (credits + 1) // 2)
             if held > chunk:
                 load -= held
                 continue
-            even = -(-(self._books.waiting + load) // (len(free) + 1)) - held  # until all hold as much
-            taken = self._books.take(name, min(chunk, even, credits - held), self._now)
+            even = -(-(self._table.waiting + load) // (len(free) + 1)) - held  # until all hold as much
+            taken = self._table.take(name, min(chunk, even, credits - held), self._now)
             chunks.append(Assignment(name, taken))
             load -= held
             held += len(taken)
@@ -199,24 +199,24 @@ class Ledger:
     def _again(self, queue: dict[int, float], size: int) -> list[Assignment]:
         """Issue failed or overdue jobs to workers that have room and do not hold them."""
         due = self._due(queue)
-        free = self._books.free(2 * size) if due else []
+        free = self._table.free(2 * size) if due else []
         chunks: dict[str, list[int]] = {}
         for index in due:
             if not free:
                 break
-            name = self._books.pick(index, free, self._avoided(index), 2 * size)
+            name = self._table.pick(index, free, self._avoided(index), 2 * size)
             if name is not None:
-                self._reissued += queue is not self._books.failed  # those were counted before
-                self._books.give(index, name, self._now)
+                self._reissued += queue is not self._table.failed  # those were counted before
+                self._table.give(index, name, self._now)
                 chunks.setdefault(name, []).append(index)
         return [Assignment(name, tuple(taken)) for name, taken in chunks.items()]
 
     def _wait(self, queue: dict[int, float]) -> float:
-        return self._pace.patience * (_GIVE_UP if queue is self._books.full else 1.0)
+        return self._chunking.patience * (_GIVE_UP if queue is self._table.full else 1.0)
 
     def _due(self, queue: dict[int, float]) -> list[int]:
         """Return the jobs to issue again: overdue ones, oldest first, and every failed one."""
-        if queue is self._books.failed:
+        if queue is self._table.failed:
             return list(queue)
         wait = self._wait(queue)
         due: list[int] = []
@@ -228,8 +228,8 @@ class Ledger:
 
     def _avoided(self, index: int) -> Container[str]:
         """Return the workers that failed at a job, as long as another one may get to it soon."""
-        failed = self._books.errors[index]
-        since = self._books.failed.get(index, -math.inf)
-        if since + self._wait(self._books.failed) <= self._now:
+        failed = self._table.errors[index]
+        since = self._table.failed.get(index, -math.inf)
+        if since + self._wait(self._table.failed) <= self._now:
             return ()
-        return failed if any(name not in failed for name in self._books.workers) else ()
+        return failed if any(name not in failed for name in self._table.workers) else ()

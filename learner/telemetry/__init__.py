@@ -1,1 +1,1 @@
-"""."""
+"""Reports of a run: published, followed, kept."""

@@ -6,15 +6,15 @@ from dataclasses import replace
 from typing import Any, Final
 
 from farm.net import codec, keys
-from farm.net.results import WireTrajectory
 from farm.net.session import Session
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from farm.net.telemetry import Line, RunEnd, RunHistory, RunReport
+from farm.net.work import WireTrajectory
 from learner import config as configs
 from learner.evaluation import Evaluation
 from learner.learner import Learner
 from learner.telemetry.report import Report, packed, wire
-from learner.telemetry.report_log import History
+from learner.telemetry.report_log import ReportLog
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ _FAREWELL: Final = 5.0  # [s] that recorders have to fetch the end
 _LOOK: Final = 0.02  # [s] between two looks at whether they have
 
 
-class Broadcast(logging.Handler):
+class Publisher(logging.Handler):
     """Publishes reports without ever waiting for anybody, and keeps a history for who asks.
 
     What a recorder misses it notices by the generation's number, and asks for.
@@ -38,7 +38,8 @@ class Broadcast(logging.Handler):
         super().__init__(logging.INFO)
         self._session, self._key, self._incarnation = session, keys.history(farm, learner.folder.name), incarnation
         self._run, self._recording, self._config = learner.folder.name, learner.run, configs.to_dict(learner.config)
-        self._history, self._generation = History(), learner.state.generation
+        self._files = dict(learner.problem.task.sources)
+        self._history, self._generation = ReportLog(), learner.state.generation
         self._end: RunEnd | None = None
         self._best: tuple[WireTrajectory | None, int] = (None, 0)
         self._lines: list[Line] = []
@@ -70,7 +71,7 @@ class Broadcast(logging.Handler):
             self._best = best, best_generation
         self._end = RunEnd(
             summary=summary, lines=self._taken(), best=self._best[0], best_generation=self._best[1],
-            mean=evaluation.mean.trajectory if evaluation else None,
+            mean=wire(evaluation.mean.trajectory) if evaluation else None,
         )  # fmt: skip
         self._session.publish(self._key, b"", block=False)
         until = time.monotonic() + _FAREWELL
@@ -93,6 +94,7 @@ class Broadcast(logging.Handler):
                 incarnation=self._incarnation,
                 recording=self._recording,
                 config=self._config,
+                files=self._files,
                 generation=done,
                 reports=self._history.page(first),
                 end=end,
@@ -116,7 +118,7 @@ class Broadcast(logging.Handler):
         return replace(report, traces=traces)
 
 
-def _before(progress: list[Progress], run: str, incarnation: str) -> list[RunReport]:
+def _before(progress: list[GenerationStats], run: str, incarnation: str) -> list[RunReport]:
     """Reports of the generations that the folder knows, without rollouts."""
     reports, rollouts, seconds = [], 0, 0.0
     for p in progress:

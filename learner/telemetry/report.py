@@ -7,9 +7,9 @@ import numpy as np
 
 from farm.arrays import AnyArray
 from farm.errors import MessageError
-from farm.net.results import WireTrajectory
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from farm.net.telemetry import Line, RunReport, Trace
+from farm.net.work import WireTrajectory
 from farm.sim.trajectory import Trajectory
 
 
@@ -17,13 +17,13 @@ from farm.sim.trajectory import Trajectory
 class Report:
     """A generation that is over."""
 
-    progress: Progress
+    progress: GenerationStats
     rate: float
     """Rollouts a second over this generation."""
     sample: Trajectory | None
     """The mean policy's rollout."""
     traces: Mapping[str, AnyArray]
-    """Tactile traces: `best` and `worst` (T, 54), and `all` (2N, T, 54) if the run keeps them."""
+    """Traces: `best` and `worst` (T, N), and `all` (2N, T, N) if the run keeps them."""
     replay: Trajectory | None
     """The best rollout so far at physics rate, once there is a new one."""
     replay_generation: int
@@ -55,7 +55,7 @@ def unpacked(message: RunReport) -> Report:
       MessageError: its progress makes no sense.
     """
     try:
-        progress = Progress.from_dict(message.progress)
+        progress = GenerationStats.from_dict(message.progress)
     except ValueError as error:
         raise MessageError(f"RunReport: {error}") from None
     if progress.generation != message.generation:

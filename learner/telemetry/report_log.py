@@ -6,8 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from farm.net import codec
-from farm.net.results import WireTrajectory
-from farm.net.telemetry import RunReport, Trace
+from farm.net.telemetry import RunReport
 
 MEMORY: Final = 32 << 20
 """What rollouts and traces may take in memory [bytes]; the oldest go first."""
@@ -18,7 +17,7 @@ PAGE: Final = 4 << 20
 _PLAIN: Final = 600  # [bytes] of a report's statistics, about
 
 
-class History:
+class ReportLog:
     """Reports in order; written by the learner's thread, read by the one that answers."""
 
     def __init__(self, memory: int = MEMORY, page: int = PAGE) -> None:
@@ -73,9 +72,5 @@ def statistics(report: RunReport) -> RunReport:
 
 def _size(report: RunReport) -> int:
     """What rollouts and traces take [bytes]."""
-    parts: tuple[WireTrajectory | Trace | None, ...] = (report.sample, report.replay, *report.traces)
-    return sum(_bytes(part) for part in parts)
-
-
-def _bytes(part: WireTrajectory | Trace | None) -> int:
-    return sum(getattr(value, "nbytes", 0) for value in vars(part).values()) if part else 0
+    shown = sum(part.nbytes for part in (report.sample, report.replay) if part)
+    return shown + sum(trace.values.nbytes for trace in report.traces)

@@ -43,7 +43,7 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
     raise Interrupted("stopped before there was a run")
 
 
-class Follower:
+class Subscriber:
     """Reads one run's reports as they come, and asks the learner for those it missed."""
 
     def __init__(self, session: Session, farm: str, run: str) -> None:

@@ -14,7 +14,7 @@ from recordings import content, generations, read, rows
 
 from learner.config import PRESETS
 from learner.run import Place, free_endpoint, open_run
-from learner.scheduler.scheduler import LedgerConfig
+from learner.scheduler.scheduler import SchedulerConfig
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +47,7 @@ def test_any_size_of_chunk_learns_the_same(tmp_path: Path, learnt: Farm, seconds
         gym, task=replace(gym.task, task="gym:Pusher-v5", steps=20), algorithm=replace(gym.algorithm, pairs=6),
         generations=6,
     )  # fmt: skip
-    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=LedgerConfig(chunk_seconds=seconds))
+    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=SchedulerConfig(chunk_seconds=seconds))
     with open_run(config, tmp_path / "r", place) as run:
         for _ in run.learn():
             pass

@@ -14,7 +14,7 @@ from recordings import generations, read, rows
 from rerun.chunk import RrdReader
 
 from farm import seeds as randomness
-from farm.net.jobs import Job
+from farm.net.work import Job
 from learner.run_folder import RunFolder
 from learner.setup import specification, start
 from workers.backends.cpu import CpuBackend

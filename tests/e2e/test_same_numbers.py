@@ -11,7 +11,7 @@ from processes import SMALL, Farm, children
 
 from learner.config import RunConfig
 from learner.run import Place, free_endpoint, learn, open_run
-from learner.scheduler.scheduler import LedgerConfig
+from learner.scheduler.scheduler import SchedulerConfig
 
 CONFIG = RunConfig(generations=10, algorithm=replace(RunConfig().algorithm, pairs=6))
 
@@ -25,7 +25,7 @@ def test_any_number_of_workers(farm: Farm, reference: dict[str, Any], workers: i
 
 @pytest.mark.parametrize("seconds", [1e-6, 10.0])
 def test_any_size_of_chunk(tmp_path: Path, reference: dict[str, Any], seconds: float) -> None:
-    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=LedgerConfig(chunk_seconds=seconds))
+    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=SchedulerConfig(chunk_seconds=seconds))
     with open_run(CONFIG, tmp_path / "r", place) as run:
         for _ in run.learn():
             pass

@@ -15,8 +15,8 @@ from recordings import generations
 from farm.commands import certificates
 from farm.errors import ConfigError, FarmError
 from farm.net import codec, keys, session
-from farm.net.messages import Want
-from farm.net.results import Result, Results
+from farm.net.messages import WorkRequest
+from farm.net.work import Result, Results
 from farm.net.session import Session
 from farm.net.tls import Bundle, find
 from learner.run import free_endpoint
@@ -89,7 +89,7 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
         w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
         for posing in (w2, eva):
             posing.token(keys.worker_token("farm", "w1/1-abc"))
-            want = Want(
+            want = WorkRequest(
                 worker="w1/1-abc", credits=100, idle=("r",), version="0", assets="a", canary="c", host="h", cores=2
             )
             posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))

@@ -19,7 +19,7 @@ from benchmarks.thesis.series import COLUMNS, Series
 from farm import tasks
 from farm.errors import ConfigError
 from farm.net import keys
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from learner.config import PRESETS, RunConfig
 from learner.run_folder import RunFolder
 
@@ -96,11 +96,11 @@ def test_the_features_that_the_thesis_recommends():
 def folder_with(path: Path, generations: int, state: str = "finished") -> RunFolder:
     """A run's folder as a run would leave it."""
     run = RunFolder.create(path, replace(RunConfig(), generations=9))
-    numbers = dict.fromkeys(Progress.__dataclass_fields__, 0.0)
+    numbers = dict.fromkeys(GenerationStats.__dataclass_fields__, 0.0)
     counts = ("generation", "rollouts", "dropped", "failed", "clamped", "reissued", "workers")
     for g in range(1, generations + 1):
         told = {**numbers, **dict.fromkeys(counts, g), "return_mean": -g / 7, "mean_policy_success": g > 3}
-        run.append(Progress(**told), np.arange(8.0) * g, np.arange(8.0) / g, 9)
+        run.append(GenerationStats(**told), np.arange(8.0) * g, np.arange(8.0) / g, 9)
     run.write_summary({
         "state": state, "mean_policy_success": True, "robust_success_rate": 0.9, "mean_policy_return": -0.25,
         "parameters_sha256": "ab", "seconds": 3.0,

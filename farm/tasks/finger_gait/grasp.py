@@ -13,8 +13,8 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.sim.scene import HandScene
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, LOWER, UPPER
+from farm.tasks.finger_gait.model import Hand
 
 PRESS: Final = {"index": 4.0, "middle": 3.0, "thumb": 6.5}
 """Force with which a finger is told to press [N]; the object's weight and friction share it out."""
@@ -35,7 +35,7 @@ _REACH: Final = 0.06
 class Grasping:
     """Inverse kinematics and touch for one scene."""
 
-    def __init__(self, scene: HandScene) -> None:
+    def __init__(self, scene: Hand) -> None:
         """Look at the scene in its start configuration, hand bent and object in place."""
         self.scene = scene
         self.data = mujoco.MjData(scene.model)

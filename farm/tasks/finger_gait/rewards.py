@@ -18,9 +18,6 @@ TERMS: Final = ("tactile", "joints", "action", "contact points", "drop")
 RETURN_SCALE: Final = 0.1
 """Factor of the return (3.4)."""
 
-RETURN_FLOOR: Final = -1e12
-"""A return that overflows counts as this: huge actions must never look good."""
-
 _RANGE: Final = UPPER - LOWER
 
 
@@ -138,24 +135,3 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
     ended = dropped | failed
     out[rows[ended], last[ended], 4] = -weights.drop
     return out
-
-
-def discounted(terms: FloatArray, gamma: float, scale: float = RETURN_SCALE) -> tuple[FloatArray, BoolArray]:
-    """Return (3.4): R = 0.1 sum_t gamma^t r_t, t from 0.
-
-    Args:
-      terms: (B, T, K) reward terms of every step, zero after the end.
-      gamma: discount factor.
-      scale: the 0.1.
-
-    Returns:
-      returns (B,), and (B,) where the sum overflowed and was clamped to RETURN_FLOOR.
-    """
-    total = np.zeros(len(terms))
-    with np.errstate(over="ignore", invalid="ignore"):
-        reward = terms.sum(axis=-1)
-        for t in range(terms.shape[1]):
-            total += gamma**t * reward[:, t]
-        total *= scale
-        clamped = ~(total >= RETURN_FLOOR)  # catches nan as well
-    return np.where(clamped, RETURN_FLOOR, total), clamped

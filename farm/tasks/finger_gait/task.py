@@ -1,23 +1,26 @@
 """Finger gaiting: from one grip of an object to another by touch (Plage 2016, ch. 3).
 
-Pure, batched: arrays in, arrays out; the physics is the workers' affair. The hand holds a
-released object with the start grip; for `steps` control steps of SUBSTEPS x TIMESTEP the
-controller sets joint targets; a demonstration of the goal grip defines the reward.
+The hand closes a start grip round a frozen object and releases it; for `steps` control steps of SUBSTEPS x TIMESTEP
+the controller sets joint targets; a demonstration of the goal grip defines the reward.
 """
 
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Final, Literal
 
+import mujoco
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
-from farm.tasks.base import Sizes
-from farm.tasks.finger_gait import rewards
-from farm.tasks.finger_gait import touch as tactile
-from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, UPPER
+from farm.settings import setting
+from farm.sim.scene import compiled
+from farm.sim.sim import Sim
+from farm.tasks.base import Camera, Channel, Record, Score, Task, TaskConfig, TaskSpec
+from farm.tasks.finger_gait import model, rewards, touch
+from farm.tasks.finger_gait.grasp import Grasping
+from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, TIP_RADIUS, UPPER
 from farm.tasks.finger_gait.observations import STATES
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS, Demonstration
 
@@ -25,16 +28,10 @@ TIMESTEP: Final = 0.01
 """A physics step [s]."""
 
 SUBSTEPS: Final = 10
-"""Physics steps a control step."""
+"""Physics steps per control step."""
 
 CONTROL_PERIOD: Final = TIMESTEP * SUBSTEPS
 """A control step [s]."""
-
-STEPS: Final = 15
-"""Control steps of a rollout, unless told otherwise."""
-
-STEPS_LIMIT: Final = 10_000
-"""Control steps of a rollout of an environment, at most."""
 
 PRESSES: Final = 0.1
 """Force from which a fingertip counts as pressing [N]."""
@@ -57,27 +54,39 @@ DISPLACEMENT: Final = 0.002
 JOINT_NOISE: Final = 0.01
 """Perturbation: standard deviation of the joint readings [rad]."""
 
-_ENVIRONMENT: Final = re.compile(r"([\w.-]{1,60}/)?[\w.-]{1,60}-v\d{1,4}", re.ASCII)
-_SHARED: Final = ("task", "steps", "gamma", "perturb")  # settings that other tasks have as well
+CLOSING: Final = 100
+"""Physics steps in which a grip is closed round the frozen object."""
 
+RAMP: Final = 50
+"""Physics steps of them in which the commands move from waiting to gripping."""
 
-def _known(kind: str, name: str, known: object) -> None:
-    if name not in known:  # type: ignore[operator]
-        raise ConfigError(f"unknown {kind} {name!r}; known are {', '.join(known)}")  # type: ignore[call-overload]
+SETTLE: Final = 50
+"""Physics steps from the release of the goal grip until its demonstration is recorded."""
+
+HOLD: Final = 200
+"""Physics steps from the release for which a grip must hold the object by itself to be taken."""
+
+_TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target a number that MuJoCo takes
+_COLOURS: Final = ((86, 180, 233), (0, 158, 115), (204, 121, 167))  # of the fingers
+_SHADES: Final = (1.25, 0.95, 0.65)  # of a finger's joints, first to last
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskConfig:
-    """The task."""
+class FingerGaitConfig(TaskConfig):
+    """The finger gait's settings."""
 
-    task: str = "finger-gait"
-    """One of TASKS: finger-gait, or gym:NAME for a MuJoCo environment of Gymnasium, for example gym:Swimmer-v5."""
+    gamma: float = setting(0.95, above=0.0, most=1.0)
+    """Discount factor of the return, per control step."""
+    perturb: bool = False
+    """Train on perturbed friction, mass, object position and joint readings (both rollouts of a pair alike)."""
     object: str = "bar"
-    """Object to be held: the name of a file in assets/objects."""
+    """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own."""
     start_grip: str = "index+thumb"
     """Grip in which the object is released."""
     goal_grip: str = "index+middle+thumb"
     """Grip to be reached; its demonstration is recorded from the simulation."""
+    friction: float = setting(1.0, above=0.0)
+    """Factor of every friction coefficient, of fingertips and object alike."""
     state: str = "joints"
     """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile."""
     reward: str = "full"
@@ -85,78 +94,33 @@ class TaskConfig:
     limited (full, no action punished for more than its joint's range)."""
     weights: str = "projected"
     """Row of the thesis' Table 3.1 with the reward's weights: direct | projected."""
-    steps: int = 0
-    """Control steps a rollout; 0: the task's own, 15 (of 0.1 s) or a gym: environment's, which this may shorten."""
-    gamma: float = 0.95
-    """Discount factor of the return, a control step."""
-    return_scale: float = rewards.RETURN_SCALE
+    action: Literal["offset", "absolute", "increment"] = "offset"
+    """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
+    clip: bool = True
+    """Clip joint targets to the joints' ranges."""
+    return_scale: float = setting(rewards.RETURN_SCALE, above=0.0)
     """Factor of the return (thesis 3.4: 0.1, introduced to keep returns small)."""
-    perturb: bool = False
-    """Train on perturbed friction, mass, object position and joint readings (both rollouts of a pair alike);
-    with gym: tasks on starts of many seeds."""
-    joints_scale: float = 1.0
+    joints_scale: float = setting(1.0, above=0.0)
     """Factor of the joint positions [rad] in the state."""
-    contacts_scale: float = 1.0
+    contacts_scale: float = setting(1.0, above=0.0)
     """Factor of the contact points [fingertip radii] in the state."""
-    tactile_scale: float = 1.0
+    tactile_scale: float = setting(1.0, above=0.0)
     """Factor of the taxels' forces [N] in the state."""
 
     def __post_init__(self) -> None:
         """Check every value."""
-        self._check_task()
-        if self.kind == "finger-gait" and self.steps == 0:
-            object.__setattr__(self, "steps", STEPS)
-        _known("grip", self.start_grip, GRIPS)
-        _known("grip", self.goal_grip, GRIPS)
-        _known("state base", self.state, STATES)
-        _known("reward", self.reward, REWARDS)
-        _known("weights", self.weights, WEIGHTS)
-        least, most = (SUCCESS_STEPS, 1000) if self.kind == "finger-gait" else (0, STEPS_LIMIT)
-        if not isinstance(self.steps, int) or not least <= self.steps <= most:
-            raise ConfigError(f"steps is {self.steps}; expected {least} to {most}")
-        if not 0 < self.gamma <= 1:
-            raise ConfigError(f"gamma is {self.gamma}; expected a number in (0, 1]")
-        for name in ("joints_scale", "contacts_scale", "tactile_scale", "return_scale"):
-            value = getattr(self, name)
-            if not 0 < value < np.inf:
-                raise ConfigError(f"{name} is {value}; expected a positive number")
-
-    @property
-    def kind(self) -> str:
-        """The part of the task's name before a colon, by which TASKS knows it."""
-        return self.task.partition(":")[0]
-
-    @property
-    def environment(self) -> str:
-        """The environment's name in Gymnasium's registry."""
-        return self.task.partition(":")[2]
-
-    def _check_task(self) -> None:
-        """See that the name is one, and that no setting is another task's."""
-        from farm.tasks import TASKS  # each of them is told a TaskConfig
-
-        if self.kind == "gym":
-            self._check_environment()
-        elif self.task not in TASKS:
-            known = ", ".join("gym:NAME" if kind == "gym" else kind for kind in TASKS)
-            raise ConfigError(f"unknown task {self.task[:80]!r}; known are {known}")
-        if self.kind == "finger-gait":
-            return
-        for f in fields(self):
-            if f.name not in _SHARED and getattr(self, f.name) != f.default:
-                flag, what = f.name.replace("_", "-"), self.kind + ":" * (self.kind == "gym")
-                raise ConfigError(
-                    f"--{flag} is a setting of finger-gait; {what} tasks have --steps, --gamma, --perturb"
-                )
-
-    def _check_environment(self) -> None:
-        """See that the name is one, and nothing that would be imported."""
-        if ":" in self.environment:
-            raise ConfigError(
-                f"task {self.task[:80]!r} names a module to import, which is refused; expected gym:NAME-vN"
-            )
-        if not _ENVIRONMENT.fullmatch(self.environment):
-            raise ConfigError(f"task {self.task[:80]!r} is no environment's name; expected gym:NAME-vN")
+        super().__post_init__()
+        for kind, name, known in (
+            ("grip", self.start_grip, GRIPS),
+            ("grip", self.goal_grip, GRIPS),
+            ("state base", self.state, STATES),
+            ("reward", self.reward, REWARDS),
+            ("weights", self.weights, WEIGHTS),
+        ):
+            if name not in known:
+                raise ConfigError(f"unknown {kind} {name!r}; known are {', '.join(known)}")
+        if self.steps and not SUCCESS_STEPS <= self.steps <= 1000:
+            raise ConfigError(f"steps is {self.steps}; expected {SUCCESS_STEPS} to 1000")
 
 
 @dataclass(frozen=True)
@@ -183,134 +147,216 @@ class Perturbation:
             noise=rng.normal(0.0, JOINT_NOISE, (steps, len(JOINTS))),
         )
 
+    @classmethod
+    def none(cls, steps: int) -> "Perturbation":
+        """Nominal conditions."""
+        return cls(1.0, 1.0, np.zeros(3), np.zeros((steps, len(JOINTS))))
 
-@dataclass(frozen=True)
-class Frames:
-    """What the simulator measured, any leading shape (...)."""
 
-    qpos: FloatArray
-    """(..., 15): joint positions [rad], then the object's position [m] and quaternion wxyz."""
-    force: FloatArray
-    """(..., 3, C) normal force of each contact of each fingertip with the object [N]."""
-    place: FloatArray
-    """(..., 3, C, 3) where it acts, in the fingertip's frame [m]."""
+class FingerGait(Task):
+    """An Allegro hand changes from one grip of an object to another by touch."""
 
-    def at(self, rows: Sequence[int] | IntArray) -> "Frames":
-        """Some of them, by their first axis."""
-        return Frames(self.qpos[rows], self.force[rows], self.place[rows])
+    Config = FingerGaitConfig
+    steps = 15
+    substeps = SUBSTEPS
+    camera = Camera(lookat=(0.035, 0.014, 0.01), distance=0.34, azimuth=150.0, elevation=-14.0)
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "default": {
+            "perturb": True, "policy": "kernel", "initial_mu": 1.75, "initial_sigma": 0.8, "sigma_rule": "capped",
+        },
+        "thesis": {"policy": "projected", "normaliser": "thesis", "sigma_rule": "bare"},
+    }  # fmt: skip
+    start_commands: FloatArray
+    """Joint targets of the start grip [rad], (8,)."""
+    goal: Demonstration
+    """The grip to be reached."""
+
+    def files(self) -> dict[str, str]:
+        """Hand, object, and what the task adds."""
+        return model.files(self.config.object)
+
+    def compiled(self) -> mujoco.MjModel:
+        """Compile them."""
+        return compiled(model.mjcf(self.sources), f"object {self.config.object}")
+
+    @cached_property
+    def hand(self) -> model.Hand:
+        """Where things are in the model."""
+        return model.Hand(self.model, self.config.object)
 
     @property
-    def joints(self) -> FloatArray:
-        """(..., 8) [rad]."""
-        return self.qpos[..., : len(JOINTS)]
+    def return_scale(self) -> float:  # type: ignore[override]  # a setting here
+        """Factor of the return."""
+        return float(self.config.return_scale)
 
-    @property
-    def pose(self) -> FloatArray:
-        """The object's (..., 7)."""
-        return self.qpos[..., len(JOINTS) :]
+    def spec(self) -> TaskSpec:
+        """What both sides must know, without closing a grip."""
+        return TaskSpec(
+            observation=STATES[self.config.state].size, action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
+            terms=TERMS, success=True, channels=self.channels,
+        )  # fmt: skip
 
+    # Beginning a rollout
 
-@dataclass(frozen=True)
-class Outcome:
-    """What rollouts were worth."""
+    def setup(self, sim: Sim) -> None:
+        """Close start and goal grip, and record the demonstration.
 
-    returns: FloatArray
-    """(B,)"""
-    success: BoolArray
-    """(B,)"""
-    steps: IntArray
-    """(B,) control steps until the end, the last one included."""
-    dropped: BoolArray
-    """(B,) ended because no fingertip touched the object."""
-    failed: BoolArray
-    """(B,) ended because the physics blew up."""
-    clamped: BoolArray
-    """(B,) the return overflowed."""
-    images: FloatArray
-    """(B, T, 3, 18) [N], zero after the end."""
-    points: FloatArray
-    """(B, T, 3, 3) [radii], zero after the end."""
-    terms: FloatArray
-    """(B, T, 5), zero after the end."""
-
-
-def sizes(config: TaskConfig) -> Sizes:
-    """How large the task's numbers are."""
-    return Sizes(
-        observation=STATES[config.state].size, lower=LOWER, upper=UPPER, steps=config.steps, period=CONTROL_PERIOD,
-        terms=TERMS, joints=len(JOINTS), fingers=len(FINGERS), success=True,
-    )  # fmt: skip
-
-
-class FingerGait:
-    """Observation, reward and success of the task."""
-
-    def __init__(self, config: TaskConfig, goal: Demonstration, commands: FloatArray) -> None:
-        """Take the demonstration of the goal grip and the start grip's commands (8,) [rad]."""
-        self.config = config
-        self.goal = goal
-        self.commands = commands
-        self.state = STATES[config.state]
-        self._scales = (config.joints_scale, config.tactile_scale, config.contacts_scale)
-
-    def observe(self, frames: Frames, noise: FloatArray | None) -> FloatArray:
-        """The controller's input.
-
-        Args:
-          frames: one moment of B rollouts.
-          noise: (B, 8) added to the joint readings [rad], or None.
-
-        Returns:
-          (B, d).
+        Raises:
+          ConfigError: the fingers cannot reach the object, or a grip does not hold it.
         """
-        joints = frames.joints if noise is None else frames.joints + noise
+        grasping = Grasping(self.hand)
+        self._waiting = grasping.command(())
+        self.start_commands = grasping.command(GRIPS[self.config.start_grip])
+        self._demonstrate(sim, self.config.start_grip, self.start_commands)
+        goal = grasping.command(GRIPS[self.config.goal_grip])
+        self.goal = self._demonstrate(sim, self.config.goal_grip, goal)
+
+    def _demonstrate(self, sim: Sim, grip: str, commands: FloatArray) -> Demonstration:
+        """Close a grip, release, let it settle, and record it."""
+        sim.begin(1)
+        self._close(sim, commands, np.zeros((1, 3)))
+        sim.step(SETTLE)
+        felt = self.measure(sim)
+        joints, images = sim.qpos[0, : len(JOINTS)].copy(), touch.image(felt["force"], felt["place"])
+        sim.step(HOLD - SETTLE)
+        if not touching(self.measure(sim)["force"])[0]:
+            raise ConfigError(f"grip {grip!r} does not hold object {self.hand.object_name!r}; take another grip")
+        return Demonstration(joints=joints, images=images[0], points=touch.contact_points(images)[0])
+
+    def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
+        """Set friction and mass, close the start grip round the frozen object, and release it."""
+        nominal = Perturbation.none(self.steps)
+        drawn = [nominal if rng is None else Perturbation.draw(rng, self.steps) for rng in rngs]
+        if self.config.friction != 1.0 or any(each is not nominal for each in drawn):
+            self._set_conditions(sim, drawn)
+        self._close(sim, self.start_commands, np.stack([each.displacement for each in drawn]))
+        sim.own["noise"] = np.stack([each.noise for each in drawn])
+        sim.own["target"] = np.tile(self.start_commands, (len(drawn), 1))
+
+    def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
+        friction, mass, inertia = (sim.expand(f) for f in ("geom_friction", "body_mass", "body_inertia"))
+        body, own = self.hand.object_body, self.model
+        for row, each in enumerate(drawn):
+            friction[row] = own.geom_friction * (each.friction * self.config.friction)
+            mass[row, body] = own.body_mass[body] * each.mass
+            inertia[row, body] = own.body_inertia[body] * each.mass
+
+    def _close(self, sim: Sim, commands: FloatArray, displaced: FloatArray) -> None:
+        """Close a grip round the frozen object, displaced by (B, 3) [m], and release it."""
+        place = slice(len(JOINTS), len(JOINTS) + 3)
+        sim.qpos[:, : len(JOINTS)] = self._waiting
+        sim.qpos[:, place] += displaced
+        sim.mocap_pos[:, 0] = sim.qpos[:, place]
+        sim.mocap_quat[:, 0] = sim.qpos[:, place.stop :]
+        part = np.minimum(1.0, np.arange(1, CLOSING + 1) / RAMP)[:, None]
+        sim.play(self._waiting + (commands - self._waiting) * part)
+        sim.eq_active[:] = 0
+
+    # A control step
+
+    def measure(self, sim: Sim) -> dict[str, FloatArray]:
+        """Forces (B, 3, C) [N] as of the last physics step's beginning, where they act in the fingertips' frames
+        (B, 3, C, 3) [m], and joint targets (B, 8) [rad]."""  # noqa: D205, D209
+        count = len(sim)
+        sensors = sim.sensordata.reshape(count, len(FINGERS), model.CONTACTS, model.CONTACT_WIDTH)
+        axes = sim.site_xmat[:, self.hand.tip_sites].reshape(count, len(FINGERS), 1, 3, 3)
+        away = sensors[..., 4:7] - sim.site_xpos[:, self.hand.tip_sites][:, :, None, :]
+        place = axes[..., 0, :] * away[..., 0:1] + axes[..., 1, :] * away[..., 1:2] + axes[..., 2, :] * away[..., 2:3]
+        found = sensors[..., 0] > 0
+        force = np.where(found, sensors[..., 1], 0.0)
+        return {"force": force, "place": np.where(found[..., None], place, 0.0), "target": sim.ctrl}
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """The state base's x, (B, d)."""
+        config, state = self.config, STATES[self.config.state]
+        joints = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)]
         images = points = joints  # not looked at by a state base without touch
-        if self.state.touch:
-            images = tactile.image(frames.force, frames.place)
-            points = tactile.contact_points(images) * self._scales[2]
-            images = images * self._scales[1]
-        return self.state.observe(joints * self._scales[0], images, points)
+        if state.touch:
+            felt = self.measure(sim)
+            images = touch.image(felt["force"], felt["place"])
+            points = touch.contact_points(images) * config.contacts_scale
+            images = images * config.tactile_scale
+        return state.observe(joints * config.joints_scale, images, points)
 
-    def judge(
-        self, frames: Frames, actions: FloatArray, start: FloatArray, steps: IntArray, failed: BoolArray
-    ) -> Outcome:
-        """Rewards, returns and success of rollouts that are over.
+    def act(self, sim: Sim, action: FloatArray) -> FloatArray:
+        """Joint targets of raw actions (B, 8) [rad], finite."""
+        base = {"offset": self.start_commands, "absolute": 0.0, "increment": sim.own["target"]}[self.config.action]
+        targets = base + action
+        targets[np.isnan(targets)] = 0.0
+        low, high = (LOWER, UPPER) if self.config.clip else (-_TARGET_LIMIT, _TARGET_LIMIT)
+        sim.own["target"] = np.minimum(np.maximum(targets, low), high)
+        return sim.own["target"]
 
-        Args:
-          frames: (B, T) moments after each control step, zero after the end.
-          actions: (B, T, 8) raw actions, zero after the end.
-          start: (B, 7) pose of the object at release.
-          steps: (B,) control steps each lasted.
-          failed: (B,) whether the physics blew up in the last of them.
-        """
-        images = tactile.image(frames.force, frames.place)
-        points = tactile.contact_points(images)
-        dropped = ~failed & ~touching(frames.force[np.arange(len(steps)), steps - 1])
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where no fingertip touches the object any more."""
+        return ~touching(self.measure(sim)["force"])
+
+    # Whole rollouts
+
+    def score(self, record: Record) -> Score:
+        """Reward terms and success of whole rollouts: touch is computed once for all of their steps."""
+        force, joints = record.frames["force"], record.frames["qpos"][..., : len(JOINTS)]
+        images = touch.image(force, record.frames["place"])
+        points = touch.contact_points(images)
+        dropped = ~record.failed & ~touching(force[np.arange(len(record.steps)), record.steps - 1])
         weights = WEIGHTS[self.config.weights]
         with np.errstate(over="ignore", invalid="ignore"):
-            reward = REWARDS[self.config.reward](frames.joints, images, points, actions, self.goal, weights)
-        terms = rewards.end(reward, steps, dropped, failed, weights)
-        returns, clamped = rewards.discounted(terms, self.config.gamma, self.config.return_scale)
-        ended = dropped | failed
-        return Outcome(
-            returns=returns,
-            success=~ended & self._success(frames, start),
-            steps=steps,
-            dropped=dropped,
-            failed=failed,
-            clamped=clamped,
-            images=images,
-            points=points,
-            terms=terms,
-        )
+            reward = REWARDS[self.config.reward](joints, images, points, record.actions, self.goal, weights)
+        terms = rewards.end(reward, record.steps, dropped, record.failed, weights)
+        return Score(terms, ~(dropped | record.failed) & self._success(record))
 
-    def _success(self, frames: Frames, start: FloatArray) -> BoolArray:
+    def _success(self, record: Record) -> BoolArray:
         """Whether the goal grip's fingers, no others, press at the last steps and the object stayed where it was."""
         wanted = np.array([finger in GRIPS[self.config.goal_grip] for finger in FINGERS])
         last = slice(-SUCCESS_STEPS, None)
-        grips = (frames.force[:, last].sum(axis=-1) >= PRESSES) == wanted
-        shift, turn = moved(frames.pose[:, last], start[:, None])
+        grips = (record.frames["force"][:, last].sum(axis=-1) >= PRESSES) == wanted
+        pose = slice(len(JOINTS), None)
+        shift, turn = moved(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
         return np.asarray(grips.all(axis=(1, 2)) & (shift <= MAX_SHIFT).all(axis=1) & (turn <= MAX_TURN).all(axis=1))
+
+    # What is shown
+
+    @cached_property
+    def channels(self) -> tuple[Channel, ...]:  # type: ignore[override]  # needs the model's fingertips
+        """Touch, forces, contacts, joints."""
+        tips = [self.model.geom(geom) for geom in self.hand.tip_geoms]
+        bodies = tuple(self.model.body(int(tip.bodyid[0])).name for tip in tips)
+        places = np.stack([tip.pos + touch.positions() for tip in tips])
+        fingers: dict[str, Any] = {"labels": FINGERS, "colours": _COLOURS, "unit": "N"}
+        joints = {"labels": tuple(n.replace("_", " ") for n in JOINTS), "colours": _joint_colours(), "unit": "rad"}
+        return (
+            Channel(
+                name="tactile", kind="images", shape=(len(FINGERS), *touch.SHAPE), top=2.0, bodies=bodies,
+                places=places, trace=True, **fingers,
+            ),
+            Channel(
+                name="contacts/force", kind="scalars", shape=(len(FINGERS),), top=3.0,
+                geoms=tuple(tip.name for tip in tips), **fingers,
+            ),
+            Channel(name="contacts/state", kind="flags", shape=(len(FINGERS),), **{**fingers, "unit": ""}),
+            Channel(
+                name="contacts/push", kind="arrows", shape=(len(FINGERS), 6), bodies=bodies, length=0.009,
+                longest=0.075, **{**fingers, "colours": ()},
+            ),
+            Channel(name="joints/position", kind="scalars", shape=(len(JOINTS),), **joints),
+            Channel(name="joints/target", kind="scalars", shape=(len(JOINTS),), **joints),
+        )  # fmt: skip
+
+    def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """The channels' values, from what was measured."""
+        images = touch.image(frames["force"], frames["place"])
+        points, force = touch.contact_points(images), images.sum(axis=-1)
+        centres = np.stack([self.model.geom_pos[tip] for tip in self.hand.tip_geoms])
+        length = np.sqrt((points * points).sum(axis=-1, keepdims=True))
+        push = -points / np.where(length > 0, length, 1.0) * force[..., None]
+        return {
+            "tactile": images.reshape(*images.shape[:-1], *touch.SHAPE),
+            "contacts/force": force,
+            "contacts/state": (force > 0).astype(float),
+            "contacts/push": np.concatenate([centres + points * TIP_RADIUS, push], axis=-1),
+            "joints/position": frames["qpos"][..., : len(JOINTS)],
+            "joints/target": frames["target"],
+        }
 
 
 def touching(force: FloatArray) -> BoolArray:
@@ -324,3 +370,15 @@ def moved(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     shift = np.sqrt((difference * difference).sum(axis=-1))
     cosine = np.abs((pose[..., 3:] * start[..., 3:]).sum(axis=-1))
     return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
+
+
+def _joint_colours() -> tuple[tuple[int, int, int], ...]:
+    """A finger's colour in shades from its first joint to its last."""
+    out = []
+    for name in JOINTS:
+        finger, number = name.split("_")
+        red, green, blue = (
+            min(255, round(c * _SHADES[int(number) - 1])) for c in _COLOURS[FINGERS.index(finger)]
+        )
+        out.append((red, green, blue))
+    return tuple(out)

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from farm.errors import CheckpointError
-from farm.net.jobs import Job
+from farm.net.work import Job
 from learner import checkpoint as checkpoints
 from learner.algorithms import PGPE, PGPEState
 from learner.checkpoint import Checkpoint, load, save

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from farm.errors import ConfigError
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from farm.policies.fourier import PolicyConfig
 from learner import comparison
 from learner.comparison import Compared, names, table
@@ -15,10 +15,10 @@ from learner.config import PRESETS, RunConfig, preset_of, properties
 from learner.run_folder import RunFolder
 
 
-def progress(generation: int, success: bool) -> Progress:
-    values = {f.name: 0 if f.type is int else 0.0 for f in dataclasses.fields(Progress)}
+def progress(generation: int, success: bool) -> GenerationStats:
+    values = {f.name: 0 if f.type is int else 0.0 for f in dataclasses.fields(GenerationStats)}
     changed = {"generation": generation, "rollouts": 30 * generation, "mean_policy_success": success, "seconds": 12.4}
-    return Progress(**{**values, "baseline": None, **changed})
+    return GenerationStats(**{**values, "baseline": None, **changed})
 
 
 def compared(name: str, config: RunConfig, successes: list[bool], **summary: object) -> Compared:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from farm.errors import CheckpointError, ConfigError
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from learner import run_folder as folders
 from learner.algorithms import PGPE
 from learner.checkpoint import Checkpoint
@@ -20,8 +20,8 @@ RNG = np.random.default_rng(1)
 ROWS = {g: (RNG.normal(size=P) * 10.0**g, RNG.uniform(size=P)) for g in range(1, 31)}
 
 
-def progress(generation: int) -> Progress:
-    return Progress(
+def progress(generation: int) -> GenerationStats:
+    return GenerationStats(
         generation=generation, rollouts=30 * generation, return_mean=-1 / generation, return_min=-4e300,
         return_max=-1e-300, return_std=np.pi, best=-0.1, baseline=None, mean_policy_return=-1 / 3,
         mean_policy_success=generation % 2 == 0, success_rate=0.25, sigma_mean=2.0, sigma_min=1.0, sigma_max=3.0,

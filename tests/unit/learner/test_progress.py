@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 
 STORED = (
     '{"version": 1, "generation": 2, "rollouts": 24, "return_mean": -5.45, "return_min": -6.5, "return_max": -4.25, '
@@ -16,30 +16,30 @@ STORED = (
 
 
 def test_a_stored_line_is_read_back() -> None:
-    read = Progress.from_dict(json.loads(STORED))
+    read = GenerationStats.from_dict(json.loads(STORED))
     assert json.dumps(read.to_dict()) == STORED
     assert (read.generation, read.best, read.mean_policy_success, read.seconds) == (2, -4.25, False, 6.5)
 
 
 def test_no_baseline() -> None:
-    read = Progress.from_dict({**json.loads(STORED), "baseline": None})
+    read = GenerationStats.from_dict({**json.loads(STORED), "baseline": None})
     assert read.baseline is None
-    assert Progress.from_dict(read.to_dict()) == read
+    assert GenerationStats.from_dict(read.to_dict()) == read
 
 
 def test_further_fields_do_no_harm() -> None:
-    assert Progress.from_dict({**json.loads(STORED), "weather": "fine"}) == Progress.from_dict(json.loads(STORED))
+    assert GenerationStats.from_dict({**json.loads(STORED), "weather": "fine"}) == GenerationStats.from_dict(json.loads(STORED))
 
 
 def test_refused() -> None:
     values = json.loads(STORED)
     with pytest.raises(ValueError, match="version 1"):
-        Progress.from_dict({**values, "version": 2})
+        GenerationStats.from_dict({**values, "version": 2})
     with pytest.raises(ValueError, match="not a line"):
-        Progress.from_dict([])  # type: ignore[arg-type]
+        GenerationStats.from_dict([])  # type: ignore[arg-type]
     for wrong in ({"best": "high"}, {"generation": 2.5}, {"baseline": []}, {"rollouts": None}):
         with pytest.raises(ValueError, match=f"whose {next(iter(wrong))} is"):
-            Progress.from_dict(values | wrong)
+            GenerationStats.from_dict(values | wrong)
     del values["best"], values["workers"]
     with pytest.raises(ValueError, match="without best, workers"):
-        Progress.from_dict(values)
+        GenerationStats.from_dict(values)

@@ -7,9 +7,9 @@ import pytest
 
 from farm.errors import ConfigError
 from farm.net import codec
-from farm.net.jobs import Job
+from farm.net.work import Job
 from farm.net.messages import Spec
-from farm.net.results import Result, Results, WireTrajectory
+from farm.net.work import Result, Results, WireTrajectory
 from farm.policies.fourier import Features, PolicyConfig
 from farm.tasks import TASKS
 from farm.tasks.finger_gait import touch as tactile

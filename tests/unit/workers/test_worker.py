@@ -17,9 +17,9 @@ import pytest
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.net import codec, keys
-from farm.net.jobs import Chunk, Generation, Job, Jobs
-from farm.net.messages import Spec, Want
-from farm.net.results import Failure, Result, Results
+from farm.net.work import Chunk, RoundHeader, Job, Jobs
+from farm.net.messages import Spec, WorkRequest
+from farm.net.work import Failure, Result, Results
 from farm.net.session import Session, connect, listen
 from farm.tasks.finger_gait.task import TaskConfig
 from learner.run import free_endpoint
@@ -79,7 +79,7 @@ class Learner:
             )  # fmt: skip
         )
         digest = hashlib.sha256(self.spec).hexdigest()
-        self.header = Generation(
+        self.header = RoundHeader(
             run=run,
             incarnation="first",
             round=2,
@@ -144,7 +144,7 @@ class Stage:
                 continue
             if event.topic == "worker":
                 return keys.tail(event.key, keys.worker_token(FARM, "")), event.alive
-            return event.topic, codec.decode(event.payload, kind or (Want if event.topic == "want" else Results))
+            return event.topic, codec.decode(event.payload, kind or (WorkRequest if event.topic == "want" else Results))
 
     def results(self, *runs: str) -> Results:
         _, said = self.next(*(f"result of {run}" for run in runs or ("r",)))
@@ -204,7 +204,7 @@ def test_it_says_what_it_wants(stage: Stage) -> None:
     Learner(stage.session, "r")
     worker = stage.hire()
     _, want = stage.next("want")
-    assert isinstance(want, Want)
+    assert isinstance(want, WorkRequest)
     assert (want.worker, want.credits, want.idle) == (worker.id, 2 * Backend.capacity, ())
 
 
@@ -287,7 +287,7 @@ def test_an_idle_worker_says_so(stage: Stage, monkeypatch: pytest.MonkeyPatch) -
     Learner(stage.session, "r")
     stage.hire()
     said = [stage.next("want")[1] for _ in range(3)]
-    assert [want.idle for want in said if isinstance(want, Want)] == [(), ("r",), ("r",)]
+    assert [want.idle for want in said if isinstance(want, WorkRequest)] == [(), ("r",), ("r",)]
 
 
 def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
@@ -305,7 +305,7 @@ def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
         while len(stage.session.events):
             event = stage.session.events.get()
             if event.topic == "want":
-                idle.update(codec.decode(event.payload, Want).idle)
+                idle.update(codec.decode(event.payload, WorkRequest).idle)
 
 
 def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
@@ -316,12 +316,12 @@ def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
     said: list[object] = []
     while len(said) < 2:
         _, message = stage.next("result of r", "want")
-        if not isinstance(message, Want) or message.credits == 0:
+        if not isinstance(message, WorkRequest) or message.credits == 0:
             said.append(message)
-    said.sort(key=lambda message: isinstance(message, Want))
+    said.sort(key=lambda message: isinstance(message, WorkRequest))
     done, want = said
     assert isinstance(done, Results)
-    assert isinstance(want, Want)
+    assert isinstance(want, WorkRequest)
     assert indices(done) == [0], "what it has begun is done"
     assert want.idle == ("r",)
 
@@ -399,7 +399,7 @@ def test_messages_it_cannot_read(
             b"\xc1",
             newer,
             codec.encode(replace(learner.header, run="a//b")),
-            codec.encode(Want(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)),
+            codec.encode(WorkRequest(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)),
         ):
             stage.session.publish(key, payload)
     learner.announce()
@@ -441,7 +441,7 @@ def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(workers, "IDLE", 0.0)
     while True:
         _, want = stage.next("want")
-        assert isinstance(want, Want)
+        assert isinstance(want, WorkRequest)
         if want.ignored == {"large": 14}:
             break
 

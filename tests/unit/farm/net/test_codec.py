@@ -15,9 +15,9 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import MessageError
 from farm.net import codec
 from farm.net.codec import array
-from farm.net.jobs import Chunk, Generation, Job
-from farm.net.messages import Spec, Want
-from farm.net.results import Result
+from farm.net.work import Chunk, RoundHeader, Job
+from farm.net.messages import Spec, WorkRequest
+from farm.net.work import Result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,7 +407,7 @@ def test_bombs_take_no_memory(payload):
 
 # ---------------------------------------------------------------- any bytes
 
-KINDS = [Sample, Inner, Want, Spec, Generation, Job, Chunk, Result]
+KINDS = [Sample, Inner, WorkRequest, Spec, RoundHeader, Job, Chunk, Result]
 
 wild = st.recursive(
     st.none()

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from farm.errors import MessageError
 from farm.net import codec
-from farm.net.jobs import RATES, Chunk, Generation, Job, Jobs
-from farm.net.messages import Refusal, Spec, Want
-from farm.net.results import Failure, Result, Results, WireTrajectory, traced
+from farm.net.work import RATES, Chunk, RoundHeader, Job, Jobs
+from farm.net.messages import Refusal, Spec, WorkRequest
+from farm.net.work import Failure, Result, Results, WireTrajectory, traced
 from farm.net.telemetry import Line, RunEnd, RunHistory, RunReport, RunStatus, Trace, WorkerStatus
 from farm.sim.trajectory import Trajectory
 
@@ -127,8 +127,8 @@ MESSAGES = {
             ),
         ),
     ),  # fmt: skip
-    "want": Want(worker="host/a1", credits=64, idle=(), version="0.1.0", assets="a", canary="c", host="h", cores=2),
-    "want nothing": Want(
+    "want": WorkRequest(worker="host/a1", credits=64, idle=(), version="0.1.0", assets="a", canary="c", host="h", cores=2),
+    "want nothing": WorkRequest(
         worker="host/a1", credits=0, idle=("run-1", "second"), version="", assets="a", canary="c", host="h", cores=2
     ),
     "spec": Spec(
@@ -147,7 +147,7 @@ MESSAGES = {
         frequencies=np.zeros((0, 8)),
         phases=np.zeros(0),
     ),
-    "generation": Generation(**HEAD, generation=6, spec="0f" * 32, traces="all", mu=RNG.normal(size=64)),
+    "generation": RoundHeader(**HEAD, generation=6, spec="0f" * 32, traces="all", mu=RNG.normal(size=64)),
     "job": job(),
     "job of one nominal rollout": job(signs=(1,), perturbation=None, rate="physics", origin="zero"),
     "job of the mean": job(signs=(1,), eps=np.zeros(0), rate="control", perturbation=None),

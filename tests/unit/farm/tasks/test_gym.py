@@ -12,9 +12,9 @@ from farm import seeds as randomness
 from farm import tasks
 from farm.errors import ConfigError
 from farm.net import codec
-from farm.net.jobs import Job
+from farm.net.work import Job
 from farm.net.messages import Spec
-from farm.net.results import Result, Results
+from farm.net.work import Result, Results
 from farm.policies.fourier import Features, Policy, PolicyConfig
 from farm.tasks.finger_gait.rewards import RETURN_FLOOR
 from farm.tasks.finger_gait.task import TaskConfig

@@ -20,7 +20,7 @@ from rerun.chunk import RrdReader
 
 from farm.arrays import AnyArray
 from farm.errors import ConfigError
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 from farm.sim import scene as scenes
 from farm.sim.scene import Geometry, Scene
 from farm.sim.trajectory import Trajectory
@@ -54,7 +54,7 @@ def start(tmp_path: Path, scene: Scene) -> Start:
     return begin
 
 
-def progress(generation: int = 1) -> Progress:
+def progress(generation: int = 1) -> GenerationStats:
     numbers: dict[str, Any] = {
         "generation": generation,
         "rollouts": 30 * generation,
@@ -78,7 +78,7 @@ def progress(generation: int = 1) -> Progress:
         "workers": 3,
         "seconds": 1.0,
     }
-    return Progress(**numbers)
+    return GenerationStats(**numbers)
 
 
 def rollout(scene: Scene, frames: int = STEPS + 1, step: float = 0.1) -> Trajectory:
@@ -463,14 +463,14 @@ class Slow:
 
     def __init__(self, fails: Exception | None = None) -> None:
         self.go = threading.Event()
-        self.generations: list[tuple[Progress, Trajectory | None, Mapping[str, AnyArray], float]] = []
+        self.generations: list[tuple[GenerationStats, Trajectory | None, Mapping[str, AnyArray], float]] = []
         self.lines: list[tuple[str, str]] = []
         self.settled = threading.Event()
         self.closed = False
         self.fails = fails
 
     def generation(
-        self, progress: Progress, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
+        self, progress: GenerationStats, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
     ) -> None:
         self.go.wait()
         if self.fails:

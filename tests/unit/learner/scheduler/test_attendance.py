@@ -3,13 +3,13 @@
 import pytest
 
 from farm.errors import MessageError
-from farm.net.messages import Want
+from farm.net.messages import WorkRequest
 from learner.scheduler import attendance
 from learner.scheduler.attendance import Attendance
 
 
-def want(worker: str, credits: int = 4) -> Want:
-    return Want(worker=worker, credits=credits, idle=(), version="7", assets="a", canary="c", host="h", cores=2)
+def want(worker: str, credits: int = 4) -> WorkRequest:
+    return WorkRequest(worker=worker, credits=credits, idle=(), version="7", assets="a", canary="c", host="h", cores=2)
 
 
 def test_who_has_a_token_is_there_until_it_goes() -> None:

@@ -14,16 +14,16 @@ import pytest
 
 from farm.errors import RunError
 from farm.net import codec, keys
-from farm.net.jobs import Chunk, Generation, Job, Jobs
-from farm.net.messages import Refusal, Spec, Want
-from farm.net.results import Failure, Result, Results, WireTrajectory
+from farm.net.work import Chunk, RoundHeader, Job, Jobs
+from farm.net.messages import Refusal, Spec, WorkRequest
+from farm.net.work import Failure, Result, Results, WireTrajectory
 from farm.net.session import Session, connect, listen
 from learner.run import free_endpoint
 from learner.scheduler import attendance
 from learner.scheduler import dispatcher as dispatchers
 from learner.scheduler.admission import Admission
 from learner.scheduler.dispatcher import Dispatcher, Stopped
-from learner.scheduler.scheduler import LedgerConfig
+from learner.scheduler.scheduler import SchedulerConfig
 
 FARM, RUN, STEPS = "try", "r", 3
 SPEC = Spec(
@@ -32,9 +32,9 @@ SPEC = Spec(
 )  # fmt: skip
 SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
 NEWER = codec.encode(
-    Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2), codec.SCHEMA + 1
+    WorkRequest(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2), codec.SCHEMA + 1
 )
-PATIENT = LedgerConfig(straggler_seconds=60.0)
+PATIENT = SchedulerConfig(straggler_seconds=60.0)
 WAIT = 20.0
 
 
@@ -77,7 +77,7 @@ class Worker:
     def want(self, credits: int, *, idle: bool = False) -> None:
         self.say(
             keys.want(FARM, self.name),
-            Want(
+            WorkRequest(
                 worker=self.name,
                 credits=credits,
                 idle=(RUN,) if idle else (),
@@ -117,7 +117,7 @@ class Learner:
         self.session, self.stop = session, threading.Event()
         self._pool = ThreadPoolExecutor(1)
 
-    def show(self, ledger: LedgerConfig = PATIENT, stopped: Callable[[], bool] | None = None) -> Dispatcher:
+    def show(self, ledger: SchedulerConfig = PATIENT, stopped: Callable[[], bool] | None = None) -> Dispatcher:
         join = "farm worker --connect here"
         self.farm = Dispatcher(
             self.session, FARM, SPEC, 9, join, stopped or self.stop.is_set, Admission("a", None), SHAPES, ledger
@@ -178,11 +178,11 @@ def test_a_round_is_announced(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
     farm.begin(7, np.array([1.0, 2.0]), Jobs.of(jobs(1)), "all")
-    said = codec.decode(worker.next("generation"), Generation)
+    said = codec.decode(worker.next("generation"), RoundHeader)
     assert (said.run, said.round, said.generation, said.mu.tolist(), said.traces) == (RUN, 1, 7, [1, 2], "all")
     asked = worker.session.ask(keys.generation(FARM, RUN), WAIT)
     assert asked is not None
-    assert codec.decode(asked, Generation).incarnation == said.incarnation
+    assert codec.decode(asked, RoundHeader).incarnation == said.incarnation
     assert worker.session.ask(keys.spec(FARM, RUN), WAIT) == codec.encode(SPEC)
 
 
@@ -231,7 +231,7 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
         b"",
         b"\xc1",
         NEWER,
-        Want(worker="b/1", credits=50, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
+        WorkRequest(worker="b/1", credits=50, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
     ):
         worker.say(inbox, nonsense)
     worker.want(1)
@@ -244,7 +244,7 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
         worker.results(first, result(0, steps=2)), worker.results(first, result(4)),
         replace(honest, run="other"), replace(honest, worker="b/1"),
         replace(honest, round=0), replace(honest, incarnation="0" * 16),
-        Want(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
+        WorkRequest(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
         Failure(run=RUN, incarnation=first.incarnation, round=first.round, worker="a/1", index=99, error="no"),
         Failure(run=RUN, incarnation="gone", round=first.round, worker="a/1", index=0, error="no"),
     ]  # fmt: skip
@@ -278,7 +278,7 @@ def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pyt
     farm = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(30))
-    nobody = Want(worker="", credits=9, idle=(), version="0", assets="a", canary="c", host="h", cores=2)
+    nobody = WorkRequest(worker="", credits=9, idle=(), version="0", assets="a", canary="c", host="h", cores=2)
     for i in range(3000):
         worker.say(keys.want(FARM, f"nobody/{i}"), replace(nobody, worker=f"nobody/{i}"))
     worker.want(10)
@@ -384,7 +384,7 @@ def test_a_worker_that_lost_its_jobs(learner: Learner, hire: Hire) -> None:
 
 
 def test_a_slow_worker_is_helped(learner: Learner, hire: Hire) -> None:
-    farm = learner.show(LedgerConfig(straggler_seconds=0.1))
+    farm = learner.show(SchedulerConfig(straggler_seconds=0.1))
     slow, fast = hire("a/1"), hire("b/1")
     slow.want(1)
     collected = learner.collect(jobs(2))
@@ -479,7 +479,7 @@ def test_another_release_hears_why_it_gets_nothing(
     with monkeypatch.context() as newer:
         newer.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
         said = codec.encode(
-            Want(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
+            WorkRequest(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
         )
     other.say(keys.want(FARM, "a/1"), said)
     assert "run the same release on both" in codec.decode(other.next("refused"), Refusal).reason
@@ -494,7 +494,7 @@ def test_numbers_of_a_worker_that_did_nothing_bind_nobody(endpoint: str, learner
     worker = hire("b/1")
     with connect((endpoint,), WAIT, lambda: False) as session:
         odd = Worker(session, "a/1")
-        want = Want(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="odd", host="h", cores=2)
+        want = WorkRequest(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="odd", host="h", cores=2)
         collected = learner.collect(jobs(2))
         odd.say(keys.want(FARM, "a/1"), want)
         odd.chunk()
@@ -514,7 +514,7 @@ def test_patterns_are_nobodys_name(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     collected = learner.collect(jobs(1))
     for name in ("**", "*/*", "a/**"):
-        want = Want(worker=name, credits=1, idle=(), version="0", assets="b", canary="c", host="h", cores=2)
+        want = WorkRequest(worker=name, credits=1, idle=(), version="0", assets="b", canary="c", host="h", cores=2)
         worker.say(keys.want(FARM, name), want)
     worker.want(1)
     worker.work(1)

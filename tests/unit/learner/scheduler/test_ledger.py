@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import pytest
 
-from learner.scheduler.scheduler import Assignment, Ledger, LedgerConfig
+from learner.scheduler.scheduler import Assignment, Scheduler, SchedulerConfig
 
 
 def started(jobs, workers=(), *, credits=4, seconds=None, **config):
     """Return a ledger in a round of `jobs`; `seconds` a job are known from a round before."""
-    ledger = Ledger(LedgerConfig(**{"chunk_seconds": 0.08, **config}))
+    ledger = Scheduler(SchedulerConfig(**{"chunk_seconds": 0.08, **config}))
     if seconds is not None:
         ledger.begin(1)
         ledger.want("teacher", 1, now=-seconds)
@@ -47,7 +47,7 @@ def test_a_round_from_begin_to_complete():
 
 
 def test_before_any_round_there_is_nothing():
-    ledger = Ledger(LedgerConfig())
+    ledger = Scheduler(SchedulerConfig())
     ledger.want("a", 4, 0.0)
     assert not ledger.complete
     assert ledger.assign(0.0) == []
@@ -399,4 +399,4 @@ def test_credits_and_jobs_must_not_be_negative():
 )
 def test_a_wrong_setting_is_named(name, value):
     with pytest.raises(ValueError, match=f"{name} is {value!r}, expected"):
-        LedgerConfig(**{name: value})
+        SchedulerConfig(**{name: value})

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.scheduler.scheduler import Ledger, LedgerConfig
+from learner.scheduler.scheduler import Scheduler, SchedulerConfig
 
 LEASE = 3.0  # a dead or hung worker's token goes after at most this [s]
 
@@ -37,7 +37,7 @@ class Farm:
     def __init__(self, seed, *, jobs, rounds, loss, config):
         self.random = random.Random(seed)
         self.config, self.loss = config, loss
-        self.ledger = Ledger(config)
+        self.ledger = Scheduler(config)
         self.now, self.order, self.events = 0.0, itertools.count(), []
         self.workers, self.live = {}, set()
         self.jobs, self.rounds, self.round = jobs, rounds, 0
@@ -180,7 +180,7 @@ class Farm:
 
 
 CONFIGS = st.builds(
-    LedgerConfig,
+    SchedulerConfig,
     copies=st.integers(1, 4),
     straggler_seconds=st.sampled_from((0.2, 1.0)),
     max_errors=st.just(10_000),
@@ -217,7 +217,7 @@ def test_every_job_counts_once_and_every_round_ends(seed, jobs, others, loss, co
 
 
 def test_ten_thousand_jobs_on_a_hundred_workers_are_quick():
-    ledger = Ledger(LedgerConfig())
+    ledger = Scheduler(SchedulerConfig())
     ledger.begin(10_000)
     names = [f"worker-{number:03}" for number in range(100)]
     chunks = []

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from farm.net.jobs import Job, Jobs
-from farm.net.results import Result, Results, WireTrajectory
-from learner.scheduler.round import Round
+from farm.net.work import Job, Jobs
+from farm.net.work import Result, Results, WireTrajectory
+from learner.scheduler.round import RoundResults
 
 TRACE = (3, 54)
 SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
@@ -35,8 +35,8 @@ def result(index: int) -> Result:
     )  # fmt: skip
 
 
-def begun(traces: str) -> Round:
-    return Round(Jobs.of([job(i) for i in range(PAIRS + 1)]), traces, TRACE, SHAPES)
+def begun(traces: str) -> RoundResults:
+    return RoundResults(Jobs.of([job(i) for i in range(PAIRS + 1)]), traces, TRACE, SHAPES)
 
 
 def message(indices: list[int], traces: str) -> Results:
@@ -68,7 +68,7 @@ def test_other_traces_than_were_wanted_do_not_fit(wanted: str, sent: str) -> Non
 
 
 def test_traces_of_another_length_do_not_fit() -> None:
-    longer = Round(begun("all").jobs, "all", (4, 54), SHAPES)
+    longer = RoundResults(begun("all").jobs, "all", (4, 54), SHAPES)
     assert longer.place(message([0], "all")) is None
     assert longer.place(message([PAIRS], "all")) is not None  # it has none
 

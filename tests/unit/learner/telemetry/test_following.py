@@ -13,15 +13,15 @@ from learner import config as configs
 from learner.config import RunConfig
 from learner.run import free_endpoint
 from learner.telemetry import subscriber as following
-from learner.telemetry.report_log import History
-from learner.telemetry.subscriber import Follower
+from learner.telemetry.report_log import ReportLog
+from learner.telemetry.subscriber import Subscriber
 
 
 class Told:
     """A learner's side: what it published, and what it answers."""
 
     def __init__(self, link: Session) -> None:
-        self.link, self.history = link, History(page=3000)
+        self.link, self.history = link, ReportLog(page=3000)
         self.page = RunHistory(
             run="r", incarnation="one", recording="r", config=configs.to_dict(RunConfig()), generation=0, reports=(),
             end=None,
@@ -57,11 +57,11 @@ class Told:
 
 
 @pytest.fixture
-def told() -> Iterator[tuple[Told, Follower]]:
+def told() -> Iterator[tuple[Told, Subscriber]]:
     endpoint = free_endpoint()
     with session.listen(endpoint, "farm") as link, session.connect((endpoint,), 10, lambda: False) as other:
         learner = Told(link)
-        follower = Follower(other, "farm", "r")
+        follower = Subscriber(other, "farm", "r")
         assert follower.begin(lambda: False) == ("r", RunConfig())
         yield learner, follower
 
@@ -72,7 +72,7 @@ def take(reports: Iterator[RunReport | RunEnd], count: int) -> list[int]:
     ]
 
 
-def test_in_order_and_each_once(told: tuple[Told, Follower]) -> None:
+def test_in_order_and_each_once(told: tuple[Told, Subscriber]) -> None:
     learner, follower = told
     for generation in range(1, 11):
         learner.report(generation, lost=generation <= 6)
@@ -94,7 +94,7 @@ def test_in_order_and_each_once(told: tuple[Told, Follower]) -> None:
     assert next(reports, None) is None
 
 
-def test_from_where_a_file_ends(told: tuple[Told, Follower]) -> None:
+def test_from_where_a_file_ends(told: tuple[Told, Subscriber]) -> None:
     learner, follower = told
     for generation in range(1, 6):
         learner.report(generation, lost=True)
@@ -102,7 +102,7 @@ def test_from_where_a_file_ends(told: tuple[Told, Follower]) -> None:
 
 
 def test_the_last_report_is_lost_and_nothing_follows(
-    told: tuple[Told, Follower], monkeypatch: pytest.MonkeyPatch
+    told: tuple[Told, Subscriber], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learner, follower = told
     monkeypatch.setattr(following, "_QUIET", 0.1)
@@ -114,14 +114,14 @@ def test_the_last_report_is_lost_and_nothing_follows(
     assert learner.asked[-2:] == [2, 2]
 
 
-def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Follower]) -> None:
+def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Subscriber]) -> None:
     learner, follower = told
     for generation in range(1, 6):
         learner.report(generation)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 5) == [1, 2, 3, 4, 5]
     learner.page = replace(learner.page, incarnation="two", generation=3)
-    learner.history = History()
+    learner.history = ReportLog()
     for generation in range(1, 4):
         learner.history.add(RunReport(run="r", incarnation="two", generation=generation, progress={}, rate=1.0))
     for generation in (4, 5, 6, 7):
@@ -129,7 +129,7 @@ def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Follower])
     assert take(reports, 2) == [6, 7]
 
 
-def test_what_a_folder_lost_is_not_waited_for(told: tuple[Told, Follower]) -> None:
+def test_what_a_folder_lost_is_not_waited_for(told: tuple[Told, Subscriber]) -> None:
     learner, follower = told
     learner.page = replace(learner.page, generation=4)
     learner.report(5, lost=True)
@@ -140,26 +140,26 @@ def test_what_a_folder_lost_is_not_waited_for(told: tuple[Told, Follower]) -> No
     assert isinstance(next(reports), RunEnd)
 
 
-def test_another_run_of_the_same_name(told: tuple[Told, Follower]) -> None:
+def test_another_run_of_the_same_name(told: tuple[Told, Subscriber]) -> None:
     learner, follower = told
     learner.report(1)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 1) == [1]
     config = configs.to_dict(RunConfig(seed=5))
     learner.page = replace(learner.page, incarnation="two", generation=0, config=config)
-    learner.history = History()
+    learner.history = ReportLog()
     learner.report(1)
     with pytest.raises(RunError, match="run r began anew: --seed was 0 and is 5"):
         next(reports)
 
 
-def test_a_learner_of_another_version(told: tuple[Told, Follower], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_learner_of_another_version(told: tuple[Told, Subscriber], monkeypatch: pytest.MonkeyPatch) -> None:
     learner, follower = told
     monkeypatch.setattr(learner, "page", replace(learner.page, generation="many"))
     with pytest.raises(RunError, match="the learner of run r cannot be understood: RunHistory.generation"):
         next(follower.follow(0, lambda: False))
 
 
-def test_stopped(told: tuple[Told, Follower]) -> None:
+def test_stopped(told: tuple[Told, Subscriber]) -> None:
     _, follower = told
     assert list(follower.follow(0, lambda: True)) == []

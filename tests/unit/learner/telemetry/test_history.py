@@ -7,7 +7,7 @@ import pytest
 
 from farm.net import codec
 from farm.net.telemetry import RunHistory, RunReport, Trace
-from learner.telemetry.report_log import History
+from learner.telemetry.report_log import ReportLog
 
 TRACE = 15 * 54 * 4  # bytes of one trace
 
@@ -19,14 +19,14 @@ def report(generation: int, rollouts: int = 1) -> RunReport:
     return RunReport(run="r", incarnation="i", generation=generation, progress=progress, rate=1.0, traces=traces)
 
 
-def filled(generations: int, memory: int, page: int) -> History:
-    history = History(memory, page)
+def filled(generations: int, memory: int, page: int) -> ReportLog:
+    history = ReportLog(memory, page)
     for generation in range(1, generations + 1):
         history.add(report(generation))
     return history
 
 
-def read(history: History, begin: int = 1) -> list[list[RunReport]]:
+def read(history: ReportLog, begin: int = 1) -> list[list[RunReport]]:
     """Pages, as a recorder asks for them."""
     pages = []
     while page := history.page(begin):
@@ -60,7 +60,7 @@ def test_one_report_larger_than_everything() -> None:
     history.add(report(4, rollouts=100))
     assert [r.generation for page in read(history) for r in page] == [1, 2, 3, 4]
     assert not history.page(4)[0].traces
-    assert len(History(0, 0).page(1)) == 0
+    assert len(ReportLog(0, 0).page(1)) == 0
 
 
 @pytest.mark.parametrize("begin", [-5, 0, 1])
@@ -69,7 +69,7 @@ def test_from_the_start(begin: int) -> None:
 
 
 def test_generations_that_a_folder_lost() -> None:
-    history = History()
+    history = ReportLog()
     for generation in (1, 2, 7, 8, 9):
         history.add(report(generation, rollouts=0))
     assert [r.generation for r in history.page(3)] == [7, 8, 9]

@@ -1,0 +1,343 @@
+"""Work on its way: rounds and jobs to workers, results back. Arrays all the way; pure; bytes by `farm.net.codec`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.net.codec import array
+from farm.sim.trajectory import Trajectory
+
+RATES: Final = ("none", "control", "physics")
+"""How much of a rollout a job wants to see, besides its figures: nothing, or a trajectory at that rate."""
+
+TRACES: Final = ("none", "extremes", "all")
+"""Traces that results bring: none, of the best and the worst exploring rollout of each message, of all of them.
+
+The best rollout of a round (of equals the first) is the best of the message that brings it: with `extremes` its trace
+is never missed, whichever jobs travel together.
+"""
+
+_LINE: Final = 1000  # characters
+_CHANNELS: Final = 100  # of a trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundHeader:
+    """A round that begins: the mean that its jobs explore around."""
+
+    run: str
+    incarnation: str
+    round: int
+    generation: int
+    spec: str
+    """Digest of the Spec's bytes."""
+    traces: str
+    """Which traces results bring, one of TRACES."""
+    mu: FloatArray = array("<f8", 1)
+    """(P,)"""
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        if self.traces not in TRACES:
+            raise ValueError(f"traces {self.traces[:40]!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jobs:
+    """Jobs as one table. A job is one rollout or a mirrored pair: origin + sign * eps for each of its signs."""
+
+    table: IntArray = array("<i8", 2)
+    """(J, 10): index; whether the origin is the mean (or zero); whether there are eps; place of the rate in RATES;
+    two signs, the second 0 for a single rollout; four words of the rollouts' seed, -1 for nominal conditions"""
+    eps: FloatArray = array("<f8", 2)
+    """Of those jobs that have some, one after the other (K, P)"""
+
+    @staticmethod
+    def exploring(eps: FloatArray, signs: tuple[int, ...], seeds: Sequence[tuple[int, ...]] | None) -> "Jobs":
+        """Jobs around the mean.
+
+        Args:
+          eps: (N, P).
+          signs: of each.
+          seeds: N of four words; None for nominal conditions.
+        """
+        table = _table(len(eps), around=True, explores=True, rate="none", signs=signs)
+        if seeds is not None:
+            table[:, _SEED] = np.array(seeds, dtype="<i8").reshape(len(eps), 4)
+        return Jobs(table=table, eps=eps)
+
+    @staticmethod
+    def mean(rate: str, seeds: Sequence[tuple[int, ...] | None]) -> "Jobs":
+        """Rollouts of the mean itself, one for each seed (None: nominal conditions)."""
+        table = _table(len(seeds), around=True, explores=False, rate=rate, signs=(1,))
+        table[:, _SEED] = np.array([_NOMINAL if seed is None else seed for seed in seeds], dtype="<i8").reshape(-1, 4)
+        return Jobs(table=table, eps=np.empty((0, 0)))
+
+    @staticmethod
+    def single(theta: FloatArray, rate: str, seed: tuple[int, ...] | None) -> "Jobs":
+        """One rollout of parameters (P,)."""
+        table = _table(1, around=False, explores=True, rate=rate, signs=(1,))
+        table[:, _SEED] = _NOMINAL if seed is None else seed
+        return Jobs(table=table, eps=theta[None])
+
+    @staticmethod
+    def joined(parts: Sequence["Jobs"]) -> "Jobs":
+        """Jobs behind each other, with the indices 0, 1, ..."""
+        table = np.concatenate([part.table for part in parts])
+        table[:, _INDEX] = np.arange(len(table))
+        eps = [part.eps for part in parts if part.eps.size]
+        return Jobs(table=table, eps=np.concatenate(eps) if len(eps) > 1 else (*eps, np.empty((0, 0)))[0])
+
+    def __len__(self) -> int:
+        """How many jobs."""
+        return len(self.table)
+
+    @property
+    def indices(self) -> IntArray:
+        """Of each job, (J,)."""
+        return self.table[:, _INDEX]
+
+    @property
+    def rollouts(self) -> IntArray:
+        """How many each job has, (J,)."""
+        return np.count_nonzero(self.table[:, _SIGN], axis=1)
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which jobs want a trajectory, (J,)."""
+        return self.table[:, _RATE] != RATES.index("none")
+
+    @property
+    def physics(self) -> BoolArray:
+        """Which jobs want it at physics rate, (J,)."""
+        return self.table[:, _RATE] == RATES.index("physics")
+
+    def seeds(self) -> list[tuple[int, ...] | None]:
+        """Of each rollout, S; None for nominal conditions."""
+        words = [None if seed[0] < 0 else tuple(seed) for seed in self.table[:, _SEED].tolist()]
+        return [seed for seed, count in zip(words, self.rollouts.tolist(), strict=True) for _ in range(count)]
+
+    def theta(self, mu: FloatArray) -> FloatArray:
+        """Parameters of each rollout around a mean (P,): origin + sign * eps, (S, P)."""
+        origin = np.where(self.table[:, _AROUND, None] != 0, mu, 0.0)
+        rows = np.repeat(np.arange(len(self)), self.rollouts)
+        signs = self.table[:, _SIGN][self.table[:, _SIGN] != 0]
+        out = origin[rows]
+        explores = self.table[rows, _EXPLORES] != 0
+        at = np.cumsum(self.table[:, _EXPLORES]) - 1  # of each job's eps
+        out[explores] += signs[explores, None] * self.eps[at[rows[explores]]]
+        return out
+
+    def take(self, chosen: Sequence[int]) -> "Jobs":
+        """Some of these jobs, by their places here; views where they lie side by side."""
+        first, end = chosen[0], chosen[-1] + 1
+        if list(chosen) == list(range(first, end)):
+            return Jobs(table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]])
+        table, before = self.table[list(chosen)], np.array([self._before[at] for at in chosen])
+        return Jobs(table=table, eps=self.eps[before[table[:, _EXPLORES] != 0]])
+
+    @cached_property
+    def _before(self) -> list[int]:
+        """How many rows of eps come before each job's, and how many there are, J + 1."""
+        return [0, *np.cumsum(self.table[:, _EXPLORES]).tolist()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk(Jobs):
+    """Jobs for one worker."""
+
+    run: str
+    incarnation: str
+    round: int
+
+    def __post_init__(self) -> None:
+        """Check that there are such jobs."""
+        table, seeds = self.table, self.table[:, _SEED]
+        if not table.size or table.shape[1] != _COLUMNS:
+            raise ValueError(f"jobs in a table of shape {table.shape}")
+        if (table < _LEAST).any() or (table > _MOST).any() or not table[:, _FIRST].all():
+            raise ValueError("jobs out of range")
+        if len(set(self.indices.tolist())) < len(self):
+            raise ValueError("a job twice")
+        nominal = seeds < 0
+        if nominal.any() and (nominal.any(axis=1) != nominal.all(axis=1)).any():
+            raise ValueError("half a seed")
+        if len(self.eps) != table[:, _EXPLORES].sum():
+            raise ValueError(f"{len(self.eps)} rows of eps of {table[:, _EXPLORES].sum()} jobs")
+
+    @classmethod
+    def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
+        """At least one job, ready to send."""
+        return cls(run=run, incarnation=incarnation, round=round, table=jobs.table, eps=jobs.eps)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What jobs gave: S rollouts, in the jobs' order."""
+
+    returns: FloatArray
+    """(S,)"""
+    flags: BoolArray
+    """success, ended, failed, clamped, (S, 4)"""
+    traces: AnyArray
+    """Of those rollouts that `traced` names, float32, (K, T, N)"""
+    trajectories: "tuple[WireTrajectory, ...]"
+    """Of the jobs that are seen, in their order: of the first rollout of each"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What a chunk gave, worker to learner: one array of each kind over the rollouts of all its jobs.
+
+    How many rollouts a job has, and which have a trajectory or a trace, the receiver derives from the jobs it issued
+    (`traced`). A map for each job would take the learner ten times as long to read.
+    """
+
+    run: str
+    incarnation: str
+    round: int
+    worker: str
+    trajectories: "tuple[WireTrajectory, ...]"
+    """Of the jobs that are seen, in their order."""
+    jobs: IntArray = array("<i8", 1)
+    """Indices, rising (J,)"""
+    returns: FloatArray = array("<f8", 1)
+    """(S,)"""
+    flags: BoolArray = array("|b1", 2)
+    """success, ended, failed, clamped, (S, 4)"""
+    traces: AnyArray = array("<f4", 3)
+    """Traces that are wanted, (K, T, N)"""
+
+    def __post_init__(self) -> None:
+        """Check that all speak of as many rollouts, at least one a job."""
+        if not 1 <= len(self.jobs) <= len(self.returns):
+            raise ValueError(f"{len(self.jobs)} jobs of {len(self.returns)} rollouts")
+        jobs = self.jobs.tolist()
+        if jobs != sorted(set(jobs)):
+            raise ValueError("jobs that do not rise")
+        if self.flags.shape != (len(self.returns), 4):
+            raise ValueError(f"flags of shape {self.flags.shape} of {len(self.returns)} rollouts")
+
+    @classmethod
+    def carrying(
+        cls, given: Simulated, jobs: Jobs, *, run: str, incarnation: str, round: int, worker: str
+    ) -> "Results":
+        """What jobs gave, ready to send; the jobs' indices rise."""
+        return cls(
+            run=run, incarnation=incarnation, round=round, worker=worker, jobs=np.ascontiguousarray(jobs.indices),
+            returns=given.returns, flags=given.flags, traces=given.traces, trajectories=given.trajectories,
+        )  # fmt: skip
+
+
+def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
+    """Which rollouts of a message have a trace, rising (K,).
+
+    Args:
+      traces: one of TRACES.
+      returns: (S,).
+      exploring: which are of jobs that have no trajectory and so explore, (S,).
+    """
+    among = np.flatnonzero(exploring)
+    if traces == "all":
+        return among
+    if traces == "none" or not among.size:
+        return among[:0]
+    theirs = returns[among]
+    return among[sorted({int(theirs.argmax()), int(theirs.argmin())})]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A job that could not be run: an exception, not a bad rollout. Or a worker that does not serve the run at all."""
+
+    run: str
+    incarnation: str
+    round: int
+    worker: str
+    index: int | None
+    """None where it is not the job: no job of this run can be run there."""
+    error: str
+    """One line."""
+
+    def __post_init__(self) -> None:
+        """Check that it can be shown."""
+        if len(self.error) > _LINE or not self.error.isprintable():
+            raise ValueError(f"an error of more than {_LINE} characters, or unprintable ones")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WireTrajectory:
+    """A Trajectory on its way; float32 but for times and figures."""
+
+    value: float
+    success: bool | None
+    channels: dict[str, Any]
+    """Arrays (F, ...) by channel."""
+    times: FloatArray = array("<f8", 1)
+    bodies: AnyArray = array("<f4", 3)
+    actions: AnyArray = array("<f4", 2)
+    terms: AnyArray = array("<f4", 2)
+
+    def __post_init__(self) -> None:
+        """Check that all have as many frames, at rising times; how wide each is, the run's task says."""
+        if not len(self.times) or self.times[0] != 0.0 or (np.diff(self.times) <= 0.0).any():
+            raise ValueError(f"{len(self.times)} frames that do not begin at 0 and rise")
+        if len(self.channels) > _CHANNELS:
+            raise ValueError(f"{len(self.channels)} channels")
+        for name, values in self._arrays().items():
+            if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f4"):
+                raise ValueError(f"{str(name)[:40]} that is no array of float32")
+            if not values.ndim or values.shape[0] != len(self.times) or not np.isfinite(values).all():
+                raise ValueError(f"{str(name)[:40]} of shape {values.shape} in {len(self.times)} frames, or not finite")
+
+    def _arrays(self) -> dict[str, AnyArray]:
+        own = {"bodies": self.bodies, "actions": self.actions, "terms": self.terms}
+        return own | {f"channels/{name}": values for name, values in self.channels.items()}
+
+    def fits(self, shapes: Mapping[str, tuple[int, ...]]) -> bool:
+        """Whether there are just these arrays, and a frame of each has its shape."""
+        return {name: values.shape[1:] for name, values in self._arrays().items()} == dict(shapes)
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> "WireTrajectory":
+        """Make ready to send."""
+        return cls(
+            value=trajectory.value, success=trajectory.success, times=trajectory.times,
+            bodies=_shrunk(trajectory.bodies), actions=_shrunk(trajectory.actions), terms=_shrunk(trajectory.terms),
+            channels={name: _shrunk(values) for name, values in trajectory.channels.items()},
+        )  # fmt: skip
+
+    def trajectory(self) -> Trajectory:
+        """As it was, to float32's precision."""
+        return Trajectory(
+            times=self.times, bodies=self.bodies.astype(float), actions=self.actions.astype(float),
+            terms=self.terms.astype(float), value=self.value, success=self.success,
+            channels={name: values.astype(float) for name, values in self.channels.items()},
+        )  # fmt: skip
+
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays [bytes]."""
+        return self.times.nbytes + sum(values.nbytes for values in self._arrays().values())
+
+
+def _shrunk(values: FloatArray) -> AnyArray:
+    return np.clip(np.nan_to_num(values, nan=-1e30), -1e30, 1e30).astype("<f4")
+
+
+def _table(count: int, *, around: bool, explores: bool, rate: str, signs: tuple[int, ...]) -> IntArray:
+    table = np.empty((count, _COLUMNS), dtype="<i8")
+    table[:] = (0, around, explores, RATES.index(rate), *(*signs, 0)[:2], *_NOMINAL)
+    table[:, _INDEX] = np.arange(count)
+    return table
+
+
+_COLUMNS: Final = 10
+_INDEX, _AROUND, _EXPLORES, _RATE, _FIRST, _SIGN, _SEED = 0, 1, 2, 3, 4, slice(4, 6), slice(6, 10)
+_LEAST: Final = np.array([0, 0, 0, 0, -1, -1, -1, -1, -1, -1])
+_MOST: Final = np.array([2**31 - 1, 1, 1, len(RATES) - 1, 1, 1, *[2**32 - 1] * 4])
+_NOMINAL: Final = (-1, -1, -1, -1)

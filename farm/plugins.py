@@ -1,0 +1,283 @@
+"""One look-up for tasks, policies, algorithms, backends and commands: built in, installed packages, files.
+
+    finger-gait            built in: a line in BUILT_IN
+    my-task                an installed package: an entry point of the group `rolloutfarm.tasks`
+    pendulum.py:Pendulum   a class in a file, named by its path
+"""
+
+import ast
+import hashlib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Final
+
+from farm.errors import ConfigError, UnservedError
+
+BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
+    "tasks": {
+        "finger-gait": "farm.tasks.finger_gait.task:FingerGait",
+        "gym": "farm.tasks.gymnasium:Environment",
+    },
+    "policies": {
+        "direct": "farm.policies.fourier:Direct",
+        "projected": "farm.policies.fourier:Projected",
+        "kernel": "farm.policies.fourier:Kernel",
+        "cosine": "farm.policies.fourier:Cosine",
+    },
+    "algorithms": {
+        "pgpe": "learner.algorithms.pgpe:PGPE",
+    },
+    "backends": {
+        "cpu": "workers.backends.cpu:CpuBackend",
+    },
+    "commands": {
+        "run": "learner.commands.run:main",
+        "learner": "learner.commands.learner:main",
+        "worker": "workers.command:main",
+        "tasks": "learner.commands.tasks:main",
+        "check": "learner.commands.check:main",
+        "new-task": "learner.commands.new_task:main",
+        "evaluate": "learner.commands.evaluate:main",
+        "replay": "learner.commands.replay:main",
+        "compare": "learner.commands.compare:main",
+        "play": "learner.commands.play:main",
+        "export": "learner.commands.export:main",
+        "sweep": "learner.commands.sweep:main",
+        "record": "learner.commands.record:main",
+        "view": "learner.commands.view:main",
+        "runs": "learner.commands.runs:main",
+        "status": "farm.commands.status:main",
+        "router": "farm.commands.router:main",
+        "certificates": "farm.commands.certificates:main",
+    },
+}
+"""Kinds of plug-ins, and the built-in ones by name. Strings, because nothing in farm/ imports a learner or worker."""
+
+_MODULES: Final = "rolloutfarm_file_"  # prefix of the modules that files become
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A class and where it is from."""
+
+    kind: str
+    """One of BUILT_IN's."""
+    name: str
+    """By which it is chosen; of a file its path, the class behind a colon."""
+    target: Any
+    """The class; of a command a function."""
+    variant: str = ""
+    """What stands behind the colon of a name that is many: `Swimmer-v5` of `gym:Swimmer-v5`."""
+    release: str = ""
+    """Package and version that it comes from; empty for the farm's own and for files."""
+    file: Path | None = None
+    """The file that it comes from, if it is from a file."""
+
+    @property
+    def wire(self) -> str:
+        """Its name as others know it: a file without its folder."""
+        return self.name if self.file is None else f"{self.file.name}:{self.target.__name__}"
+
+    @property
+    def origin(self) -> str:
+        """Where it is from, for people."""
+        return str(self.file) if self.file else self.release or "built in"
+
+    def digest(self) -> str:
+        """SHA-256 of its code: its file, or its module and all that this imports from the same package."""
+        if self.file is not None:
+            return hashlib.sha256(self.file.read_bytes()).hexdigest()
+        return code_digest(self.target.__module__)
+
+
+def names(kind: str) -> dict[str, str]:
+    """Names of a kind that can be chosen, and where each is from; a file can be chosen as well."""
+    found = dict.fromkeys(BUILT_IN[kind], "built in")
+    for point in _points(kind):
+        if point.name not in found:
+            found[point.name] = _release(point)
+    return found
+
+
+def find(kind: str, name: str) -> Plugin:
+    """The plug-in of that name.
+
+    Raises:
+      ConfigError: there is none (says which there are), or it cannot be imported (says why).
+    """
+    path, _, inside = name.rpartition(":")
+    if path.endswith(".py"):
+        return _from_file(kind, Path(path), inside)
+    own, _, variant = name.partition(":")
+    if own in BUILT_IN[kind]:
+        module, _, attribute = BUILT_IN[kind][own].partition(":")
+        found = Plugin(kind, name, getattr(_import(module, kind, own), attribute), variant)
+    else:
+        found = _from_package(kind, own, variant)
+    takes = getattr(found.target, "takes", "")
+    if bool(takes) != bool(variant):
+        raise ConfigError(f"{_one(kind)} {name[:80]!r}: expected {own}{f':{takes}' if takes else ''}")
+    return found
+
+
+def _from_package(kind: str, own: str, variant: str) -> Plugin:
+    for point in _points(kind):
+        if point.name == own:
+            try:
+                target = point.load()
+            except Exception as error:  # whatever an import may raise
+                raise ConfigError(
+                    f"{_one(kind)} {own!r} of {_release(point)} cannot be imported: {type(error).__name__}: {error}"
+                ) from error
+            return Plugin(kind, f"{own}:{variant}" if variant else own, target, variant, _release(point))
+    known = ", ".join(names(kind))
+    files = "" if kind == "commands" else ", or FILE.py:CLASS"
+    raise ConfigError(f"unknown {_one(kind)} {own[:80]!r}; known are {known}{files}")
+
+
+def _from_file(kind: str, path: Path, inside: str) -> Plugin:
+    module = _file_module(path.resolve(), kind)
+    target = getattr(module, inside, None)
+    if not isinstance(target, type):
+        known = [name for name, value in vars(module).items() if _own_class(value, module.__name__)]
+        raise ConfigError(f"{path} has no class {inside!r}; it has {', '.join(known) or 'none'}")
+    return Plugin(kind, f"{path.resolve()}:{inside}", target, file=path.resolve())
+
+
+def _own_class(value: object, module: str) -> bool:
+    return isinstance(value, type) and value.__module__ == module
+
+
+@cache
+def _file_module(path: Path, kind: str) -> Any:  # noqa: ANN401  a module
+    """Import a file; the folder it lies in is on no path, so that it can shadow nothing."""
+    if not path.is_file():
+        raise ConfigError(f"{_one(kind)} {path}: there is no such file")
+    name = _MODULES + hashlib.sha256(str(path).encode()).hexdigest()[:12]
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look for their annotations there
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the file may raise; its own traceback says where
+        del sys.modules[name]
+        raise ConfigError(f"{path} cannot be imported: {_where(error, path)}") from error
+    return module
+
+
+def _where(error: Exception, path: Path) -> str:
+    """An error and its line in a file."""
+    if isinstance(error, SyntaxError) and error.lineno:
+        return f"line {error.lineno}: {error.msg}"
+    lines, trace = [], error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(path):
+            lines.append(trace.tb_lineno)
+        trace = trace.tb_next
+    place = f"line {lines[-1]}: " if lines else ""
+    return f"{place}{type(error).__name__}: {error}"
+
+
+def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:
+    """A class from a file that somebody else named, if this machine was told to serve that file.
+
+    Args:
+      kind: of the plug-in.
+      wire: NAME.py:CLASS.
+      digest: of the file's bytes, as the other side has it.
+      files: those that may be served.
+
+    Raises:
+      UnservedError: none is allowed, or the one that is differs.
+    """
+    name, _, inside = wire.rpartition(":")
+    for path in files:
+        if path.name == name:
+            if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+                raise UnservedError(f"{path} differs from the learner's {name}: copy the learner's file there")
+            return _from_file(kind, path, inside)
+    raise UnservedError(f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file {name}")
+
+
+@cache
+def code_digest(module: str) -> str:
+    """SHA-256 of a module's source and of all that it imports from its own top-level package, by module name."""
+    said = hashlib.sha256()
+    for name, source in sorted(_sources(module).items()):
+        said.update(name.encode() + b"\0" + source + b"\0")
+    return said.hexdigest()
+
+
+def _sources(module: str) -> dict[str, bytes]:
+    """Sources of a module and of what it imports from its own package, however far."""
+    found: dict[str, bytes] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        spec = importlib.util.find_spec(name)
+        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+            continue
+        found[name] = Path(spec.origin).read_bytes()
+        waiting += _imports(found[name], name, module.partition(".")[0])
+    return found
+
+
+def _imports(source: bytes, module: str, package: str) -> Iterator[str]:
+    """Modules of the package that a source imports."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = _absolute(node, module)
+            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        for name in names:
+            if name.partition(".")[0] == package and _is_module(name):
+                yield name
+
+
+def _absolute(node: ast.ImportFrom, module: str) -> str:
+    if not node.level:
+        return node.module or ""
+    spec = importlib.util.find_spec(module)
+    parts = module.split(".") if spec is not None and spec.submodule_search_locations else module.split(".")[:-1]
+    kept = parts[: len(parts) - node.level + 1]
+    return ".".join([*kept, *([node.module] if node.module else [])])
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, AttributeError, ValueError):
+        return False
+
+
+@cache
+def _points(kind: str) -> tuple[EntryPoint, ...]:
+    return tuple(entry_points(group=f"rolloutfarm.{kind}"))
+
+
+def _release(point: EntryPoint) -> str:
+    return f"{point.dist.name} {point.dist.version}" if point.dist else "an installed package"
+
+
+def _import(module: str, kind: str, name: str) -> Any:  # noqa: ANN401  a module
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ConfigError(f"{_one(kind)} {name!r} cannot be imported: {error}") from error
+
+
+def _one(kind: str) -> str:
+    """A kind's name in the singular."""
+    return {"policies": "policy"}.get(kind, kind.rstrip("s"))

@@ -1,0 +1,131 @@
+"""What a run simulates, built from its specification: jobs in, results out. For workers, and for a learner's own use."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from farm import plugins, settings
+from farm.arrays import FloatArray
+from farm.errors import ConfigError, UnservedError
+from farm.net.messages import Spec
+from farm.net.work import Jobs, Simulated, WireTrajectory, traced
+from farm.policies.base import Policy
+from farm.sim.engines import BatchEngine
+from farm.sim.scene import Scene, quiet
+from farm.sim.sim import Backend, MakeEngine, Sim
+from farm.tasks import loop
+from farm.tasks.base import Task
+
+SIMULATION = "farm.tasks.loop"
+"""The module whose code, with all it imports, decides every rollout's numbers besides task and policy."""
+
+
+class Runner:
+    """Runs one run's jobs."""
+
+    def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine) -> None:
+        """Simulate what all rollouts need.
+
+        Raises:
+          ConfigError: the task cannot be begun.
+        """
+        quiet()
+        self.task, self.policy = task, policy
+        self.spec, self.scene = policy.spec, Scene(task.model)
+        self.sim = Sim(task.engine(make))
+        loop.again(lambda: task.setup(self.sim))
+
+    def run(self, mu: FloatArray, jobs: Jobs, traces: str = "none") -> Simulated:
+        """Run jobs around a mean (P,), with those traces of exploring rollouts that are wanted, one of TRACES."""
+        theta, seeds, first = jobs.theta(mu), jobs.seeds(), np.cumsum(jobs.rollouts) - jobs.rollouts
+        at_physics = np.repeat(jobs.physics, jobs.rollouts)
+        returns, flags = np.zeros(len(theta)), np.zeros((len(theta), 4), dtype=bool)
+        seen: dict[int, WireTrajectory] = {}
+        values = np.empty((0, *self.spec.trace), dtype="<f4")
+        for physics in (False, True):
+            rows = np.flatnonzero(at_physics == physics)
+            if not len(rows):
+                continue
+            rollouts = self.rollouts(theta[rows], [seeds[row] for row in rows], physics=physics)
+            returns[rows], flags[rows] = rollouts.returns, rollouts.flags
+            place = {int(row): at for at, row in enumerate(rows)}
+            for job in np.flatnonzero(jobs.seen & (jobs.physics == physics)).tolist():
+                seen[job] = WireTrajectory.of(self.trajectory(rollouts, place[int(first[job])]))
+            if not physics:
+                exploring = ~np.repeat(jobs.seen, jobs.rollouts)[rows]
+                chosen = traced(traces if self.spec.traced else "none", rollouts.returns, exploring)
+                values = loop.traces(self.task, self.spec, rollouts, chosen)
+        return Simulated(returns, flags, values, tuple(seen[job] for job in sorted(seen)))
+
+    def rollouts(self, theta: FloatArray, seeds: list[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
+        """Rollouts of parameters theta (B, P), with a frame each control step or each physics step."""
+        return loop.run(self.task, self.policy, self.sim, theta, seeds, 1 if physics else 0)
+
+    def trajectory(self, rollouts: loop.Rollouts, row: int) -> Any:  # noqa: ANN401  a Trajectory
+        """One of them, frame by frame."""
+        return loop.trajectory(self.task, self.spec, self.scene, rollouts, row)
+
+    def close(self) -> None:
+        """Give back what it holds."""
+        self.sim.engine.close()
+
+
+def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
+    """The task and the policy of a run that somebody else specified.
+
+    Args:
+      spec: the specification.
+      files: files of classes that this machine may serve.
+
+    Raises:
+      UnservedError: it names something that is not here, is not allowed, or has other code here.
+    """
+    try:
+        task_class = _plugin("tasks", spec.task, spec.code.get("task"), spec.release, files)
+        policy_class = _plugin("policies", spec.policy, spec.code.get("policy"), spec.policy_release, files)
+        if plugins.code_digest(SIMULATION) != spec.code.get("simulation"):
+            raise UnservedError(f"its simulation's code differs from the learner's (farm/); {_SAME}")
+        task = build_task(task_class, spec.task_config, spec.files)
+        sizes = task.spec()
+        if sizes.release != spec.task_release:
+            raise UnservedError(f"the run has {spec.task} of {spec.task_release}, here is {sizes.release}")
+        config = settings.from_dict(policy_class.target.Config, spec.policy_config, spec.policy)
+        return task, policy_class.target(config, sizes, spec.constants)
+    except UnservedError:
+        raise
+    except ConfigError as error:
+        raise UnservedError(str(error)) from None
+
+
+def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping[str, str] | None) -> Task:
+    """A task from its class, the settings in a table, and the texts that the run carries."""
+    config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
+    return cast("Task", plugin.target(config, plugin.variant, files))
+
+
+_SAME = "install the learner's release on both sides"
+
+
+def _plugin(
+    kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]
+) -> plugins.Plugin:
+    """The class that a specification names, if its code is the learner's."""
+    if name.rpartition(":")[0].endswith(".py"):
+        return plugins.allowed(kind, name, digest or "", files)
+    found = plugins.find(kind, name)
+    if found.release != release:
+        raise UnservedError(f"the run has {name} of {release or 'the farm'}, here is {found.release or 'the farm'}'s")
+    if found.digest() != digest:
+        raise UnservedError(f"its code of {name!r} differs from the learner's: {_SAME}")
+    return found
+
+
+def backend(name: str) -> Backend:
+    """The backend of that name.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    return cast("Backend", plugins.find("backends", name).target())

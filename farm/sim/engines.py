@@ -1,0 +1,157 @@
+"""MuJoCo on this machine's processor: many simulations in mujoco.batch, or one in an MjData."""
+
+from collections.abc import Callable
+
+import mujoco
+import mujoco.batch
+import numpy as np
+
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.sim.sim import Rebound, failed_rows
+
+CAPACITY = 64
+"""Rollouts that are stepped together."""
+
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+"""Everything that the next step depends on, as mujoco.batch keeps it."""
+
+
+class BatchEngine:
+    """Simulations of one model in mujoco.batch; their numbers are those of a plain `mj_step` loop."""
+
+    def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
+        """Make room for `size` rows; the physics runs on `threads`."""
+        self.model, self.size = model, size
+        self._batch = mujoco.batch.Batch(model, size, threads)
+        self._fields: dict[str, AnyArray] = {}
+
+    def field(self, name: str) -> AnyArray:
+        """A live array over all rows."""
+        known = self._fields.get(name)
+        if known is None:
+            if name not in mujoco.batch.DATA_FIELDS:
+                raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
+            known = self._fields[name] = self._batch.bind(name)
+            if not known.flags.writeable:
+                raise Rebound
+        return known
+
+    def reset(self, ids: IntArray) -> None:
+        """Bring rows to the model's own start."""
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+
+    def step(self, ids: IntArray, count: int) -> None:
+        """Advance rows; one in which MuJoCo itself raised counts as blown up, the others go on."""
+        try:
+            self._batch.step(ids, nstep=count)
+        except mujoco.batch.SimulationError as error:
+            self._batch.state[error.ids] = np.nan
+
+    def play(self, ids: IntArray, controls: FloatArray) -> None:
+        """Advance rows by one physics step for each of their controls."""
+        try:
+            self._batch.rollout(controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids)
+        except mujoco.batch.SimulationError as error:
+            self._batch.state[error.ids] = np.nan
+
+    def forward(self, ids: IntArray) -> None:
+        """Compute outputs."""
+        try:
+            self._batch.forward(ids)
+        except mujoco.batch.SimulationError as error:
+            self._batch.state[error.ids] = np.nan
+
+    def copy(self, sources: IntArray) -> None:
+        """Give row i the state of row sources[i]."""
+        self._batch.state[: len(sources)] = self._batch.state[sources]
+
+    def blown_up(self, ids: IntArray) -> BoolArray:
+        """Rows whose state is no longer a reasonable number."""
+        return failed_rows(self._batch.state[ids])
+
+    def expand(self, name: str) -> AnyArray:
+        """A field of the model with values for each row."""
+        return self._batch.expand(name)
+
+    def set_const(self, ids: IntArray) -> None:
+        """Have derived constants follow."""
+        self._batch.set_const(ids)
+
+    def close(self) -> None:
+        """Hold nothing that Python does not give back."""
+
+
+class DataEngine:
+    """One simulation in an MjData, stepped by whoever shows it."""
+
+    size = 1
+
+    def __init__(self, model: mujoco.MjModel, step: Callable[[mujoco.MjData], bool] | None = None) -> None:
+        """Take the model, and what advances it by a physics step (false: enough); without: `mj_step`."""
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self.over = False
+        """Whether `step` said that it is enough."""
+        self._step = step
+
+    def field(self, name: str) -> AnyArray:
+        """A live array of one row."""
+        if name not in mujoco.batch.DATA_FIELDS:
+            raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
+        values = np.asarray(getattr(self.data, name))[None]
+        if name not in _STATE_FIELDS:
+            values.flags.writeable = False
+        return values
+
+    def reset(self, ids: IntArray) -> None:  # noqa: ARG002
+        """Bring it to the model's own start."""
+        mujoco.mj_resetData(self.model, self.data)
+
+    def step(self, ids: IntArray, count: int) -> None:  # noqa: ARG002
+        """Advance it by physics steps."""
+        for _ in range(count):
+            if self._step is None:
+                mujoco.mj_step(self.model, self.data)
+            elif not self._step(self.data):
+                self.over = True
+                return
+
+    def play(self, ids: IntArray, controls: FloatArray) -> None:  # noqa: ARG002
+        """Advance it, unseen, by one physics step for each of its controls."""
+        for control in controls[0]:
+            self.data.ctrl[:] = control
+            mujoco.mj_step(self.model, self.data)
+
+    def forward(self, ids: IntArray) -> None:  # noqa: ARG002
+        """Compute outputs."""
+        mujoco.mj_forward(self.model, self.data)
+
+    def copy(self, sources: IntArray) -> None:
+        """There is one row."""
+
+    def blown_up(self, ids: IntArray) -> BoolArray:  # noqa: ARG002
+        """Whether its state is no longer a reasonable number."""
+        state = np.empty(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, self.data, state, STATE)
+        return failed_rows(state[None])
+
+    def expand(self, name: str) -> AnyArray:
+        """A field of the model, as one row."""
+        own = self.model.opt if name.startswith("opt.") else self.model
+        return np.asarray(getattr(own, name.removeprefix("opt.")))[None]
+
+    def set_const(self, ids: IntArray) -> None:  # noqa: ARG002
+        """Have derived constants follow."""
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+    def close(self) -> None:
+        """Hold nothing that Python does not give back."""
+
+
+_STATE_FIELDS = frozenset(
+    (
+        "time", "qpos", "qvel", "act", "history", "qacc_warmstart", "plugin_state", "ctrl", "qfrc_applied",
+        "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata",
+    )
+)  # fmt: skip
+

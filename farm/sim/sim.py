@@ -1,0 +1,225 @@
+"""A batch of simulations as named live arrays: all that a task sees of a simulator.
+
+    sim.qpos          (B, nq), sim.sensordata, sim.xpos ... as MjData names them, of the rollouts still going
+    sim.own["goal"]   (B, ...), what the task remembers of each of them
+    sim.t             control steps done
+    sim.expand("geom_friction")   a field of the model with values of its own for each rollout
+
+While a rollout is brought to its start the arrays are views that can be written; afterwards they are read-only.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Protocol
+
+import mujoco
+import numpy as np
+
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+
+LIMIT = 1e8
+"""A state beyond it has blown up, finite or not."""
+
+
+class Rebound(Exception):  # noqa: N818  not an error
+    """An output of the simulator was asked for the first time: the batch begins again, now with its values."""
+
+
+class Engine(Protocol):
+    """What simulates: rows of states of one model. A backend makes it, or a task brings its own."""
+
+    model: mujoco.MjModel
+    size: int
+    """Rows."""
+
+    def field(self, name: str) -> AnyArray:
+        """A live array over all rows, (size, ...), by its name in MjData; read-only where it is an output.
+
+        Raises Rebound where its values are there only after the next call, AttributeError where there is none.
+        """
+        ...
+
+    def reset(self, ids: IntArray) -> None:
+        """Bring rows to the model's own start."""
+        ...
+
+    def step(self, ids: IntArray, count: int) -> None:
+        """Advance rows by physics steps."""
+        ...
+
+    def play(self, ids: IntArray, controls: FloatArray) -> None:
+        """Advance rows by one physics step for each of their controls, (n, steps, nu)."""
+        ...
+
+    def forward(self, ids: IntArray) -> None:
+        """Compute the outputs of rows from their states."""
+        ...
+
+    def copy(self, sources: IntArray) -> None:
+        """Give row i the state of row sources[i]; rows are never copied downwards onto later sources."""
+        ...
+
+    def blown_up(self, ids: IntArray) -> BoolArray:
+        """Rows whose state is no longer a reasonable number, (n,)."""
+        ...
+
+    def expand(self, name: str) -> AnyArray:
+        """A field of the model with values for each row, live, (size, ...)."""
+        ...
+
+    def set_const(self, ids: IntArray) -> None:
+        """Have derived constants follow what was written into expanded fields."""
+        ...
+
+    def close(self) -> None:
+        """Give back what it holds."""
+        ...
+
+
+class Backend(Protocol):
+    """What a worker simulates with, made without arguments: engines for models."""
+
+    capacity: ClassVar[int]
+    """Rollouts that are worth having at a time."""
+
+    def engine(self, model: mujoco.MjModel) -> Engine:
+        """Make room for a model's simulations."""
+        ...
+
+
+MakeEngine = Callable[[mujoco.MjModel], Engine]
+
+
+class Sim:
+    """A batch of rollouts in an engine."""
+
+    def __init__(self, engine: Engine) -> None:
+        """Take an engine; `begin` comes next."""
+        self.engine = engine
+        self.own: dict[str, AnyArray] = {}
+        """What the task remembers of each rollout, (B, ...); follows them as others end."""
+        self.t = 0
+        """Control steps done."""
+        self._ids: IntArray = np.arange(0)
+        self._source: IntArray | None = None  # rows that outputs are read from, until the first step
+        self._expanded: dict[str, AnyArray] = {}
+        self._nominal: dict[str, AnyArray] = {}  # the model's own values of them
+        self._dirty = self._live = self._stepped = False
+        self._now: dict[str, AnyArray] = {}
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """What is simulated; never changed."""
+        return self.engine.model
+
+    def __len__(self) -> int:
+        """B, the rollouts still going."""
+        return len(self._ids)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401  an array of MjData
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = self._now.get(name)
+        if known is not None:
+            return known
+        values = self.engine.field(name)
+        if self._live:
+            if not values.flags.writeable and not self._stepped:  # somebody may have written states
+                self._constants()
+                self.engine.forward(self._ids)
+            return values[: len(self)]
+        self._now[name] = taken = self._rows(values)
+        return taken
+
+    def _rows(self, values: AnyArray) -> AnyArray:
+        """The rows still going, read-only."""
+        rows = self._ids if self._source is None or values.flags.writeable else self._source
+        whole = rows[-1] == len(rows) - 1 and self._source is None if len(rows) else False
+        taken = values[: len(rows)] if whole else values[rows]  # rows rise: the last one tells whether some are gone
+        taken = taken.view()
+        taken.flags.writeable = False
+        return taken
+
+    def begin(self, count: int) -> None:
+        """Begin `count` rollouts at the model's own start; arrays can be written until `start`."""
+        self._ids, self._source = np.arange(count), None
+        self.own, self.t, self._now = {}, 0, {}
+        self._live, self._stepped = True, False
+        self.engine.reset(self._ids)
+        for name, values in self._expanded.items():
+            values[:count] = self._nominal[name]
+            self._dirty = True
+
+    def start(self, sources: IntArray) -> None:
+        """End the preparation: B rollouts, each from where the prepared one of number sources[i] stands."""
+        self._constants()
+        if not self._stepped:
+            self.engine.forward(self._ids)
+        self._live = False
+        if len(sources) == len(self._ids) and (sources == self._ids).all():
+            return
+        self._ids = np.arange(len(sources))
+        self.engine.copy(sources)
+        for values in self._expanded.values():
+            values[: len(sources)] = values[sources]
+        if self._expanded:
+            self.engine.set_const(self._ids)
+        self.own = {name: values[sources] for name, values in self.own.items()}
+        self._source = sources
+
+    def expand(self, name: str) -> AnyArray:
+        """A field of MjModel with a value for each rollout, (B, ...); to be written while rollouts are prepared."""
+        if name not in self._expanded:
+            self._nominal[name] = np.array(_own_value(self.model, name))
+            self._expanded[name] = self.engine.expand(name)
+        self._dirty = True
+        return self._expanded[name][: len(self)]
+
+    def step(self, count: int = 1) -> None:
+        """Advance all rollouts by physics steps."""
+        self._constants()
+        self._moved()
+        self.engine.step(self._ids, count)
+
+    def play(self, controls: FloatArray) -> None:
+        """Advance all rollouts by one physics step for each of the controls, (steps, nu)."""
+        self._constants()
+        self._moved()
+        self.engine.play(self._ids, np.broadcast_to(controls, (len(self), *controls.shape)))
+
+    def forward(self) -> None:
+        """Compute outputs from the states as they were written."""
+        self._constants()
+        self._moved()
+        self.engine.forward(self._ids)
+
+    def control(self, values: FloatArray) -> None:
+        """Set the controls, (B, nu)."""
+        self.engine.field("ctrl")[self._ids] = values
+        self._now.pop("ctrl", None)
+
+    def blown_up(self) -> BoolArray:
+        """Which rollouts' states are no longer reasonable numbers, (B,)."""
+        return self.engine.blown_up(self._ids)
+
+    def keep(self, going: BoolArray) -> None:
+        """Let go of the rollouts that are over, (B,)."""
+        self._ids, self._now = self._ids[going], {}
+        self.own = {name: values[going] for name, values in self.own.items()}
+
+    def _moved(self) -> None:
+        self._now, self._source, self._stepped = {}, None, True
+
+    def _constants(self) -> None:
+        """Have derived constants follow, if somebody may have written what they depend on."""
+        if self._dirty:
+            self.engine.set_const(self._ids)
+            self._dirty = False
+
+
+def _own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a number or an array
+    return getattr(model.opt, name.removeprefix("opt.")) if name.startswith("opt.") else getattr(model, name)
+
+
+def failed_rows(state: FloatArray) -> BoolArray:
+    """Rows (n, nstate) with a number that is not reasonable, (n,)."""
+    return np.asarray(~(np.abs(state) < LIMIT).all(axis=1))

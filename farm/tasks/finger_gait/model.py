@@ -1,0 +1,108 @@
+"""The hand with an object: which files it is made of, and where things are in its arrays."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import mujoco
+
+import farm
+from farm.errors import ConfigError
+from farm.sim.scene import compiled
+from farm.tasks.finger_gait.hand import FINGERS
+
+CONTACTS: Final = 4
+"""Contacts kept per fingertip (the strongest); a sphere on a convex body has one."""
+
+CONTACT_WIDTH: Final = 7
+"""Numbers per contact: found (1), force in the contact frame (3) [N], position in the world (3) [m]."""
+
+OBJECT: Final = "object"
+
+
+def folder() -> Path:
+    """Where the assets are: beside this package in a checkout, in it where it is installed."""
+    inside = Path(farm.__file__).parent / "assets"
+    return inside if inside.is_dir() else inside.parent.parent / "assets"
+
+
+def objects() -> list[str]:
+    """Names of the objects there are, one file each."""
+    return sorted(file.stem for file in folder().glob("objects/*.xml"))
+
+
+def files(object_name: str) -> dict[str, str]:
+    """The texts that the model is made of, by name: hand, what the task adds, and an object by name or file.
+
+    Raises:
+      ConfigError: there is no such object.
+    """
+    known = objects()
+    path = Path(object_name) if object_name.endswith(".xml") else folder() / f"objects/{object_name}.xml"
+    if not object_name.endswith(".xml") and object_name not in known:
+        raise ConfigError(f"unknown object {object_name!r}; known are {', '.join(known)}, or a file NAME.xml")
+    try:
+        own = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read the object {path}: {error}") from None
+    parts = {name: (folder() / name).read_text("utf-8") for name in ("hand.xml", "finger_gait.xml")}
+    return {**parts, "object.xml": own}
+
+
+def mjcf(sources: Mapping[str, str]) -> str:
+    """The texts of `files` as one MJCF text that needs no other file.
+
+    Raises:
+      ConfigError: one is no XML.
+    """
+    whole = ET.Element("mujoco")
+    for name in ("hand.xml", "finger_gait.xml", "object.xml"):
+        try:
+            whole.extend(ET.fromstring(sources[name]))
+        except (KeyError, ET.ParseError) as error:
+            raise ConfigError(f"the hand's model: {name} cannot be read: {error}") from None
+    return ET.tostring(whole, encoding="unicode")
+
+
+def load(object_name: str) -> "Hand":
+    """Compile the hand with an object.
+
+    Raises:
+      ConfigError: there is no such object, or MuJoCo refuses it.
+    """
+    return Hand(compiled(mjcf(files(object_name)), f"object {object_name}"), object_name)
+
+
+@dataclass(frozen=True)
+class Hand:
+    """A compiled hand with one object.
+
+    The object hangs on a weld to the mocap body `anchor` while equality 0 is active: that is the task's freeze. Its
+    free joint comes last in `qpos`, after the eight controlled joints.
+    """
+
+    model: mujoco.MjModel
+    object_name: str
+
+    @cached_property
+    def object_body(self) -> int:
+        """The object's body."""
+        return int(self.model.body(OBJECT).id)
+
+    @cached_property
+    def tip_sites(self) -> list[int]:
+        """The sites at the centres of the fingertips, in the order of FINGERS."""
+        return [int(self.model.site(f"{finger}_tip").id) for finger in FINGERS]
+
+    @cached_property
+    def tip_geoms(self) -> list[int]:
+        """The fingertips' spheres, in the order of FINGERS."""
+        return [int(self.model.geom(f"{finger}_tip").id) for finger in FINGERS]
+
+    @cached_property
+    def object_geoms(self) -> list[int]:
+        """The geometries of the object."""
+        return [i for i in range(self.model.ngeom) if self.model.geom_bodyid[i] == self.object_body]

@@ -1,0 +1,335 @@
+"""The closed loop: observe, act, step, reward. There is no other.
+
+A rollout's numbers depend on (task, policy parameters, seed) alone: not on the other rollouts of its batch, their
+order, or threads. They equal, bit for bit, those of one rollout at a time in a plain `mj_step` loop.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.errors import TaskError
+from farm.sim.engines import BatchEngine
+from farm.sim.scene import Scene, quiet
+from farm.sim.sim import Rebound, Sim
+from farm.sim.trajectory import Trajectory
+from farm.tasks.base import Record, Task, TaskSpec, flat
+
+RETURN_FLOOR: Final = -1e12
+"""A return that overflows, or is of a rollout that failed, counts as this: it must never look good."""
+
+Seed = tuple[int, ...] | None
+"""What a rollout's random numbers are drawn from; None for nominal conditions."""
+
+
+class Acts(Protocol):
+    """What the loop needs of a policy."""
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """What of the parameters (B, P) does not change during a rollout, (B, ...)."""
+        ...
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions (B, A) of observations (B, d)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """B rollouts that are over; T control steps, F frames: T, or T x substeps at physics rate."""
+
+    returns: FloatArray
+    """(B,)"""
+    success: BoolArray
+    """(B,); false where the task knows no success"""
+    ended: BoolArray
+    """(B,) the task ended it before its last step."""
+    failed: BoolArray
+    """(B,) the physics blew up."""
+    clamped: BoolArray
+    """(B,) the return overflowed."""
+    steps: IntArray
+    """(B,) control steps until the end, the last one included."""
+    terms: FloatArray
+    """(B, T, K), zero after the end."""
+    actions: FloatArray
+    """(B, T, A), zero after the end."""
+    start: Mapping[str, FloatArray]
+    """What was measured at the start, and qpos, (B, ...)."""
+    frames: Mapping[str, FloatArray]
+    """And in every frame, zero after the end, (B, F, ...)."""
+
+    @property
+    def flags(self) -> BoolArray:
+        """success, ended, failed, clamped, (B, 4)."""
+        return np.stack([self.success, self.ended, self.failed, self.clamped], axis=1)
+
+    def at(self, rows: slice | IntArray) -> "Rollouts":
+        """Some of them."""
+        return _each(lambda values: values[rows], self)
+
+
+class Batch:
+    """Rollouts of one task that are stepped together, whoever decides the actions."""
+
+    def __init__(self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0) -> None:
+        """Bring them to their starts; rollouts of equal seeds share one.
+
+        Args:
+          task: what is simulated; its `setup` is done.
+          sim: where.
+          seeds: one each.
+          every: physics steps between two frames; 0: one frame each control step.
+        """
+        self.task, self.sim = task, sim
+        self._parts = task.substeps // (every or task.substeps)
+        self._substeps = task.substeps // self._parts
+        unique = list(dict.fromkeys(seeds))
+        sim.begin(len(unique))
+        task.prepare(sim, [None if seed is None else np.random.default_rng(seed) for seed in unique])
+        sim.start(np.array([unique.index(seed) for seed in seeds]))
+        count, self.active = len(seeds), np.arange(len(seeds))
+        self._start = self._measured()
+        frames = (count, task.steps * self._parts)
+        self._frames = {name: np.zeros((*frames, *values.shape[1:])) for name, values in self._start.items()}
+        self._actions: FloatArray | None = None
+        self._terms: FloatArray | None = None
+        self._names: tuple[str, ...] = ()
+        self._steps = np.full(count, task.steps)
+        self._failed, self._ended, self._success = (np.zeros(count, dtype=bool) for _ in range(3))
+
+    def observe(self) -> FloatArray:
+        """What the policy sees of the rollouts still going, (n, d)."""
+        x = self.task.observe(self.sim)
+        return _array("observe", x, (len(self.sim), *np.shape(x)[1:2]))
+
+    def step(self, action: FloatArray) -> None:
+        """One control step of the rollouts still going: raw actions (n, A)."""
+        task, sim, t = self.task, self.sim, self.sim.t
+        if self._actions is None:
+            self._actions = np.zeros((len(self._steps), task.steps, action.shape[1]))
+        self._actions[self.active, t] = action
+        sim.control(_array("act", task.act(sim, action), (len(sim), sim.model.nu)))
+        for part in range(self._parts):
+            sim.step(self._substeps)
+            for name, values in self._measured().items():
+                self._frames[name][self.active, t * self._parts + part] = values
+        sim.t += 1
+        failed = sim.blown_up()
+        self._reward(action, t, failed)
+        ended = task.ended(sim)
+        ended = np.zeros(len(sim), dtype=bool) if ended is None else _array("ended", ended, (len(sim),)).astype(bool)
+        self._conclude(failed, ended & ~failed, t)
+
+    def _measured(self) -> dict[str, FloatArray]:
+        """What is kept of this frame, (n, ...) each."""
+        count = len(self.sim)
+        given = {name: _array(name, v, (count, *np.shape(v)[1:])) for name, v in self.task.measure(self.sim).items()}
+        return {"qpos": self.sim.qpos, **given}
+
+    def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> None:
+        """Note the reward terms of a control step, unless whole rollouts are scored."""
+        if scores(self.task):
+            return
+        given = self.task.reward(self.sim, action)
+        terms = given if isinstance(given, dict) else {"reward": given}
+        values = np.stack([_array(f"reward {n}", v, (len(self.sim),)) for n, v in terms.items()], axis=1)
+        if self._terms is None:
+            self._names = tuple(terms)
+            self._terms = np.zeros((len(self._steps), self.task.steps, len(terms)))
+        if tuple(terms) != self._names:
+            raise TaskError(f"reward has terms {', '.join(terms)}; the step before it had {', '.join(self._names)}")
+        values[failed] = 0.0
+        if not np.isfinite(values).all():
+            bad = next(n for n, column in zip(terms, values.T, strict=True) if not np.isfinite(column).all())
+            raise TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine")
+        self._terms[self.active, t] = values
+
+    def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
+        """Let go of the rollouts that are over; the last step is the end of all."""
+        over = failed | ended
+        last = t + 1 == self.task.steps
+        if last or over.any():
+            success = None if scores(self.task) else self.task.success(self.sim)
+            if success is not None:
+                done = over | last
+                self._success[self.active[done]] = (success & ~failed)[done]
+        if not over.any():
+            return
+        self._steps[self.active[over]] = t + 1
+        self._failed[self.active[failed]], self._ended[self.active[ended]] = True, True
+        frames = slice(t * self._parts, (t + 1) * self._parts)
+        for values in self._frames.values():
+            values[self.active[failed], frames] = 0.0  # no number of a blown-up state goes any further
+        self.active = self.active[~over]
+        self.sim.keep(~over)
+
+    @property
+    def over(self) -> bool:
+        """Whether all are over."""
+        return self.sim.t >= self.task.steps or not len(self.active)
+
+    def record(self) -> Record:
+        """What was measured after each control step so far."""
+        assert self._actions is not None
+        at = slice(self._parts - 1, None, self._parts)
+        frames = {name: values[:, at] for name, values in self._frames.items()}
+        return Record(frames, self._start, self._actions, self._steps, self._failed)
+
+    def rollouts(self) -> Rollouts:
+        """Score them, when all are over."""
+        record = self.record()
+        score = self.task.score(record)
+        terms, success = (self._terms, self._success) if score is None else (score.terms, score.success)
+        assert terms is not None
+        returns, clamped = discounted(terms, self.task.config.gamma, self.task.return_scale)
+        if score is None:
+            clamped = clamped | self._failed
+            returns = np.where(clamped, RETURN_FLOOR, returns)
+        return Rollouts(
+            returns=returns, success=np.zeros(len(returns), dtype=bool) if success is None else success,
+            ended=self._ended, failed=self._failed, clamped=clamped, steps=self._steps, terms=terms,
+            actions=record.actions, start=self._start, frames=self._frames,
+        )  # fmt: skip
+
+
+def run(task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], every: int = 0) -> Rollouts:
+    """Run rollouts of parameters theta (B, P) to their ends; as many at a time as the engine takes."""
+    size, parts = sim.engine.size, []
+    for first in range(0, len(theta), size):
+        rows = slice(first, first + size)
+        parts.append(again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every)))
+    return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
+
+
+def _run(task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], every: int) -> Rollouts:
+    batch = Batch(task, sim, seeds, every)
+    all_prepared = prepared = policy.prepare(theta)
+    while not batch.over:
+        if len(batch.active) < len(prepared):
+            prepared = all_prepared[batch.active]
+        batch.step(policy.act(prepared, batch.observe()))
+    return batch.rollouts()
+
+
+def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  what `doing` gives
+    """Begin again where an output of the simulator was asked for the first time; numbers never depend on that."""
+    while True:
+        try:
+            return doing()
+        except Rebound:
+            continue
+
+
+def scores(task: Task) -> bool:
+    """Whether the task scores whole rollouts."""
+    return type(task).score is not Task.score
+
+
+def discounted(terms: FloatArray, gamma: float, scale: float) -> tuple[FloatArray, BoolArray]:
+    """Return R = scale * sum_t gamma^t r_t, t from 0.
+
+    Args:
+      terms: (B, T, K) reward terms of every step, zero after the end.
+      gamma: discount factor.
+      scale: factor of the sum.
+
+    Returns:
+      returns (B,), and (B,) where the sum overflowed and was clamped to RETURN_FLOOR.
+    """
+    total = np.zeros(len(terms))
+    with np.errstate(over="ignore", invalid="ignore"):
+        reward = terms.sum(axis=-1)
+        for t in range(terms.shape[1]):
+            total += gamma**t * reward[:, t]
+        total *= scale
+        clamped = ~(total >= RETURN_FLOOR)  # catches nan as well
+    return np.where(clamped, RETURN_FLOOR, total), clamped
+
+
+def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row: int) -> Trajectory:
+    """One rollout, frame by frame, its start first."""
+    parts = next(iter(rollouts.frames.values())).shape[1] // task.steps
+    steps = int(rollouts.steps[row])
+    control = np.repeat(np.arange(steps), parts)
+    shown = whole(rollouts, row)
+    terms, actions = rollouts.terms[row], rollouts.actions[row]
+    return Trajectory(
+        times=np.arange(steps * parts + 1, dtype=float) * (task.period / parts),
+        bodies=scene.poses(shown["qpos"]),
+        actions=np.concatenate([np.zeros((1, actions.shape[1])), actions[control]]),
+        terms=np.concatenate([np.zeros((1, terms.shape[1])), terms[control]]),
+        channels=task.show(shown),
+        value=float(rollouts.returns[row]),
+        success=bool(rollouts.success[row]) if spec.success else None,
+    )
+
+
+def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
+    """What was measured in one rollout: at its start, and in every frame until its end, (F + 1, ...)."""
+    count = len(next(iter(rollouts.frames.values()))[row])
+    frames = int(rollouts.steps[row]) * (count // rollouts.actions.shape[1])
+    first = {name: values[row][None] for name, values in rollouts.start.items()}
+    return {name: np.concatenate([first[name], values[row, :frames]]) for name, values in rollouts.frames.items()}
+
+
+def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> AnyArray:
+    """What travels of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
+    if not spec.traced or not len(rows):
+        return np.zeros((len(rows), *spec.trace), dtype="<f4")
+    values = flat(spec.traced, task.show({name: frames[rows] for name, frames in rollouts.frames.items()}))
+    values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
+    return values
+
+
+def probe(task: Task) -> TaskSpec:
+    """What others must know of a task, found by one control step of one rollout."""
+    quiet()
+    sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
+
+    def look() -> tuple[Batch, int]:
+        task.setup(sim)
+        batch = Batch(task, sim, [None])
+        size = batch.observe().shape[1]
+        with np.errstate(all="ignore"):
+            batch.step(np.zeros((1, sim.model.nu)))
+        return batch, size
+
+    try:
+        batch, size = again(look)
+        names = batch._names or ("reward",)
+        success = None if scores(task) else type(task).success is not Task.success
+        return TaskSpec(
+            observation=size, action=sim.model.nu, steps=task.steps, period=task.period, terms=names,
+            success=bool(success), channels=task.channels,
+        )  # fmt: skip
+    finally:
+        sim.engine.close()
+
+
+def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa: ANN401  whatever a task gave
+    """The values, if they are an array of that shape.
+
+    Raises:
+      TaskError: they are not; names the array, what came and what was expected.
+    """
+    if not isinstance(values, np.ndarray) or values.shape != shape:
+        got = f"an array of shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
+        raise TaskError(f"{name} gave {got}; expected an array of shape {shape}")
+    return values
+
+
+def _each(call: Callable[..., AnyArray], *parts: Rollouts) -> Rollouts:
+    """Apply a function to every array of rollouts, or of several side by side."""
+    made: dict[str, Any] = {}
+    for name in Rollouts.__dataclass_fields__:
+        values = [getattr(part, name) for part in parts]
+        made[name] = (
+            {key: call(*(value[key] for value in values)) for key in values[0]}
+            if isinstance(values[0], Mapping)
+            else call(*values)
+        )
+    return Rollouts(**made)
