@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _WHERE: Final = {
     "learn": "learner.run", "load": "learner.replay", "RunConfig": "learner.config", "configure": "learner.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
-    "Channel": "farm.tasks.base", "Camera": "farm.tasks.base", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
+    "Channel": "farm.tasks.base", "Camera": "farm.sim.camera", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
     "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",
     "Algorithm": "learner.algorithms", "SearchState": "learner.algorithms",
     "Backend": "farm.sim.sim", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",

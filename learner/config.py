@@ -86,9 +86,9 @@ def _filled(config: RunConfig) -> dict[str, Any]:
 
 _DEFAULT: Final = {"policy": "direct", "algorithm": "pgpe"}
 _GENERAL: Final[Mapping[str, Any]] = {
-    "policy": "direct", "features": 50, "bandwidth": 3.0, "algorithm": "pgpe", "initial_mu": 0.0,
-    "initial_sigma": 0.1, "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.1,
-    "learning_rate_sigma": 0.1, "sigma_rule": "capped", "max_speed": 0.2,
+    "policy": "direct", "features": 50, "bandwidth": 1.0, "algorithm": "pgpe", "initial_mu": 0.0,
+    "initial_sigma": 1.0, "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.5,
+    "learning_rate_sigma": 0.1, "sigma_rule": "capped", "max_speed": 1.0,
 }  # fmt: skip
 """The settings that runs begin with, where the task has none of its own."""
 

@@ -1,70 +1,56 @@
 """A learnt policy as one .npz that plain MuJoCo and numpy run; docs/export.md describes it."""
 
+import json
 from pathlib import Path
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm import settings
 from farm.errors import RunError
-from farm.sim import scene as scenes
-from farm.tasks.finger_gait import touch as tactile
-from farm.tasks.finger_gait.hand import FINGERS, JOINTS, LOWER, UPPER
-from farm.tasks.finger_gait.rewards import WEIGHTS, Weights
-from farm.tasks.finger_gait.task import CONTROL_PERIOD, SUBSTEPS
-from learner.replay import Stored
+from farm.sim.engines import STATE, DataEngine
+from farm.sim.sim import Sim
+from farm.tasks.loop import Batch
+from learner.replay import LoadedPolicy
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Version of the file."""
 
-_UNCLIPPED: Final = 1e6  # [rad]; what limits an unclipped target, as in farm.policy
 
-
-def contents(stored: Stored) -> dict[str, Any]:
+def contents(policy: LoadedPolicy) -> dict[str, Any]:
     """Everything that the file holds, by name."""
-    config, simulation = stored.config, stored.simulation
-    task, policy = simulation.task, config.policy
-    limits = (LOWER, UPPER) if policy.clip else (np.full(8, -_UNCLIPPED), np.full(8, _UNCLIPPED))
-    start = simulation.start
+    found = policy.problem
+    task, config = found.task, found.config
+    engine = DataEngine(task.model)
+    sim = Sim(engine)
+    task.setup(sim)
+    batch = Batch(task, sim, [None])
+    state = np.empty(mujoco.mj_stateSize(task.model, STATE))
+    mujoco.mj_getState(task.model, engine.data, state, STATE)
     return {
         "version": VERSION,
-        "generation": stored.generation,
-        "mjcf": scenes.text(simulation.scene.object_name),
-        "joints": np.array(JOINTS),
-        "tips": np.array([f"{finger}_tip" for finger in FINGERS]),
-        "controller": policy.controller,
-        "bandwidth": policy.bandwidth,
-        "action": policy.action,
-        "mu": stored.mu,
-        "W": stored.features.frequencies,
-        "c": stored.features.phases,
-        "lower": limits[0],
-        "upper": limits[1],
-        "start_command": task.commands,
-        "state": start.rows[0],
-        "state_kind": scenes.STATE,
-        "x": task.observe(start.frames, None)[0],
-        "input": task.config.state,
-        "joints_scale": task.config.joints_scale,
-        "contacts_scale": task.config.contacts_scale,
-        "tactile_scale": task.config.tactile_scale,
-        "taxels": tactile.DIRECTIONS,
-        "kappa": tactile.KAPPA,
-        "steps": task.config.steps,
-        "substeps": SUBSTEPS,
-        "control_period": CONTROL_PERIOD,
+        "task": config.task.rpartition("/")[2],
+        "policy": config.policy.rpartition("/")[2],
+        "task_config": json.dumps(settings.to_dict(config.task_config)),
+        "policy_config": json.dumps(settings.to_dict(config.policy_config)),
+        "generation": policy.generation,
+        "mjcf": task.mjcf(),
+        "mu": policy.mu,
+        "state": state,
+        "state_kind": STATE,
+        "x": batch.observe()[0],
+        "steps": task.steps,
+        "substeps": task.substeps,
+        "control_period": task.period,
         "gamma": task.config.gamma,
-        "return_scale": task.config.return_scale,
-        "weights": _weights(task.config.reward, WEIGHTS[task.config.weights], task.goal.joints, task.goal.images),
-        "punished_to": limits[1] - limits[0] if task.config.reward == "limited" else np.full(len(limits[0]), np.inf),
-        "drop_penalty": WEIGHTS[task.config.weights].drop,
-        "goal_joints": task.goal.joints,
-        "goal_images": task.goal.images,
-        "goal_points": task.goal.points,
+        "return_scale": task.return_scale,
+        **found.policy.constants,
+        **task.exported(),
     }
 
 
-def write(path: Path, stored: Stored) -> None:
+def write(path: Path, policy: LoadedPolicy) -> None:
     """Write the file; it holds arrays and texts, nothing that has to be unpickled.
 
     Raises:
@@ -72,13 +58,6 @@ def write(path: Path, stored: Stored) -> None:
     """
     try:
         with path.open("wb") as file:  # np.savez would add a suffix of its own
-            np.savez_compressed(file, allow_pickle=False, **contents(stored))
+            np.savez_compressed(file, allow_pickle=False, **contents(policy))
     except OSError as error:
         raise RunError(f"cannot write {path}: {error.strerror}") from None
-
-
-def _weights(reward: str, weights: Weights, joints: FloatArray, images: FloatArray) -> FloatArray:
-    """Factors of the squares that the reward takes off: tactile, joints, action, contact points, (4,)."""
-    full = float(reward != "basic")
-    touch = full * weights.tactile / float((images.reshape(-1) ** 2).sum())
-    return np.array([touch, weights.joints / float((joints**2).sum()), weights.action, full * weights.contact_points])

@@ -1,115 +1,100 @@
-"""What a finished run is good for: a policy that it stored, again, under the trained or other conditions.
+"""Loads a run's policy and rolls it out again, under the trained or other settings of its task.
 
-from learner.replay import Conditions, again
-from learner.run_folder import RunFolder
+import farm
 
-print(again(RunFolder.open(Path("runs/first")), Conditions(friction=0.5)).trajectory.success)
+policy = farm.load("runs/first", friction=0.5)
+print(policy.rollout().trajectory.success)
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
-import numpy as np
-from farm.tasks.finger_gait.physics import Rollouts, Simulation
-from workers.finger_gait import trajectory, whole
-
+from farm import plugins, settings
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.policies.fourier import Features, Policy
+from farm.rollouts import Runner, build_task
 from farm.sim.trajectory import Trajectory
-from farm.tasks.finger_gait.hand import JOINTS
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.task import Frames, Perturbation
+from farm.tasks.loop import Rollouts, Seed, whole
 from learner import checkpoint as checkpoints
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
-from learner.setup import start
-
-
-@dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """What is different from the run's own nominal conditions."""
-
-    object: str | None = None
-    """Object to hold: the name of a file in assets/objects; None: the run's."""
-    friction: float | None = None
-    """Factor of every friction coefficient, of fingertips and object alike; None: 1."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.friction is not None and not 0 < self.friction < np.inf:
-            raise ConfigError(f"friction is {self.friction}; expected a positive number")
-
-    def __str__(self) -> str:
-        """As a caption says it; empty for the run's own."""
-        said = [] if self.object is None else [f"object {self.object}"]
-        return ", ".join([*said, *([] if self.friction is None else [f"friction times {self.friction:g}"])])
-
-    def perturbation(self, steps: int) -> Perturbation | None:
-        """As the simulation takes it."""
-        if self.friction is None:
-            return None
-        return Perturbation(self.friction, 1.0, np.zeros(3), np.zeros((steps, len(JOINTS))))
+from learner.setup import Problem, problem, start
 
 
 @dataclass(frozen=True)
-class Stored:
-    """A policy that a run stored, ready to simulate."""
+class Replay:
+    """One rollout again, at physics rate."""
 
-    config: RunConfig
+    trajectory: Trajectory
+    frames: Mapping[str, FloatArray]
+    """What was measured in each frame, qpos (F, nq) among it"""
+    rollouts: Rollouts
+    """One row."""
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """The mean policy of a run after some generation."""
+
+    problem: Problem
     generation: int
     """Updates that led to it."""
     mu: FloatArray
     """Its parameters, (P,)"""
-    features: Features
-    simulation: Simulation
+
+    @cached_property
+    def runner(self) -> Runner:
+        """Simulates it in this process."""
+        return self.problem.runner()
+
+    def rollout(self, theta: FloatArray | None = None, seed: Seed = None) -> Replay:
+        """One rollout of it, or of other parameters (P,), from the start that a seed gives (None: nominal)."""
+        chosen = self.mu if theta is None else theta
+        rollouts = self.runner.rollouts(chosen[None], [seed], physics=True)
+        return Replay(self.runner.trajectory(rollouts, 0), whole(rollouts, 0), rollouts)
 
 
-@dataclass(frozen=True)
-class Again:
-    """A rollout of a stored policy, at physics rate."""
-
-    stored: Stored
-    rollouts: Rollouts
-    """One row."""
-    trajectory: Trajectory
-
-    @property
-    def frames(self) -> Frames:
-        """(F,) what was measured, at the release and after each physics step until the end."""
-        return whole(self.rollouts, 0, len(self.trajectory.times) - 1)
-
-
-def stored(folder: RunFolder, generation: int | None = None, object_name: str | None = None) -> Stored:
-    """The mean policy after a generation, None for the last.
+def load(path: str | Path, generation: int | None = None, **changed: Any) -> LoadedPolicy:  # noqa: ANN401
+    """The mean policy of the run in a folder, after a generation (None: the last), with other settings of its task.
 
     Raises:
-      ConfigError: it is not stored, its grips do not hold this object, or it is of another task.
+      ConfigError: it is not stored, or cannot be simulated like that.
+    """
+    folder = RunFolder.open(Path(path))
+    config = folder.read_config()
+    try:
+        task = replace(config.task_config, **changed)
+    except TypeError:
+        raise ConfigError(f"no settings of {config.task}: {', '.join(changed)}") from None
+    return loaded(folder, generation, task)
+
+
+def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -> LoadedPolicy:  # noqa: ANN401
+    """The same, with settings of the task as a whole; None for the run's own.
+
+    Raises:
+      ConfigError: it is not stored, or cannot be simulated like that.
     """
     config = folder.read_config()
-    if config.task.kind != "finger-gait":
-        raise ConfigError(f"{folder.path} has learnt {config.task.task}: this is for runs of finger-gait alone")
     at = checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     chosen = last if generation is None else generation
     mu = at.state["mu"] if chosen == last else _earlier(folder, config, chosen)
-    features = Features(at.frequencies, at.phases)
-    policy = Policy(config.policy, STATES[config.task.state].size, features)
-    task = config.task if object_name is None else replace(config.task, object=object_name)
-    return Stored(config, chosen, mu, features, Simulation(task, policy))
+    files = at.files
+    if task is not None and task != config.task_config:
+        files = _files(config, replace(config, task_config=task), at.files)
+        config = replace(config, task_config=task)
+    return LoadedPolicy(problem(replace(config, stop_when_solved=None), at.constants, files), chosen, mu)
 
 
-def again(folder: RunFolder, conditions: Conditions | None = None, generation: int | None = None) -> Again:
-    """Simulate a stored policy once more.
-
-    Raises:
-      ConfigError: the policy is not stored, or the grips do not hold the object.
-    """
-    conditions = conditions or Conditions()
-    policy = stored(folder, generation, conditions.object)
-    simulation = policy.simulation
-    perturbation = conditions.perturbation(simulation.task.config.steps)
-    rollouts = simulation.run(policy.mu[None], [perturbation], substeps=1)
-    return Again(policy, rollouts, trajectory(simulation, rollouts, 0, 1))
+def _files(old: RunConfig, new: RunConfig, kept: Mapping[str, str]) -> dict[str, str]:
+    """The texts that a task with other settings is made of: the run's own, but for those that the settings change."""
+    plugin = plugins.find("tasks", old.task)
+    before, after = (dict(build_task(plugin, settings.to_dict(c.task_config), None).sources) for c in (old, new))
+    return {name: kept[name] if name in kept and text == before.get(name) else text for name, text in after.items()}
 
 
 def _earlier(folder: RunFolder, config: RunConfig, generation: int) -> FloatArray:
@@ -118,5 +103,5 @@ def _earlier(folder: RunFolder, config: RunConfig, generation: int) -> FloatArra
         return folder.mean(generation)
     if config.init_from is not None:
         raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
-    mu: FloatArray = start(config, folder.name).state["mu"]
+    mu: FloatArray = start(config, folder.name)[1].state["mu"]
     return mu

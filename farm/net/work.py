@@ -128,6 +128,8 @@ class Jobs:
         signs = self.table[:, _SIGN][self.table[:, _SIGN] != 0]
         out = origin[rows]
         explores = self.table[rows, _EXPLORES] != 0
+        if not explores.any():  # eps may have no columns then
+            return out
         at = np.cumsum(self.table[:, _EXPLORES]) - 1  # of each job's eps
         out[explores] += signs[explores, None] * self.eps[at[rows[explores]]]
         return out

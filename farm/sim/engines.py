@@ -86,13 +86,14 @@ class DataEngine:
 
     size = 1
 
-    def __init__(self, model: mujoco.MjModel, step: Callable[[mujoco.MjData], bool] | None = None) -> None:
-        """Take the model, and what advances it by a physics step (false: enough); without: `mj_step`."""
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Take the model."""
         self.model = model
         self.data = mujoco.MjData(model)
+        self.pace: Callable[[], bool] | None = None
+        """Advances it by a physics step, and says whether to go on; without: `mj_step`."""
         self.over = False
-        """Whether `step` said that it is enough."""
-        self._step = step
+        """Whether `pace` said that it is enough."""
 
     def field(self, name: str) -> AnyArray:
         """A live array of one row."""
@@ -110,9 +111,9 @@ class DataEngine:
     def step(self, ids: IntArray, count: int) -> None:  # noqa: ARG002
         """Advance it by physics steps."""
         for _ in range(count):
-            if self._step is None:
+            if self.pace is None:
                 mujoco.mj_step(self.model, self.data)
-            elif not self._step(self.data):
+            elif not self.pace():
                 self.over = True
                 return
 

@@ -1,78 +1,43 @@
-"""A policy in MuJoCo's interactive viewer, in real time; a door to mujoco."""
+"""A task in MuJoCo's interactive viewer, in real time; a door to mujoco."""
 
 import threading
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
 import mujoco.viewer
 
-from farm.arrays import FloatArray
 from farm.errors import RunError
-from farm.policies.fourier import Policy
-from farm.sim.scene import STATE, HandScene
-from farm.tasks.finger_gait.task import SUBSTEPS, TIMESTEP, FingerGait, Frames, touching
+from farm.sim.engines import DataEngine
+from farm.sim.camera import Camera
+from farm.sim.sim import Sim
 
-_CAMERA: Final = {"distance": 0.42, "azimuth": 150.0, "elevation": -14.0}
-_LOOK_AT: Final = (0.035, 0.014, 0.0)
 _CLOSING: Final = 10.0  # [s]
 _PUSH: Final = 2000.0  # of the mouse's spring, for each kg: MuJoCo's 100 are lost on an object of 50 g in a firm grip
 
 
-@dataclass(frozen=True)
-class Player:
-    """A policy and where its rollouts begin."""
-
-    scene: HandScene
-    task: FingerGait
-    policy: Policy
-    mu: FloatArray
-    """(P,)"""
-    state: FloatArray
-    """The simulator's at the moment of release."""
-    start: Frames
-    """(1,) what is measured there."""
-
-    def rollout(self, data: mujoco.MjData, step: Callable[[], bool]) -> int:
-        """One closed-loop rollout.
-
-        Args:
-          data: of the scene's model; begins at the release, whatever it was before.
-          step: advances it by one physics step; false ends the rollout.
-
-        Returns:
-          control steps begun; fewer than the task's where the object fell or `step` said so.
-        """
-        mujoco.mj_setState(self.scene.model, data, self.state, STATE)
-        weights = self.policy.weights(self.mu[None])
-        now, last = self.start, self.task.commands[None]
-        for t in range(self.task.config.steps):
-            actions = self.policy.actions(weights, self.task.observe(now, None))
-            last = self.policy.targets(actions, self.task.commands, last)
-            data.ctrl[:] = last[0]
-            for _ in range(SUBSTEPS):
-                if not step():
-                    return t + 1
-            now = self.scene.measure(data)
-            if not touching(now.force)[0]:
-                return t + 1
-        return self.task.config.steps
-
-
 def watch(
-    player: Player, wait: Callable[[float], bool], say: Callable[[str], object], *, speed: float, hold: float
+    model: mujoco.MjModel,
+    play: Callable[[Sim], int],
+    wait: Callable[[float], bool],
+    say: Callable[[str], object],
+    *,
+    camera: Camera | None,
+    speed: float,
+    hold: float,
 ) -> int:
-    """Open the viewer and play rollouts, one after the other, until its window is closed.
+    """Open the viewer and play rollouts, one after another, until its window is closed.
 
     Args:
-      player: what is played.
+      model: what is simulated; its look may be changed.
+      play: runs one rollout in a simulation that is shown, and returns the control steps it lasted.
       wait: sleeps so many seconds; true when it is time to end.
       say: told how the first rollout went.
+      camera: where it is seen from; without: MuJoCo's own.
       speed: 1 is real time.
-      hold: how long the hand rests after a rollout [s].
+      hold: how long the scene rests after a rollout [s].
 
     Returns:
       control steps played.
@@ -82,22 +47,19 @@ def watch(
     """
     _check_window()
     others = set(threading.enumerate())
-    player.scene.model.vis.map.stiffness = _PUSH
-    data = mujoco.MjData(player.scene.model)
-    mujoco.mj_setState(player.scene.model, data, player.state, STATE)
+    model.vis.map.stiffness = _PUSH
+    engine = DataEngine(model)
     played = 0
-    with mujoco.viewer.launch_passive(player.scene.model, data, show_left_ui=False, show_right_ui=False) as viewer:
-        with viewer.lock():
-            viewer.cam.lookat[:] = _LOOK_AT
-            for name, value in _CAMERA.items():
-                setattr(viewer.cam, name, value)
-        clock = _Clock(viewer, data, wait, speed)
+    with mujoco.viewer.launch_passive(model, engine.data, show_left_ui=False, show_right_ui=False) as viewer:
+        _look(viewer, camera)
+        clock = _Clock(viewer, engine.data, wait, speed, float(model.opt.timestep))
+        engine.pace = clock.step
         while clock.going:
-            steps = player.rollout(data, clock.step)
+            steps = play(Sim(engine))
             if not played:
                 say(f"the first rollout is over after {steps} control steps, others follow")
             played += steps
-            for _ in range(round(hold / TIMESTEP)):
+            for _ in range(round(hold / model.opt.timestep)):
                 if not clock.step():
                     break
     for drawing in set(threading.enumerate()) - others:
@@ -105,14 +67,22 @@ def watch(
     return played
 
 
+def _look(viewer: mujoco.viewer.Handle, camera: Camera | None) -> None:
+    if camera is None:
+        return
+    with viewer.lock():
+        viewer.cam.lookat[:] = camera.lookat
+        viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = camera.distance, camera.azimuth, camera.elevation
+
+
 class _Clock:
     """Steps the physics at the speed that is wanted, with the mouse's pushes."""
 
     def __init__(
-        self, viewer: mujoco.viewer.Handle, data: mujoco.MjData, wait: Callable[[float], bool], speed: float
+        self, viewer: mujoco.viewer.Handle, data: mujoco.MjData, wait: Callable[[float], bool], speed: float, step: float
     ) -> None:
         self._viewer, self._data, self._wait = viewer, data, wait
-        self._period = TIMESTEP / speed
+        self._period = step / speed
         self._next = time.monotonic()
         self.going = True
 
@@ -131,7 +101,7 @@ class _Clock:
 
 
 def _check_window() -> None:
-    """Whether a window can be opened: the viewer's own thread would fail without a word.
+    """Check that a window can be opened: the viewer's own thread would fail without a word.
 
     Raises:
       RunError: it cannot.

@@ -9,6 +9,7 @@ import numpy as np
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
+from farm.sim.camera import Camera
 
 if TYPE_CHECKING:
     import mujoco
@@ -74,20 +75,6 @@ class Channel:
     def names(self) -> tuple[str, ...]:
         """Labels, or numbers from 1."""
         return self.labels or tuple(str(i + 1) for i in range(self.shape[0]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Camera:
-    """Where pictures of a task are taken from, as MuJoCo's free camera has it."""
-
-    lookat: tuple[float, float, float]
-    """[m]"""
-    distance: float
-    """[m]"""
-    azimuth: float = 120.0
-    """[deg]"""
-    elevation: float = -15.0
-    """[deg]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,12 +203,16 @@ class Task:
         return self._model
 
     def compiled(self) -> "mujoco.MjModel":
-        """Compile the model from `sources`."""
+        """Compile the model."""
         from farm.sim.scene import compiled
 
+        return compiled(self.mjcf(), type(self).__name__)
+
+    def mjcf(self) -> str:
+        """The model as one MJCF text, from `sources`."""
         if "model.xml" not in self.sources:
             raise ConfigError(f"task {type(self).__name__} has no model: give it `xml`, an MJCF text")
-        return compiled(self.sources["model.xml"], type(self).__name__)
+        return self.sources["model.xml"]
 
     def engine(self, backend: "MakeEngine") -> "Engine":
         """What simulates: the backend's engine for the model, unless the task brings one."""
@@ -274,6 +265,10 @@ class Task:
     def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Values of the channels from what was measured, any leading shape; those measured under their names."""
         return {channel.name: frames[channel.name] for channel in self.channels}
+
+    def exported(self) -> dict[str, Any]:
+        """What an exported policy needs besides model, policy and start: arrays, numbers and texts, by name."""
+        return {}
 
     # What others know of it
 

@@ -81,6 +81,14 @@ class Environment(Task):
         model: mujoco.MjModel = self._first.unwrapped.model  # type: ignore[attr-defined]
         return model
 
+    def mjcf(self) -> str:
+        """An environment has no text of its own.
+
+        Raises:
+          ConfigError: always.
+        """
+        raise ConfigError(f"gym:{self.variant} is made by gymnasium: there is no MJCF text to export")
+
     @property
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Least and greatest action, (A,) each."""

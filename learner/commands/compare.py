@@ -11,7 +11,7 @@ from farm import settings as arguments
 from farm.errors import ConfigError, RunError
 from learner import comparison
 from learner.commands import recordings, view
-from learner.replay import again
+from learner.replay import loaded
 from learner.run import check_rerun
 from learner.run_folder import RunFolder
 
@@ -41,8 +41,9 @@ def main(words: Sequence[str]) -> int:
     runs = comparison.read(folders)
     shown = []
     for folder, run in zip(folders, runs, strict=True):
-        final = again(folder)
-        shown.append(Shown(run.name, final.stored.simulation.scene, run.progress, final.trajectory))
+        policy = loaded(folder)
+        found, final = policy.problem, policy.rollout().trajectory
+        shown.append(Shown(run.name, found.scene, found.spec, run.progress, final, found.task.camera))
     try:
         record_comparison(command.to, shown, comparison.table(runs))
     except OSError as error:

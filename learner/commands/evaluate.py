@@ -7,23 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from farm import settings as arguments
-from farm import tasks
+from farm import settings
 from farm.errors import ConfigError
 from farm.seeds import SEEDS
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
-from learner.run import simulate
+from learner.replay import loaded
 from learner.run_folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateCommand:
-    """The learnt mean policy on perturbed starts: friction, mass, object position and joint readings."""
+    """The learnt mean policy on perturbed starts and conditions, as its task draws them."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -44,37 +42,38 @@ class EvaluateCommand:
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(EvaluateCommand, words, "farm evaluate")
+    command = settings.parse(EvaluateCommand, words, "farm evaluate")
     figures = evaluate(RunFolder.open(command.run), command.rollouts, command.seed)
     if command.json:
         sys.stdout.write(json.dumps(figures, indent=2) + "\n")
         return 0
     table = Table(title=f"{figures['run']}, mean policy after generation {figures['generation']}")
-    for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "dropped"):
+    for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "ended early"):
         table.add_column(column, justify="left" if column == "conditions" else "right")
     for name in ("nominal", "perturbed"):
         row = figures[name]
         success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
         returns = [f"{row[key]:.3f}" for key in ("return_mean", "return_min", "return_max")]
-        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["dropped"]))
+        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["ended"]))
     Console().print(table)
     return 0
 
 
 def evaluate(folder: RunFolder, rollouts: int, seed: int) -> dict[str, Any]:
     """The figures, as the JSON shows them."""
-    generation, results = simulate(folder, evaluation_jobs(rollouts, seed))
-    judged = tasks.sizes(folder.read_config().task).success
-    parts = {"nominal": results[rollouts:], "perturbed": results[:rollouts]}
-    figures: dict[str, Any] = {"run": folder.name, "generation": generation, "seed": seed}
-    for name, part in parts.items():
-        returns = np.array([result.returns[0] for result in part])
+    policy = loaded(folder)
+    spec = policy.problem.spec
+    given = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
+    figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}
+    for name, rows in (("nominal", slice(rollouts, None)), ("perturbed", slice(rollouts))):
+        returns, flags = given.returns[rows], given.flags[rows]
         figures[name] = {
-            "rollouts": len(part),
-            "success_rate": float(np.mean([result.success[0] for result in part])) if judged else None,
+            "rollouts": len(returns),
+            "success_rate": float(flags[:, 0].mean()) if spec.success else None,
             "return_mean": float(returns.mean()),
             "return_min": float(returns.min()),
             "return_max": float(returns.max()),
-            "dropped": int(sum(result.dropped[0] for result in part)),
+            "ended": int(flags[:, 1].sum()),
+            "failed": int(flags[:, 2].sum()),
         }
     return figures

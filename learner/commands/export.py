@@ -10,7 +10,7 @@ import tyro
 from farm import settings as arguments
 from farm.errors import ConfigError
 from learner import export
-from learner.replay import stored
+from learner.replay import loaded
 from learner.run_folder import RunFolder
 
 
@@ -36,7 +36,7 @@ class ExportCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ExportCommand, words, "farm export")
-    policy = stored(RunFolder.open(command.run), command.generation)
+    policy = loaded(RunFolder.open(command.run), command.generation)
     export.write(command.to, policy)
     size = command.to.stat().st_size
     sys.stdout.write(f"mean policy after generation {policy.generation} written to {command.to}, {size >> 10} KiB\n")

@@ -159,13 +159,18 @@ def parse(
     return settings.parse(kind, words, program, default), resumed, begin
 
 
+def plugin_path(kind: str, name: str) -> str:
+    """A plug-in's name as config.json has it: a file's with its whole path."""
+    return plugins.find(kind, name).name
+
+
 def _with_names(words: Sequence[str]) -> list[str]:
     """The words, with plug-ins in files named by their whole paths: a run can then be repeated from anywhere."""
     out = list(words)
     for flag, kind in (("--task", "tasks"), ("--policy", "policies"), ("--algorithm", "algorithms")):
         for i, word in enumerate(out):
             if word == flag and i + 1 < len(out):
-                out[i + 1] = plugins.find(kind, out[i + 1]).name
+                out[i + 1] = plugin_path(kind, out[i + 1])
             elif word.startswith(f"{flag}="):
-                out[i] = f"{flag}={plugins.find(kind, word.partition('=')[2]).name}"
+                out[i] = f"{flag}={plugin_path(kind, word.partition('=')[2])}"
     return out

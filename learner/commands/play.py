@@ -1,34 +1,45 @@
 """`farm play`: the learnt policy in MuJoCo's interactive viewer."""
 
+import copy
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from farm import settings as arguments
+from farm import settings
 from farm.commands import logs
 from farm.commands.screen import display
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError
+from farm.sim.engines import DataEngine
+from farm.sim.sim import Sim
+from farm.tasks.base import TaskConfig
+from farm.tasks.loop import Batch
 from learner.commands.learning import INTERRUPTED
+from learner.commands.replay import task_of
+from learner.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from learner.replay import LoadedPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayCommand:
-    """The learnt policy in MuJoCo's interactive viewer, over and over; Ctrl+drag pushes the object."""
+    """The learnt policy in MuJoCo's interactive viewer, over and over; Ctrl+drag pushes."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     generation: int | None = None
     """Generation whose mean policy is played, 0 for the first; None: the last."""
-    object: str | None = None
-    """Another object to hold: the name of a file in assets/objects."""
     speed: float = 1.0
     """1 is real time."""
     hold: float = 2.0
-    """How long the hand rests before it begins again [s]."""
+    """How long the scene rests before it begins again [s]."""
+    task: TaskConfig = field(default_factory=TaskConfig)
+    """Settings of the task, the run's own unless given."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -42,29 +53,43 @@ class PlayCommand:
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(PlayCommand, words, "farm play")
-    from learner.replay import stored
-    from learner.run_folder import RunFolder
+    own = task_of(words)
+    default = PlayCommand(run=tyro.MISSING, task=own or TaskConfig())
+    command = settings.parse(PlayCommand, words, "farm play", default)
+    from learner.replay import loaded
 
-    folder = RunFolder.open(command.run)
-    policy = stored(folder, command.generation, command.object)
+    policy = loaded(RunFolder.open(command.run), command.generation, command.task)
     if not display():
         raise ConfigError(
-            f"no display to open a window on: farm replay {command.run} --video gait.gif draws without one"
+            f"no display to open a window on: farm replay {command.run} --video rollout.gif draws without one"
         )
-    from farm.sim.rendering import lit
-    from farm.sim.viewer import Player, watch
+    from farm.sim.viewer import watch
 
-    simulation = policy.simulation
-    start = simulation.start
-    scene = lit(simulation.scene.object_name)
-    player = Player(scene, simulation.task, simulation.policy, policy.mu, start.rows[0], start.frames.at([0]))
     logs.set_up("WARNING")
-    _say(f"mean policy after generation {policy.generation}; double-click the object, then push it by Ctrl and drag")
+    _say(f"mean policy after generation {policy.generation}; double-click a body, then push it by Ctrl and drag")
+    task = policy.problem.task
+    task.setup(Sim(DataEngine(task.model)))
     with stop_flag("ending") as stop:
-        played = watch(player, stop.wait, _say, speed=command.speed, hold=command.hold)
+        played = watch(
+            copy.copy(task.model), _rollout(policy), stop.wait, _say, camera=task.camera, speed=command.speed,
+            hold=command.hold,
+        )  # fmt: skip
     _say(f"{played} control steps played")
     return INTERRUPTED if stop.is_set() else 0
+
+
+def _rollout(policy: "LoadedPolicy") -> Callable[[Sim], int]:
+    """One nominal rollout in a simulation that is shown; control steps that it lasted."""
+    found = policy.problem
+    prepared = found.policy.prepare(policy.mu[None])
+
+    def play(sim: Sim) -> int:
+        batch = Batch(found.task, sim, [None])
+        while not batch.over and not sim.engine.over:  # type: ignore[attr-defined]  # a DataEngine
+            batch.step(found.policy.act(prepared, batch.observe()))
+        return sim.t
+
+    return play
 
 
 def _say(line: str) -> None:

@@ -46,6 +46,8 @@ class RecordCommand:
     """Folder with certificates: a viewer's bundle."""
     name: str = ""
     """Which viewer's, where the folder holds several."""
+    allow_file: tuple[Path, ...] = ()
+    """Use the task or policy in this file, repeatable, where the run's is a class in a file on the learner's machine."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -89,6 +91,7 @@ def main(words: Sequence[str]) -> int:
 def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
     """Follow a run to its end, or until stopped."""
     from learner.recording.remote import open_remote
+    from learner.setup import problem
     from learner.telemetry.subscriber import Subscriber, find_run
 
     bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
@@ -97,10 +100,16 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
         # The session goes first: the learner waits for that at the end, while the file is still being merged.
         with session.connect(endpoints, None, stopped, bundle) as link:
             run = command.run or find_run(link, command.farm, stopped)
-            follower = Subscriber(link, command.farm, run)
-            name, config = follower.begin(stopped)
+            follower = Subscriber(link, command.farm, run, command.allow_file)
+            name, config, files = follower.begin(stopped)
             path = command.out / run if command.file else None
-            remote = kept.enter_context(open_remote(path, name=name, config=config, serve=command.address))
+            shown = problem(config, files=files)
+            remote = kept.enter_context(
+                open_remote(
+                    path, name=name, config=config, serve=command.address, spec=shown.spec, scene=shown.scene,
+                    camera=shown.task.camera,
+                )  # fmt: skip
+            )
             _announce(run, remote, spawn=command.spawn)
             remote.follow(follower, stopped)
         return remote

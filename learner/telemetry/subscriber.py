@@ -3,7 +3,8 @@
 import logging
 import time
 from collections.abc import Callable, Iterator
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from farm.errors import ConfigError, Interrupted, MessageError, RunError
 from farm.net import codec, keys
@@ -46,8 +47,9 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
 class Subscriber:
     """Reads one run's reports as they come, and asks the learner for those it missed."""
 
-    def __init__(self, session: Session, farm: str, run: str) -> None:
-        """Subscribe: what is published from now on is not missed."""
+    def __init__(self, session: Session, farm: str, run: str, files: tuple[Path, ...] = ()) -> None:
+        """Subscribe: what is published from now on is not missed; `files` are those whose classes may be used."""
+        self._files = files
         self._session, self._run, self._key = session, run, keys.history(farm, run)
         self._done, self._incarnation = 0, ""
         self._config: RunConfig | None = None
@@ -56,8 +58,8 @@ class Subscriber:
         session.subscribe("history", self._key)
         session.watch("learner", keys.learner_token(farm, run))
 
-    def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig]:
-        """The recording's id and the run's configuration, as soon as its learner is there.
+    def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig, dict[str, str]]:
+        """The recording's id, the run's configuration and its task's texts, as soon as its learner is there.
 
         Raises:
           ConfigError: the configuration is none of this release.
@@ -68,8 +70,8 @@ class Subscriber:
         while not stopped():
             page = self._ask()
             if page is not None:
-                self._config = configs.from_dict(page.config, f"run {self._run}")
-                return page.recording, self._config
+                self._config = self._read(page)
+                return page.recording, self._config, page.files
             if not told:
                 log.info("waiting for the learner of run %s", self._run)
                 told = True
@@ -143,13 +145,37 @@ class Subscriber:
 
     def _recognise(self, page: RunHistory) -> None:
         """See that a learner that comes back goes on with the run we know."""
-        config = configs.from_dict(page.config, f"run {self._run}")
+        config = self._read(page)
         if self._config is not None:
             for name, old, new in other(self._config, config):
                 raise RunError(f"run {self._run} began anew: --{name} was {old} and is {new}; start a recorder anew")
         if self._incarnation:
             log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
         self._incarnation = page.incarnation
+
+
+    def _read(self, page: RunHistory) -> RunConfig:
+        """The run's configuration; classes in files are those of this machine's files of the same names."""
+        return configs.from_dict(localised(page.config, self._files), f"run {self._run}")
+
+
+def localised(config: dict[str, Any], files: tuple[Path, ...]) -> dict[str, Any]:
+    """A configuration whose classes in files are looked for in these files.
+
+    Raises:
+      ConfigError: one is in a file that is none of them.
+    """
+    out = dict(config)
+    for part in ("task", "policy", "algorithm"):
+        table = config.get(part)
+        path, _, inside = str(table.get("name") if isinstance(table, dict) else "").rpartition(":")
+        if isinstance(table, dict) and path.endswith(".py"):
+            here = [file for file in files if file.name == Path(path).name]
+            if not here:
+                name = Path(path).name
+                raise ConfigError(f"the run's {part} is a class in {name}: copy it here, and give --allow-file {name}")
+            out[part] = {**table, "name": f"{here[0].resolve()}:{inside}"}
+    return out
 
 
 def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:

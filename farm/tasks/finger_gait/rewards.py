@@ -135,3 +135,11 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
     ended = dropped | failed
     out[rows[ended], last[ended], 4] = -weights.drop
     return out
+
+
+def factors(reward: str, weights: Weights, goal: Demonstration) -> FloatArray:
+    """Factors of the squares that a reward takes off: tactile, joints, action, contact points, (4,)."""
+    full = float(reward != "basic")
+    touch = full * weights.tactile / float(_squares(goal.images.reshape(-1)))
+    near = weights.joints / float(_squares(goal.joints))
+    return np.array([touch, near, weights.action, full * weights.contact_points])

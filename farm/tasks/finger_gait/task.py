@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final, Literal
 
-import mujoco
 import numpy as np
 
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.settings import setting
-from farm.sim.scene import compiled
 from farm.sim.sim import Sim
 from farm.tasks.base import Camera, Channel, Record, Score, Task, TaskConfig, TaskSpec
 from farm.tasks.finger_gait import model, rewards, touch
@@ -175,9 +173,9 @@ class FingerGait(Task):
         """Hand, object, and what the task adds."""
         return model.files(self.config.object)
 
-    def compiled(self) -> mujoco.MjModel:
-        """Compile them."""
-        return compiled(model.mjcf(self.sources), f"object {self.config.object}")
+    def mjcf(self) -> str:
+        """One text of them."""
+        return model.mjcf(self.sources)
 
     @cached_property
     def hand(self) -> model.Hand:
@@ -356,6 +354,33 @@ class FingerGait(Task):
             "contacts/push": np.concatenate([centres + points * TIP_RADIUS, push], axis=-1),
             "joints/position": frames["qpos"][..., : len(JOINTS)],
             "joints/target": frames["target"],
+        }
+
+
+    def exported(self) -> dict[str, Any]:
+        """Everything that `observe`, `act` and `score` use."""
+        config, goal, weights = self.config, self.goal, WEIGHTS[self.config.weights]
+        limits = (LOWER, UPPER) if config.clip else (np.full(8, -_TARGET_LIMIT), np.full(8, _TARGET_LIMIT))
+        punished = UPPER - LOWER if config.reward == "limited" else np.full(len(JOINTS), np.inf)
+        return {
+            "joints": np.array(JOINTS),
+            "tips": np.array([f"{finger}_tip" for finger in FINGERS]),
+            "action": config.action,
+            "lower": limits[0],
+            "upper": limits[1],
+            "start_command": self.start_commands,
+            "input": config.state,
+            "joints_scale": config.joints_scale,
+            "contacts_scale": config.contacts_scale,
+            "tactile_scale": config.tactile_scale,
+            "taxels": touch.DIRECTIONS,
+            "kappa": touch.KAPPA,
+            "weights": rewards.factors(config.reward, weights, goal),
+            "punished_to": punished,
+            "drop_penalty": weights.drop,
+            "goal_joints": goal.joints,
+            "goal_images": goal.images,
+            "goal_points": goal.points,
         }
 
 

@@ -1,0 +1,142 @@
+"""`farm check`: tells the author of a task in seconds what is wrong with it."""
+
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from farm import seeds, settings
+from farm.arrays import FloatArray
+from farm.commands.screen import draw_offscreen
+from farm.errors import ConfigError, FarmError, RunError, TaskError
+from farm.tasks.base import TaskConfig
+from learner.commands.options import plugin_path
+from learner.config import RunConfig
+
+ROWS = 8
+"""Rollouts that are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckCommand:
+    """Checks a task: sizes, bounds, same bits however its rollouts are batched, rollouts per second, a picture."""
+
+    name: tyro.conf.Positional[str]
+    """The task: a name, gym:NAME, or FILE.py:CLASS."""
+    picture: Path | None = None
+    """Picture of the start to write, NAME.png; None: the task's name."""
+    task: TaskConfig = field(default_factory=TaskConfig)
+    """Settings of the task."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    name = next((word for word in words if not word.startswith("-")), None)
+    own = None if name is None else RunConfig(task=plugin_path("tasks", name))
+    default = CheckCommand(name=tyro.MISSING, task=own.task_config if own else TaskConfig())
+    command = settings.parse(CheckCommand, words, "farm check", default)
+    assert own is not None
+    draw_offscreen()
+    try:
+        for line in checked(RunConfig(task=own.task, task_config=command.task), command.picture):
+            sys.stdout.write(f"{line}\n")
+            sys.stdout.flush()
+    except FarmError:
+        raise
+    except Exception as error:  # the author's own code: its traceback says where
+        sys.stderr.write("".join(_own_frames(error, command.name)))
+        raise RunError(f"{command.name} failed: {type(error).__name__}: {error}") from None
+    return 0
+
+
+def _own_frames(error: Exception, name: str) -> list[str]:
+    """The part of a traceback that lies in the task's own file; all of it where there is none."""
+    path = Path(name.rpartition(":")[0]).resolve()
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if frame.filename == str(path)] or list(frames)
+    return traceback.format_list(own)
+
+
+def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
+    """Lines about a task, as they are found out.
+
+    Raises:
+      TaskError: rollouts depend on their batch, or an array is wrong.
+    """
+    from learner.setup import problem
+
+    found = problem(config)
+    spec, model = found.spec, found.task.model
+    low, high = found.task.limits
+    yield f"observation {spec.observation}, actions {spec.action}, controls {model.nu} from {low} to {high}"
+    yield f"{spec.steps} control steps of {spec.period:g} s; reward of {', '.join(spec.terms)}"
+    yield f"success: {'yes' if spec.success else 'none'}; channels: {', '.join(c.name for c in spec.channels) or 'none'}"
+    yield f"policy {config.policy} with {found.policy.size} parameters"
+    runner = found.runner()
+    theta = np.random.default_rng(0).normal(0.0, 0.5, (ROWS, found.policy.size))
+    drawn = [None if i == 0 else seeds.trial(0, i // 2) for i in range(ROWS)]
+    together = runner.rollouts(theta, drawn)
+    yield f"returns {together.returns.min():.4g} to {together.returns.max():.4g}, {int(together.ended.sum())} ended early"
+    if together.failed.any():
+        yield f"warning: the physics of {int(together.failed.sum())} of {ROWS} rollouts blew up"
+    order = np.random.default_rng(1).permutation(ROWS)
+    permuted = runner.rollouts(theta[order], [drawn[i] for i in order])
+    _same(_arrays(together), {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()}, "in another order")
+    for row in range(ROWS):
+        alone = runner.rollouts(theta[row : row + 1], [drawn[row]])
+        _same({k: v[row] for k, v in _arrays(together).items()}, {k: v[0] for k, v in _arrays(alone).items()}, "alone")
+    runner.trajectory(together, 0)
+    yield "same bits together, in another order, and one by one"
+    begun, many = time.perf_counter(), np.tile(theta, (4, 1))
+    runner.rollouts(many, drawn * 4)
+    yield f"{len(many) / (time.perf_counter() - begun):.0f} rollouts/s on one core"
+    yield _picture(found, together.start["qpos"][0], picture)
+
+
+def _arrays(rollouts: object) -> dict[str, FloatArray]:
+    """Everything that must not depend on the batch, the earliest cause first."""
+    start, frames = (getattr(rollouts, name) for name in ("start", "frames"))
+    out = {f"{name} at the start": values for name, values in start.items()}
+    out |= {"actions": getattr(rollouts, "actions"), **frames}  # noqa: B009  by name like the others
+    return out | {name: getattr(rollouts, name) for name in ("terms", "returns", "success", "ended")}
+
+
+def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str) -> None:
+    """Compare arrays bit for bit.
+
+    Raises:
+      TaskError: names the first that differs.
+    """
+    for name, values in first.items():
+        if values.tobytes() != np.ascontiguousarray(second[name]).tobytes():
+            most = np.abs(np.asarray(values, float) - np.asarray(second[name], float)).max()
+            raise TaskError(
+                f"{name} differs (by up to {most:.3g}) when the same rollouts run {how}: rows of a batch must not depend "
+                "on each other, and the task object must not remember anything of a rollout"
+            )
+
+
+def _picture(found: object, qpos: FloatArray, path: Path | None) -> str:
+    """Draw the start, and say where."""
+    from farm.sim import rendering
+    from learner.setup import Problem
+
+    assert isinstance(found, Problem)
+    target = path or Path(f"{type(found.task).__name__.lower()}.png")
+    if target.suffix != ".png":
+        raise ConfigError(f"--picture {target}: expected a name that ends in .png")
+    try:
+        from PIL import Image
+    except ImportError:
+        return "no picture: it needs pillow (pip install pillow)"
+    try:
+        [drawn] = rendering.pictures(found.task.model, qpos[None], (480, 360), camera=found.task.camera)
+        Image.fromarray(drawn).save(target)
+    except (RunError, OSError) as error:
+        return f"no picture: {error}"
+    return f"the start: {target}"

@@ -1,0 +1,41 @@
+"""`farm new-task`: writes a task of your own to start from."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import tyro
+
+from farm import settings
+from farm.errors import ConfigError
+
+TEMPLATE = "task_template.py.txt"
+"""The file it writes, in this package; `Pendulum` stands for the name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewTaskCommand:
+    """Writes NAME.py, a task of 30 lines that runs: change it into yours."""
+
+    name: tyro.conf.Positional[str]
+    """Name of the task: letters, digits and _; the class is called after it."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    name = settings.parse(NewTaskCommand, words, "farm new-task").name.replace("-", "_")
+    if not (name.isidentifier() and name.isascii()):
+        raise ConfigError(f"{name!r} is no name of a task; expected letters, digits and _, a letter first")
+    path, inside = Path(f"{name}.py"), "".join(part.capitalize() for part in name.split("_"))
+    text = (files("learner.commands") / TEMPLATE).read_text("utf-8").replace("Pendulum", inside)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise ConfigError(f"{path} exists and is not overwritten: take another name") from None
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+    sys.stdout.write(f"written to {path}; next:\n  farm check {path}:{inside}\n  farm run --task {path}:{inside}\n")
+    return 0
