@@ -10,7 +10,8 @@ Pure, batched. One action a_i for each of A controlled joints, the hand's eight 
     z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
 
 A rollout's numbers must not depend on who shares its batch. Matrix products over a batch do that (they change
-their order of summation with the shape), so sums here are spelt out or run row by row.
+their order of summation with the shape), so sums here are spelt out or run row by row. Nor on the processor: exp and
+cos are those of `farm/elementary.py`.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from farm import elementary
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.hand import LOWER, UPPER
@@ -106,7 +108,7 @@ class Policy:
             if self.config.controller == "projected":
                 return np.stack([[self.features(joint) for joint in rollout] for rollout in theta])
             if self.config.controller == "cosine":
-                return np.cos(theta)
+                return elementary.cos(theta)
             return theta
 
     def actions(self, weights: FloatArray, x: FloatArray) -> FloatArray:
@@ -128,14 +130,16 @@ class Policy:
     def features(self, x: FloatArray) -> FloatArray:
         """z(x) of one state, (d,) -> (D,)."""
         angle = self._phases.copy()
+        product = np.empty_like(angle)
         for row, value in zip(self._rows, x, strict=True):
-            angle += row * value
-        return self._scale * np.cos(angle)
+            np.multiply(row, value, out=product)
+            angle += product
+        return self._scale * elementary.cos(angle)
 
     def _kernel(self, theta: FloatArray, x: FloatArray) -> FloatArray:
         difference = theta - x[:, None, :]
         squares = (difference * difference).sum(axis=-1)
-        return np.exp(squares * (-0.5 / self.config.bandwidth**2))
+        return elementary.exp(squares * (-0.5 / self.config.bandwidth**2))
 
     def targets(self, actions: FloatArray, start: FloatArray, last: FloatArray) -> FloatArray:
         """Joint targets.

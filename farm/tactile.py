@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from farm import elementary
 from farm.arrays import FloatArray
 from farm.hand import TIP_RADIUS
 
@@ -37,7 +38,8 @@ KAPPA: Final = 8.0
 
 def _directions() -> FloatArray:
     pitch, across = np.meshgrid(ROWS + TILT, COLUMNS, indexing="ij")
-    xyz = [np.cos(across) * np.sin(pitch), np.sin(across), np.cos(across) * np.cos(pitch)]
+    wide, sideways = elementary.cos(across), elementary.sin(across)
+    xyz = [wide * elementary.sin(pitch), sideways, wide * elementary.cos(pitch)]
     directions = np.stack(xyz, axis=-1).reshape(TAXELS, 3)
     directions.flags.writeable = False
     return directions
@@ -82,7 +84,7 @@ def _spread(force: FloatArray, position: FloatArray) -> FloatArray:
         + (y / length)[:, None] * DIRECTIONS[:, 1]
         + (z / length)[:, None] * DIRECTIONS[:, 2]
     )
-    weight = np.exp(KAPPA * (cosine - 1.0))
+    weight = elementary.exp(KAPPA * (cosine - 1.0))
     weight *= (force / weight.sum(axis=-1))[:, None]
     return weight
 
