@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.arrays import FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.finished import Stored
 from farm.hand import FINGERS, GRIPS
-from farm.tasks.finger_gait import MAX_SHIFT, MAX_TURN, PRESSES, SUBSTEPS, SUCCESS_STEPS, Perturbation, moved, touching
+from farm.tasks.finger_gait import PRESSES, SUBSTEPS, SUCCESS_STEPS, Perturbation, stayed, touching
 from workers.simulation import CAPACITY
 
 
@@ -75,7 +75,7 @@ def _run(policies: Sequence[Stored], perturbations: Sequence[Perturbation], step
         pressing = now.force.sum(axis=-1)
         acting[active, t], force[active, t] = turn[active], pressing
         felt[active] = np.where(((pressing >= PRESSES) == goals[turn[active]]).all(axis=-1), felt[active] + 1, 0)
-        going = _held(now.pose, released[active]) & touching(now.force) & ~stepper.blown_up(active)
+        going = stayed(now.pose, released[active]) & touching(now.force) & ~stepper.blown_up(active)
         there = active[going & (felt[active] >= SUCCESS_STEPS)]
         changes[there] += 1
         turn[there] = (turn[there] + 1) % len(policies)
@@ -84,9 +84,3 @@ def _run(policies: Sequence[Stored], perturbations: Sequence[Perturbation], step
         if not len(active):
             break
     return Chained(changes, acting, force)
-
-
-def _held(pose: FloatArray, released: FloatArray) -> BoolArray:
-    """Whether the object is where success wants it."""
-    shift, turned = moved(pose, released)
-    return np.asarray((shift <= MAX_SHIFT) & (turned <= MAX_TURN))
