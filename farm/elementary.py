@@ -71,7 +71,7 @@ def sin(x: FloatArray) -> FloatArray:
 
 def _blockwise(function: Callable[[FloatArray, FloatArray], None], x: FloatArray) -> FloatArray:
     """Call function(x, out) on parts of at most _BLOCK elements."""
-    flat = np.ravel(np.asarray(x, dtype=np.float64))
+    flat = np.asarray(x, dtype=np.float64).ravel()
     out = np.empty(flat.size)
     with np.errstate(all="ignore"):
         for first in range(0, flat.size, _BLOCK):

@@ -48,6 +48,8 @@ def _directions() -> FloatArray:
 DIRECTIONS: Final = _directions()
 """Unit vectors from the fingertip's centre to its taxels, in its frame, row by row, (18, 3)."""
 
+_AXES: Final = np.ascontiguousarray(DIRECTIONS.T)  # (3, 18)
+
 
 def positions() -> FloatArray:
     """Places of the taxels in the fingertip's frame [m], (18, 3)."""
@@ -84,7 +86,9 @@ def _spread(force: FloatArray, position: FloatArray) -> FloatArray:
         + (y / length)[:, None] * DIRECTIONS[:, 1]
         + (z / length)[:, None] * DIRECTIONS[:, 2]
     )
-    weight = elementary.exp(KAPPA * (cosine - 1.0))
+    cosine -= 1.0
+    cosine *= KAPPA
+    weight = elementary.exp(cosine)
     weight *= (force / weight.sum(axis=-1))[:, None]
     return weight
 
@@ -101,4 +105,4 @@ def contact_points(images: FloatArray) -> FloatArray:
     images = np.ascontiguousarray(images)  # numpy sums in the order of the memory
     total = images.sum(axis=-1)
     share = images / np.where(total > 0, total, 1.0)[..., None]
-    return np.stack([(share * DIRECTIONS[:, axis]).sum(axis=-1) for axis in range(3)], axis=-1)
+    return (share[..., None, :] * _AXES).sum(axis=-1)
