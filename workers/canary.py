@@ -1,8 +1,9 @@
 """A fingerprint of this machine's numbers: a few rollouts, compared bit for bit.
 
-Processors, compilers and library versions round differently. Machines with the same canary digest
-give the same numbers for the same jobs; the canary goes through everything that a rollout is made
-of: products and cosines of the policy, taxels, contact points, rewards, grips, perturbed physics.
+Kinds of processors, compilers and library versions round differently (x86-64 processors with AVX2 do not among
+themselves: docs/protocol.md). Machines with the same canary digest give the same numbers for the same jobs; the canary
+goes through everything that a rollout is made of: products and cosines of the policy, taxels, contact points, rewards,
+grips, perturbed physics.
 """
 
 import hashlib
