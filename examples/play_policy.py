@@ -5,10 +5,35 @@
 `farm export RUN POLICY.npz` writes the file; docs/export.md says what is in it.
 """
 
+import math
 import sys
 
 import mujoco
 import numpy as np
+
+# Parts of pi and ln 2, and coefficients, of the two functions below.
+PI = tuple(map(float.fromhex, ("0x1.921fb54400000p+1", "0x1.0b4611a600000p-33", "0x1.3198a2e037073p-68")))
+LN2 = tuple(map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
+SINE = (
+    *(2.7314447669863995e-15, -7.643970296798572e-13, 1.6058977312464087e-10, -2.5052107616996182e-08),
+    *(2.7557319219163234e-06, -0.00019841269841254974, 0.008333333333333316, -0.16666666666666666),
+)
+COTH = (-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 / 6, 2.0)
+
+
+def cos(x: np.ndarray) -> np.ndarray:
+    """Cosine of |x| < 10^6, with the same bits on every processor; numpy's has others on some."""
+    k = np.floor(x * (1.0 / math.pi))
+    r = (k + 0.5) * PI[0] - x + (k + 0.5) * PI[1] + (k + 0.5) * PI[2]
+    r = np.where(k % 2 == 0, r, -r)
+    return r + np.polyval(SINE, r * r) * (r * r) * r
+
+
+def exp(x: np.ndarray) -> np.ndarray:
+    """e^x of |x| < 700, the same way."""
+    k = np.rint(x * float.fromhex("0x1.71547652b82fep+0"))
+    r = x - k * LN2[0] - k * LN2[1]
+    return np.ldexp(1.0 + 2.0 * (r / (np.polyval(COTH, r * r) - r)), k.astype(int))
 
 
 class Policy:
@@ -24,7 +49,7 @@ class Policy:
         self.theta = self.p["mu"].reshape(8, -1)
         self.rows = np.ascontiguousarray((self.p["W"] / self.p["bandwidth"]).T)  # one a state component
         if self.p["controller"] in ("projected", "cosine"):
-            maps = {"projected": lambda rows: np.stack([self.features(row) for row in rows]), "cosine": np.cos}
+            maps = {"projected": lambda rows: np.stack([self.features(row) for row in rows]), "cosine": cos}
             self.theta = maps[self.p["controller"]](self.theta)
 
     def reset(self) -> None:
@@ -36,7 +61,8 @@ class Policy:
         """One action (8,) [rad]; the servos' targets follow from it."""
         if self.p["controller"] == "kernel":
             difference = self.theta - self.x
-            a = np.exp((difference * difference).sum(axis=-1) * (-0.5 / self.p["bandwidth"] ** 2))
+            powers = (difference * difference).sum(axis=-1) * (-0.5 / self.p["bandwidth"] ** 2)
+            a = np.array([math.exp(power) for power in powers])
         else:
             a = (self.theta * self.features(self.x)).sum(axis=-1)
         base = {"offset": self.p["start_command"], "absolute": 0.0, "increment": self.last}[self.p["action"]]
@@ -51,7 +77,7 @@ class Policy:
         angle = self.p["c"].copy()
         for row, value in zip(self.rows, x, strict=True):
             angle += row * value
-        return np.sqrt(2.0 / len(angle)) * np.cos(angle)
+        return np.sqrt(2.0 / len(angle)) * cos(angle)
 
     def feel(self) -> tuple[np.ndarray, np.ndarray, bool]:
         """Taxels (3, 18) [N], their centres of force (3, 3) [radii], and whether anything is touched at all."""
@@ -66,7 +92,7 @@ class Policy:
                     length = np.sqrt(x * x + y * y + z * z) or 1.0
                     u = self.p["taxels"]
                     cosine = x / length * u[:, 0] + y / length * u[:, 1] + z / length * u[:, 2]
-                    weight = np.exp(self.p["kappa"] * (cosine - 1.0))
+                    weight = exp(self.p["kappa"] * (cosine - 1.0))
                     images[finger] += weight * (normal / weight.sum())
                     any_contact = True
         total = images.sum(axis=-1)

@@ -230,7 +230,7 @@ class Learner:
             sigma_mean=float(state.sigma.mean()),
             sigma_min=float(state.sigma.min()),
             sigma_max=float(state.sigma.max()),
-            mean_norm=float(np.linalg.norm(state.mu)),
+            mean_norm=float(np.sqrt((state.mu * state.mu).sum())),
             ended=ended,
             failed=failed,
             clamped=clamped,

@@ -39,8 +39,8 @@ DOORS = {
 
 PURE = (
     *("farm/arrays.py", "farm/errors.py", "farm/hand.py", "farm/keys.py", "farm/policy.py", "farm/rewards.py"),
-    *("farm/states.py", "farm/tactile.py", "farm/trajectory.py", "farm/tasks/", "learner/algorithms/"),
-    *("learner/ledger/", "learner/progress.py", "workers/jobs.py"),
+    *("farm/states.py", "farm/tactile.py", "farm/trajectory.py", "farm/tasks/", "farm/elementary.py"),
+    *("learner/algorithms/", "learner/ledger/", "learner/progress.py", "workers/jobs.py"),
     *(f"learner/experiments/{name}.py" for name in ("experiment", "catalogue", "claims", "findings", "shapes")),
 )
 """Modules without network, simulator, clock or file."""

@@ -9,18 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.arrays import FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS
 from farm.tasks.finger_gait.physics import CAPACITY
 from farm.tasks.finger_gait.task import (
-    MAX_SHIFT,
-    MAX_TURN,
     PRESSES,
     SUBSTEPS,
     SUCCESS_STEPS,
     Perturbation,
-    moved,
+    stayed,
     touching,
 )
 from learner.replay import Stored
@@ -84,7 +82,7 @@ def _run(policies: Sequence[Stored], perturbations: Sequence[Perturbation], step
         pressing = now.force.sum(axis=-1)
         acting[active, t], force[active, t] = turn[active], pressing
         felt[active] = np.where(((pressing >= PRESSES) == goals[turn[active]]).all(axis=-1), felt[active] + 1, 0)
-        going = _held(now.pose, released[active]) & touching(now.force) & ~stepper.blown_up(active)
+        going = stayed(now.pose, released[active]) & touching(now.force) & ~stepper.blown_up(active)
         there = active[going & (felt[active] >= SUCCESS_STEPS)]
         changes[there] += 1
         turn[there] = (turn[there] + 1) % len(policies)
@@ -93,9 +91,3 @@ def _run(policies: Sequence[Stored], perturbations: Sequence[Perturbation], step
         if not len(active):
             break
     return Chained(changes, acting, force)
-
-
-def _held(pose: FloatArray, released: FloatArray) -> BoolArray:
-    """Whether the object is where success wants it."""
-    shift, turned = moved(pose, released)
-    return np.asarray((shift <= MAX_SHIFT) & (turned <= MAX_TURN))

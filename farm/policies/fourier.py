@@ -8,14 +8,18 @@ One action a_i for each of A controlled joints or actuators:
     cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters an action (thesis 5.2, future work)
 
     z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
+
+Numpy's exp and cos depend on the processor: these are the C library's, number by number, and `farm/elementary.py`'s.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
+from farm import elementary
 from farm.arrays import FloatArray
 from farm.policies.base import Policy, PolicyConfig, check_constants
 from farm.settings import setting
@@ -57,7 +61,9 @@ class Kernel(Policy):
         difference = np.ascontiguousarray(prepared) - np.ascontiguousarray(x)[:, None, :]
         with np.errstate(over="ignore", invalid="ignore"):
             squares = (difference * difference).sum(axis=-1)
-            return np.exp(squares * (-0.5 / self.config.bandwidth**2))
+        exponents = squares * (-0.5 / self.config.bandwidth**2)
+        # Number by number: of the few that one step has, numpy's calls for `elementary.exp` would take longer.
+        return np.array(list(map(math.exp, exponents.ravel().tolist()))).reshape(exponents.shape)
 
 
 class Direct(Policy):
@@ -98,9 +104,11 @@ class Direct(Policy):
     def features(self, x: FloatArray) -> FloatArray:
         """z(x) of one observation, (d,) -> (D,)."""
         angle = self.constants["phases"].copy()
+        product = np.empty_like(angle)
         for row, value in zip(self._rows, x, strict=True):
-            angle += row * value
-        return self._scale * np.cos(angle)
+            np.multiply(row, value, out=product)
+            angle += product
+        return self._scale * elementary.cos(angle)
 
 
 class Projected(Direct):
@@ -124,7 +132,7 @@ class Cosine(Direct):
     def prepare(self, theta: FloatArray) -> FloatArray:
         """Weights of the features, (B, A, D)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.cos(_by_action(theta, self.spec.action))
+            return elementary.cos(_by_action(theta, self.spec.action))
 
 
 def _by_action(theta: FloatArray, actions: int) -> FloatArray:

@@ -1,6 +1,7 @@
 """The numbers learnt are the same to the last bit, whatever happens to the farm."""
 
 import os
+import platform
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -126,3 +127,40 @@ def test_workers_serve_two_learners(farm: Farm, reference: dict[str, Any]) -> No
         assert learner.returncode == 0, said
     for name in "ab":
         assert farm.summary(name)["parameters_sha256"] == reference["parameters_sha256"]
+
+
+_AVX512 = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL"  # names of several releases
+
+PROCESSORS = {
+    "as it is": {},
+    "BLAS of 2004": {"OPENBLAS_CORETYPE": "Prescott"},
+    "BLAS of 2013": {"OPENBLAS_CORETYPE": "Haswell"},
+    "BLAS of 2017": {"OPENBLAS_CORETYPE": "SkylakeX"},
+    "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": _AVX512},
+    "both of 2013": {"NPY_DISABLE_CPU_FEATURES": _AVX512, "OPENBLAS_CORETYPE": "Haswell"},
+    "numpy without AVX2": {"NPY_DISABLE_CPU_FEATURES": f"{_AVX512} X86_V3 AVX2 FMA3"},
+}
+"""Environments in which numpy and its linear algebra compute as they do on other x86-64 processors."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the variables are of x86-64")
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("--generations", "6"),
+        ("--generations", "3", "--controller", "projected", "--features", "500", "--state", "joints+tactile"),
+        ("--generations", "3", "--controller", "cosine", "--features", "100", "--optimiser", "adam", "--perturb"),
+    ],
+    ids=["kernel", "projected", "cosine"],
+)
+def test_any_processor(farm: Farm, monkeypatch: pytest.MonkeyPatch, settings: tuple[str, ...]) -> None:
+    monkeypatch.setenv("PYTHONWARNINGS", "ignore")  # numpy's, that a processor has no such features anyway
+    found = {}
+    for number, (processor, variables) in enumerate(PROCESSORS.items()):
+        with monkeypatch.context() as environment:
+            for name, value in variables.items():
+                environment.setenv(name, value)
+            farm.call("run", "--name", f"r{number}", *settings, *SMALL)
+        found[processor] = farm.summary(f"r{number}")["parameters_sha256"]
+    assert len(set(found.values())) == 1, found

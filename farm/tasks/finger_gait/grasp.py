@@ -31,6 +31,9 @@ _BENT: Final = np.array([0.47, 1.09, 0.88, 0.48, 1.11, 0.88, 0.70, 0.86])
 _REACH: Final = 0.06
 """How far from the object's centre the approach starts [m]."""
 
+_DAMPING: Final = 1e-8
+"""Of the search for joint positions [m^2]: keeps a stretched finger's step finite."""
+
 
 class Grasping:
     """Inverse kinematics and touch for one scene."""
@@ -101,8 +104,7 @@ class Grasping:
             error = goal - self.data.site_xpos[site][[0, 2]]
             mujoco.mj_jacSite(self.scene.model, self.data, jacobian, None, site)
             plane = jacobian[[0, 2]][:, joints]
-            step = plane.T @ np.linalg.solve(plane @ plane.T + 1e-8 * np.eye(2), error)
-            self.data.qpos[joints] += np.clip(step, -0.2, 0.2)
+            self.data.qpos[joints] += np.clip(_step(plane, error), -0.2, 0.2)
         return self.data.qpos[joints].copy()
 
     def _press(self, finger: str) -> FloatArray:
@@ -124,3 +126,16 @@ class Grasping:
 
     def _site(self, finger: str) -> int:
         return self.scene.tip_sites[FINGERS.index(finger)]
+
+
+def _step(jacobian: FloatArray, error: FloatArray) -> FloatArray:
+    """J' (J J' + damping I)^-1 e for J (2, n) and e (2,) [m] -> (n,) [rad].
+
+    Spelt out, by Cramer's rule: a linear algebra library rounds as the processor likes, and every grip begins here.
+    """
+    first, second = jacobian
+    a, b, c = (first * first).sum() + _DAMPING, (first * second).sum(), (second * second).sum() + _DAMPING
+    determinant = a * c - b * b
+    return first * ((c * error[0] - b * error[1]) / determinant) + second * (
+        (a * error[1] - b * error[0]) / determinant
+    )

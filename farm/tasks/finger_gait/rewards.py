@@ -21,6 +21,10 @@ RETURN_SCALE: Final = 0.1
 _RANGE: Final = UPPER - LOWER
 
 
+def _squares(difference: FloatArray) -> FloatArray:
+    return (difference * difference).sum(axis=-1)  # no matrix product: it rounds as the processor likes
+
+
 @dataclass(frozen=True)
 class Weights:
     """One row of Table 3.1."""
@@ -39,7 +43,7 @@ class Weights:
 
 WEIGHTS: Final[dict[str, Weights]] = {
     # The thesis says "sensor range": the ranges of the controlled joints [rad].
-    "direct": Weights(1.0, 30.0, 10.0 / float(_RANGE @ _RANGE), 1.0, 1000.0),
+    "direct": Weights(1.0, 30.0, 10.0 / float(_squares(_RANGE)), 1.0, 1000.0),
     "projected": Weights(0.1, 6.0, 1.0 / float(_RANGE.mean()), 6.0, 400.0),
 }
 """Rows of Table 3.1 by the controller they were made for."""
@@ -58,10 +62,6 @@ class Demonstration:
 
 
 Reward = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, Demonstration, Weights], FloatArray]
-
-
-def _squares(difference: FloatArray) -> FloatArray:
-    return (difference * difference).sum(axis=-1)
 
 
 def basic(

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
+from farm import elementary
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.settings import setting
@@ -42,6 +43,8 @@ MAX_SHIFT: Final = 0.015
 
 MAX_TURN: Final = np.deg2rad(30.0)
 """How far the object may turn from how it was released [rad]."""
+
+_LEAST_COSINE: Final = float(elementary.cos(np.array(0.5 * MAX_TURN)))  # of half that
 
 SCALE: Final = (0.8, 1.2)
 """Perturbation: friction and mass are multiplied by U(SCALE)."""
@@ -309,8 +312,8 @@ class FingerGait(Task):
         last = slice(-SUCCESS_STEPS, None)
         grips = (record.frames["force"][:, last].sum(axis=-1) >= PRESSES) == wanted
         pose = slice(len(JOINTS), None)
-        shift, turn = moved(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
-        return np.asarray(grips.all(axis=(1, 2)) & (shift <= MAX_SHIFT).all(axis=1) & (turn <= MAX_TURN).all(axis=1))
+        there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
+        return np.asarray(grips.all(axis=(1, 2)) & there.all(axis=1))
 
     # What is shown
 
@@ -390,11 +393,22 @@ def touching(force: FloatArray) -> BoolArray:
 
 
 def moved(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far poses (..., 7) are from others: shift [m] and angle [rad]."""
+    """How far poses (..., 7) are from others: shift [m] and angle [rad], to be read, not to decide: see `stayed`."""
+    shift, cosine = _distance(pose, start)
+    return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
+
+
+def stayed(pose: FloatArray, start: FloatArray) -> BoolArray:
+    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others, the same on every processor: no arccos."""
+    shift, cosine = _distance(pose, start)
+    return np.asarray((shift <= MAX_SHIFT) & (cosine >= _LEAST_COSINE))
+
+
+def _distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Shift [m] and the cosine of half the angle between poses (..., 7)."""
     difference = pose[..., :3] - start[..., :3]
     shift = np.sqrt((difference * difference).sum(axis=-1))
-    cosine = np.abs((pose[..., 3:] * start[..., 3:]).sum(axis=-1))
-    return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
+    return shift, np.abs((pose[..., 3:] * start[..., 3:]).sum(axis=-1))
 
 
 def _joint_colours() -> tuple[tuple[int, int, int], ...]:

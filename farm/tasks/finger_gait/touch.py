@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from farm import elementary
 from farm.arrays import FloatArray
 from farm.tasks.finger_gait.hand import TIP_RADIUS
 
@@ -37,7 +38,8 @@ KAPPA: Final = 8.0
 
 def _directions() -> FloatArray:
     pitch, across = np.meshgrid(ROWS + TILT, COLUMNS, indexing="ij")
-    xyz = [np.cos(across) * np.sin(pitch), np.sin(across), np.cos(across) * np.cos(pitch)]
+    wide, sideways = elementary.cos(across), elementary.sin(across)
+    xyz = [wide * elementary.sin(pitch), sideways, wide * elementary.cos(pitch)]
     directions = np.stack(xyz, axis=-1).reshape(TAXELS, 3)
     directions.flags.writeable = False
     return directions
@@ -45,6 +47,8 @@ def _directions() -> FloatArray:
 
 DIRECTIONS: Final = _directions()
 """Unit vectors from the fingertip's centre to its taxels, in its frame, row by row, (18, 3)."""
+
+_AXES: Final = np.ascontiguousarray(DIRECTIONS.T)  # (3, 18)
 
 
 def positions() -> FloatArray:
@@ -82,7 +86,9 @@ def _spread(force: FloatArray, position: FloatArray) -> FloatArray:
         + (y / length)[:, None] * DIRECTIONS[:, 1]
         + (z / length)[:, None] * DIRECTIONS[:, 2]
     )
-    weight = np.exp(KAPPA * (cosine - 1.0))
+    cosine -= 1.0
+    cosine *= KAPPA
+    weight = elementary.exp(cosine)
     weight *= (force / weight.sum(axis=-1))[:, None]
     return weight
 
@@ -99,4 +105,4 @@ def contact_points(images: FloatArray) -> FloatArray:
     images = np.ascontiguousarray(images)  # numpy sums in the order of the memory
     total = images.sum(axis=-1)
     share = images / np.where(total > 0, total, 1.0)[..., None]
-    return np.stack([(share * DIRECTIONS[:, axis]).sum(axis=-1) for axis in range(3)], axis=-1)
+    return (share[..., None, :] * _AXES).sum(axis=-1)
