@@ -123,6 +123,9 @@ def compiled(mjcf: str, name: str) -> mujoco.MjModel:
       ConfigError: MuJoCo refuses it; names it.
     """
     try:
-        return mujoco.MjModel.from_xml_string(mjcf)
+        model = mujoco.MjModel.from_xml_string(mjcf)
     except ValueError as error:
         raise ConfigError(f"{name}: MuJoCo refuses its model: {' '.join(str(error).split())[:300]}") from None
+    # A state that has blown up stays visible, so that its rollout is reported as failed.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model

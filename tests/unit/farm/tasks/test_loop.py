@@ -1,0 +1,277 @@
+"""The closed loop on made-up tasks: rows that do not know of each other, ends, failures, and clear errors."""
+
+from dataclasses import dataclass, fields
+
+import mujoco
+import numpy as np
+import pytest
+
+from farm.errors import ConfigError, TaskError
+from farm.policies.fourier import Direct, FeaturesConfig
+from farm.rollouts import Runner
+from farm.settings import setting
+from farm.tasks.base import Channel, Record, Score, Task, TaskConfig
+from farm.tasks.loop import RETURN_FLOOR, Rollouts, discounted, trajectory
+
+XML = """<mujoco><option timestep="0.01"/><worldbody>
+  <body pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0" damping="0.1"/><geom name="cart" size="0.1" mass="1"/>
+  <body><joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.02" mass="0.1"/></body>
+  </body></worldbody><actuator><motor joint="slide" ctrlrange="-3 5"/></actuator>
+  <sensor><jointpos joint="hinge"/></sensor></mujoco>"""
+
+
+class Pole(Task):
+    """A pole on a cart, with something of everything."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config(TaskConfig):
+        """Its own settings."""
+
+        width: float = setting(0.6, above=0.0)
+        """Angle at which it has fallen [rad]."""
+
+    xml = XML
+    steps, substeps = 12, 4
+    channels = (Channel(name="angle", kind="scalars", shape=(1,), unit="rad", trace=True),)
+
+    def reset(self, sim, row, rng):
+        """Lean it, and load it with a mass of its own."""
+        sim.qpos[row, 1] = 0.05
+        if rng is not None:
+            sim.qpos[row, 1] = rng.uniform(-0.4, 0.4)
+            sim.expand("body_mass")[row, 2] *= rng.uniform(0.5, 2.0)
+
+    def prepare(self, sim, rngs):
+        """Draw a goal that is remembered."""
+        super().prepare(sim, rngs)
+        sim.own["goal"] = np.array([0.0 if rng is None else rng.uniform() for rng in rngs])
+
+    def observe(self, sim):
+        """Angle, by the sensor, and how far the goal is."""
+        return np.concatenate([sim.sensordata, sim.qvel, (sim.qpos[:, 0] - sim.own["goal"])[:, None]], axis=1)
+
+    def reward(self, sim, action):
+        """Upright, near the goal, lazy."""
+        return {"upright": np.cos(sim.qpos[:, 1]), "near": -np.abs(sim.qpos[:, 0] - sim.own["goal"])}
+
+    def ended(self, sim):
+        """It fell."""
+        return np.abs(sim.qpos[:, 1]) > self.config.width
+
+    def success(self, sim):
+        """It stands at the end."""
+        return np.abs(sim.qpos[:, 1]) < 0.3
+
+    def measure(self, sim):
+        """The angle."""
+        return {"angle": sim.sensordata}
+
+
+def runner(kind: type[Task] = Pole, **settings) -> Runner:
+    task = kind(kind.Config(**settings))
+    spec, config = task.spec(), FeaturesConfig(features=10)
+    return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
+
+
+def thetas(made: Runner, count: int, scale: float = 1.0) -> np.ndarray:
+    return np.random.default_rng(1).normal(0.0, scale, (count, made.policy.size))
+
+
+SEEDS = [None, (1, 2, 3, 4), (1, 2, 3, 4), (5, 0, 0, 0), None, (9, 9, 9, 9), (5, 0, 0, 0)]
+
+
+def arrays(rollouts: Rollouts) -> dict[str, np.ndarray]:
+    out = {}
+    for each in fields(rollouts):
+        value = getattr(rollouts, each.name)
+        out |= {f"{each.name} {k}": v for k, v in value.items()} if isinstance(value, dict) else {each.name: value}
+    return out
+
+
+def same(one: Rollouts, row: int, other: Rollouts, at: int) -> None:
+    for name, values in arrays(one).items():
+        assert values[row].tobytes() == arrays(other)[name][at].tobytes(), name
+
+
+def test_a_rollout_does_not_depend_on_its_batch():
+    made = runner()
+    theta = thetas(made, 7, 4.0)
+    together = made.rollouts(theta, SEEDS)
+    assert len(set(together.steps.tolist())) > 2, "some end early"
+    order = [3, 6, 0, 5, 1, 4, 2]
+    permuted = made.rollouts(theta[order], [SEEDS[i] for i in order])
+    for at, row in enumerate(order):
+        same(together, row, permuted, at)
+        same(together, row, made.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+    fresh = runner().rollouts(theta[::-1], SEEDS[::-1])
+    for row in range(7):
+        same(together, row, fresh, 6 - row)
+
+
+def test_more_rollouts_than_the_engine_has_rows_are_done_in_turns():
+    made = runner()
+    count = made.sim.engine.size + 9
+    theta, seeds = thetas(made, count), [(0, 0, 0, i // 2) for i in range(count)]
+    together = made.rollouts(theta, seeds)
+    for row in (0, 40, count - 10, count - 1):
+        same(together, row, made.rollouts(theta[row : row + 1], [seeds[row]]), 0)
+
+
+def test_physics_rate_shows_more_of_the_same():
+    made = runner()
+    theta = thetas(made, 3, 4.0)
+    coarse, fine = made.rollouts(theta, SEEDS[:3]), made.rollouts(theta, SEEDS[:3], physics=True)
+    assert fine.frames["angle"].shape == (3, 48, 1)
+    assert fine.frames["angle"][:, 3::4].tobytes() == coarse.frames["angle"].tobytes()
+    assert fine.returns.tobytes() == coarse.returns.tobytes()
+
+
+def test_it_is_a_plain_loop():
+    made = runner(steps=5)
+    model = mujoco.MjModel.from_xml_string(XML)
+    data = mujoco.MjData(model)
+    data.qpos[1] = 0.05
+    mujoco.mj_forward(model, data)
+    theta, value = thetas(made, 1), 0.0
+    prepared = made.policy.prepare(theta)
+    for _ in range(5):
+        x = np.concatenate([data.sensordata, data.qvel, data.qpos[:1]])[None]
+        data.ctrl[:] = -3 + 8 * 0.5 * (1 + np.clip(made.policy.act(prepared, x)[0], -1, 1))
+        for _ in range(4):
+            mujoco.mj_step(model, data)
+        value += float(np.cos(data.qpos[1]) - abs(data.qpos[0]))
+    assert made.rollouts(theta, [None]).returns[0] == pytest.approx(value, rel=1e-14)
+
+
+def test_ends_and_success():
+    made = runner()
+    rollouts = made.rollouts(thetas(made, 7, 4.0), SEEDS)
+    for row in range(7):
+        angle, steps = rollouts.frames["qpos"][row, :, 1], rollouts.steps[row]
+        assert rollouts.ended[row] == bool(np.abs(angle).max() > 0.6)
+        assert not angle[steps:].any()
+        assert not rollouts.terms[row, steps:].any()
+        assert rollouts.success[row] == (abs(angle[steps - 1]) < 0.3)
+        assert rollouts.returns[row] == pytest.approx(rollouts.terms[row].sum())
+    never = made.task.Config(width=100.0)
+    assert not runner(width=never.width).rollouts(thetas(made, 7), SEEDS).ended.any()
+
+
+def test_a_trajectory_has_the_channels():
+    made = runner()
+    rollouts = made.rollouts(thetas(made, 1), [None])
+    shown = trajectory(made.task, made.spec, made.scene, rollouts, 0)
+    assert {name: v.shape[1:] for name, v in shown.arrays().items()} == made.spec.shapes(len(made.scene.bodies))
+    assert shown.channels["angle"][0, 0] == pytest.approx(0.05)
+    assert shown.times[-1] == pytest.approx(12 * 0.04)
+    assert shown.success in (True, False)
+
+
+class Fragile(Pole):
+    """Blows up where it is asked to."""
+
+    def reset(self, sim, row, rng):
+        """Throw one of them away."""
+        if rng is not None:
+            sim.qvel[row, 0] = 1e9
+
+    def ended(self, sim):
+        """Never."""
+        return None
+
+
+def test_a_rollout_that_blows_up_fails_alone():
+    made = runner(Fragile)
+    theta = thetas(made, 3)
+    rollouts = made.rollouts(theta, [None, (1, 1, 1, 1), None])
+    assert rollouts.failed.tolist() == [False, True, False]
+    assert rollouts.returns[1] == RETURN_FLOOR
+    assert rollouts.clamped.tolist() == [False, True, False]
+    assert all(np.isfinite(values).all() for values in arrays(rollouts).values())
+    same(rollouts, 2, made.rollouts(theta[2:], [None]), 0)
+
+
+def broken(**methods) -> Runner:
+    return runner(type("Broken", (Pole,), methods))
+
+
+@pytest.mark.parametrize(
+    ("methods", "line"),
+    [
+        ({"reward": lambda _, sim, a: np.zeros((len(sim), 2))}, r"reward gave an array of shape \(1, 2\); expected an "
+         r"array of shape \(1,\)"),
+        ({"reward": lambda _, sim, a: 1.0}, "reward reward gave a float"),
+        ({"reward": lambda _, sim, a: {"near": np.full(len(sim), np.nan)}}, "reward 'near' is not finite in control "
+         "step 1, though the physics is fine"),
+        ({"act": lambda _, sim, a: np.zeros((len(sim), 3))}, r"act gave an array of shape \(1, 3\); expected an array of "
+         r"shape \(1, 1\)"),
+        ({"observe": lambda _, sim: [1.0]}, "observe gave a list"),
+        ({"ended": lambda _, sim: np.zeros(2, dtype=bool)}, r"ended gave an array of shape \(2,\)"),
+        ({"measure": lambda _, sim: {"angle": np.zeros(3)}}, r"angle gave an array of shape \(3,\)"),
+    ],
+)  # fmt: skip
+def test_arrays_that_make_no_sense_are_named(methods, line):
+    with pytest.raises(TaskError, match=line):
+        broken(**methods)
+
+
+def test_the_simulator_can_only_be_written_while_rollouts_begin():
+    def observe(_, sim):
+        sim.qpos[:] = 0.0
+        return sim.qpos
+
+    with pytest.raises(ValueError, match="read-only"):
+        broken(observe=observe)
+    with pytest.raises(AttributeError, match="sim has no 'qpso'"):
+        broken(observe=lambda _, sim: sim.qpso)
+
+
+def test_a_model_that_mujoco_refuses_is_one_line():
+    with pytest.raises(ConfigError, match="Broken: MuJoCo refuses its model: .*"):
+        broken(xml="<mujoco><body/>")
+    with pytest.raises(ConfigError, match="task Broken has no model: give it `xml`"):
+        broken(xml="")
+
+
+class Whole(Pole):
+    """Scores whole rollouts."""
+
+    def score(self, record: Record) -> Score:
+        """The same as step by step, with no success."""
+        qpos = record.frames["qpos"]
+        inside = np.arange(self.steps) < record.steps[:, None]
+        return Score(np.where(inside, np.cos(qpos[..., 1]), 0.0)[..., None])
+
+
+def test_whole_rollouts_can_be_scored_at_once():
+    made, step = runner(Whole), runner()
+    theta = thetas(made, 7, 4.0)
+    once, each = made.rollouts(theta, SEEDS), step.rollouts(theta, SEEDS)
+    np.testing.assert_allclose(once.terms[..., 0], each.terms[..., 0], rtol=1e-15)
+    assert not made.spec.success
+    assert made.spec.terms == ("reward",)
+
+
+def test_the_return_is_discounted_and_never_looks_good_when_it_overflows():
+    terms = np.random.default_rng(0).normal(size=(4, 15, 3))
+    expected = [0.5 * sum(0.9**t * step.sum() for t, step in enumerate(rollout)) for rollout in terms]
+    np.testing.assert_allclose(discounted(terms, 0.9, 0.5)[0], expected, rtol=1e-12)
+    for bad in (np.nan, -np.inf, -1e13):
+        terms[1, 3, 0] = bad
+        returns, clamped = discounted(terms, 0.9, 1.0)
+        assert clamped.tolist() == [False, True, False, False]
+        assert returns[1] == RETURN_FLOOR
+
+
+def test_sim_shows_what_is_going_and_follows_it():
+    made = runner()
+    sim = made.sim
+    sim.begin(3)
+    sim.qpos[:, 0] = (1.0, 2.0, 3.0)
+    sim.own["name"] = np.array([10, 20, 30])
+    sim.start(np.array([0, 2, 2, 1]))
+    assert sim.qpos[:, 0].tolist() == [1.0, 3.0, 3.0, 2.0]
+    sim.keep(np.array([True, False, True, True]))
+    assert (sim.qpos[:, 0].tolist(), sim.own["name"].tolist(), len(sim)) == ([1.0, 3.0, 2.0], [10, 30, 20], 3)
+    sim.step(2)
+    assert sim.sensordata.shape == (3, 1)
