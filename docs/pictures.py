@@ -9,6 +9,7 @@ Rerun viewer on a run's recording.) Needs the extra `video`.
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -16,16 +17,15 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from farm.arrays import FloatArray
-from farm.policies.fourier import Features, Policy, PolicyConfig
 from farm.sim import rendering, video
-from farm.sim.scene import CONTACTS, load
-from farm.tasks.finger_gait import touch as tactile
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks import loop
+from farm.tasks.finger_gait import model, touch
 from farm.tasks.finger_gait.grasp import Grasping
-from farm.tasks.finger_gait.hand import TIP_RADIUS
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import Simulation
-from farm.tasks.finger_gait.task import Frames, TaskConfig
-from learner.replay import again
+from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
+from learner.replay import Again, again
 from learner.run_folder import RunFolder
 
 PANEL: Final = (400, 450)
@@ -68,25 +68,34 @@ _HELD: Final = ("index+thumb", "index+middle+thumb")
 
 def _waiting() -> FloatArray:
     """Fingers open, the object frozen in front of them, (15,)."""
-    scene = load("bar")
-    qpos = scene.model.qpos0.copy()
-    qpos[:8] = Grasping(scene).command(())
+    hand = model.load("bar")
+    qpos = hand.model.qpos0.copy()
+    qpos[: len(JOINTS)] = Grasping(hand).command(())
     return qpos
+
+
+class _Still:
+    """A policy whose actions are zero."""
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        return theta
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:  # noqa: ARG002
+        return np.zeros((len(prepared), len(JOINTS)))
 
 
 def _held(grip: str) -> FloatArray:
     """One second after the release from a grip that is left alone, (15,)."""
-    config, kernel = TaskConfig(start_grip=grip), PolicyConfig(controller="kernel")
-    size = STATES[config.state].size
-    policy = Policy(kernel, size, Features.draw(kernel, size, np.random.default_rng(0)))
-    far = np.full((1, policy.size), 50.0)  # so far from any joint position that every action is zero
-    rollouts = Simulation(config, policy).run(far, [None])
-    return rollouts.frames.qpos[0, 9]
+    task = FingerGait(FingerGaitConfig(start_grip=grip))
+    sim = Sim(task.engine(BatchEngine))
+    loop.again(lambda: task.setup(sim))
+    rollouts = loop.run(task, _Still(), sim, np.zeros((1, 1)), [None])
+    return rollouts.frames["qpos"][0, 9]
 
 
 def _photograph(qpos: FloatArray) -> Image.Image:
-    still = Frames(qpos[None], np.zeros((1, 3, CONTACTS)), np.zeros((1, 3, CONTACTS, 3)))
-    (picture,) = rendering.pictures("bar", still, PANEL, distance=0.4, glow=False)
+    camera = replace(FingerGait.camera, distance=0.4)
+    (picture,) = rendering.pictures(model.load("bar").model, qpos[None], PANEL, camera=camera)
     return Image.fromarray(picture)
 
 
@@ -102,9 +111,18 @@ def gait_video(run: Path) -> Iterator[rendering.Picture]:
     for name, part in shown.items():
         rows = [min(moment, len(part.trajectory.times) - 1) for moment in chosen]
         moments = sorted(set(rows))
-        drawn = dict(zip(moments, rendering.pictures("bar", part.frames.at(moments), SIDE), strict=True))
+        drawn = dict(zip(moments, _drawn(part, moments), strict=True))
         sides.append([_named(drawn[row], name) for row in rows])
     return (np.concatenate(pair, axis=1) for pair in zip(*sides, strict=True))
+
+
+def _drawn(part: Again, moments: list[int]) -> Iterator[rendering.Picture]:
+    """Moments of a rollout."""
+    task, channels = part.task, part.trajectory.channels
+    values = {name: frames[moments] for name, frames in channels.items()}
+    return rendering.pictures(
+        task.model, part.qpos[moments], SIDE, camera=task.camera, channels=task.channels, values=values
+    )
 
 
 def _named(picture: rendering.Picture, name: str) -> rendering.Picture:
@@ -118,7 +136,7 @@ def _named(picture: rendering.Picture, name: str) -> rendering.Picture:
 def tactile_picture() -> str:
     """Side view with the rows' angles, front view with numbered taxels, and the image of one contact."""
     contact = _direction(np.deg2rad(14.0), np.deg2rad(20.0))
-    force = tactile.image(np.array([2.0]), contact[None] * TIP_RADIUS)
+    force = touch.image(np.array([2.0]), contact[None] * TIP_RADIUS)
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 960 400" font-family="DejaVu Sans, Arial, sans-serif">',
         '<rect width="960" height="400" fill="#ffffff"/>',
@@ -131,15 +149,15 @@ def tactile_picture() -> str:
 
 
 def _direction(pitch: float, across: float) -> FloatArray:
-    """From the fingertip's centre, by angles as in farm.tactile, pitch from the middle of the half sphere."""
-    turned = pitch + tactile.TILT
+    """From the fingertip's centre, by angles as in finger_gait/touch.py; pitch from the half sphere's middle."""
+    turned = pitch + touch.TILT
     return np.array([np.cos(across) * np.sin(turned), np.sin(across), np.cos(across) * np.cos(turned)])
 
 
 def _side(x: float, y: float, radius: float) -> list[str]:
     """In the finger's plane: its axis up, its pad to the right."""
     out = [_title(x, "side view: rows 1 to 6")]
-    half = np.deg2rad(np.linspace(-90, 90, 61)) + tactile.TILT
+    half = np.deg2rad(np.linspace(-90, 90, 61)) + touch.TILT
     edge = " ".join(f"{x + radius * np.sin(a):.1f},{y - radius * np.cos(a):.1f}" for a in half)
     width = 0.8 * radius
     link = f'x="{x - width:.1f}" y="{y}" width="{2 * width:.1f}" height="{1.25 * radius:.1f}"'
@@ -147,11 +165,11 @@ def _side(x: float, y: float, radius: float) -> list[str]:
     out.append(f'<circle cx="{x}" cy="{y}" r="{radius}" fill="#f2f3f5" stroke="#b6bac2"/>')
     out.append(f'<polygon points="{edge}" fill="#cfe3f3" stroke="#5b7f9c" stroke-width="1.5"/>')
     out.append(_line(x, y, x, y - 1.3 * radius, "#8a8f98", dashed=True))
-    middle = float(tactile.TILT)
+    middle = float(touch.TILT)
     out.append(_line(x, y, x + 1.2 * radius * np.sin(middle), y - 1.2 * radius * np.cos(middle), "#d55e00"))
     out.append(_text(x - 8, y - 1.24 * radius, "finger's axis, z", anchor="end", colour="#5c6068"))
     out.append(_text(x + 0.66 * radius, y - 1.1 * radius, f"{np.rad2deg(middle):.0f}°: middle", colour="#d55e00"))
-    for row, angle in enumerate(tactile.ROWS, 1):
+    for row, angle in enumerate(touch.ROWS, 1):
         a = float(angle) + middle
         out.append(_dot(x + radius * np.sin(a), y - radius * np.cos(a), 5, "#0072b2"))
         out.append(_text(x + 1.2 * radius * np.sin(a), y - 1.2 * radius * np.cos(a) + 5, str(row), anchor="middle"))
@@ -164,9 +182,9 @@ def _front(x: float, y: float, radius: float, force: FloatArray, contact: FloatA
     """Looking at the middle of the half sphere from outside: towards the finger's back up, positive y right."""
     out = [_title(x, "front view: taxels 0 to 17")]
     out.append(f'<circle cx="{x}" cy="{y}" r="{radius}" fill="#eef4f9" stroke="#5b7f9c" stroke-width="1.5"/>')
-    tilt = float(tactile.TILT)
+    tilt = float(touch.TILT)
     back = np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
-    for number, taxel in enumerate(tactile.DIRECTIONS):
+    for number, taxel in enumerate(touch.DIRECTIONS):
         at = x + radius * taxel[1], y - radius * float(taxel @ back)
         out.append(_dot(*at, 11.5, _colour(force[number], force.max()), "#30343b"))
         ink = _ink(force[number], force.max())
@@ -183,7 +201,7 @@ def _front(x: float, y: float, radius: float, force: FloatArray, contact: FloatA
 def _image(x: float, y: float, force: FloatArray) -> list[str]:
     """The 6 x 3 image that comes of it."""
     wide, high = 64, 44
-    rows, columns = tactile.SHAPE
+    rows, columns = touch.SHAPE
     out = [_title(x + wide * columns / 2, "its image: 6 x 3 forces [N]")]
     for number, newton in enumerate(force):
         row, column = divmod(number, columns)

@@ -36,7 +36,7 @@ class Viewer:
         """Made by `viewer`."""
         self._client = client
         self.errors: list[str] = []
-        """What its views complained of."""
+        """Errors that its views reported."""
 
     def open(self, source: str) -> None:
         """Show a file or a live stream, and wait until there is something to see."""
@@ -55,7 +55,7 @@ class Viewer:
         self._client.set_blueprint(layout, "recording")
 
     def go(self, timeline: str, **at: float) -> None:
-        """Stand at a point of a timeline."""
+        """Move the cursor to a point of a timeline."""
         self._client.set_time(timeline, play_state="paused", **at)
 
     def shoot(self, path: Path) -> None:
@@ -96,7 +96,7 @@ def viewer() -> Iterator[Viewer]:
 
 
 def main() -> None:
-    """Learn, look, write."""
+    """Learn, take the pictures, write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "pictures")
     out = parser.parse_args().out.resolve()

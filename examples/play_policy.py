@@ -5,6 +5,7 @@
 `farm export RUN POLICY.npz` writes the file; docs/export.md says what is in it.
 """
 
+import json
 import math
 import sys
 
@@ -47,10 +48,12 @@ class Policy:
         self.data = mujoco.MjData(self.model)
         self.sites = [self.model.site(name).id for name in self.p["tips"]]
         self.theta = self.p["mu"].reshape(8, -1)
-        self.rows = np.ascontiguousarray((self.p["W"] / self.p["bandwidth"]).T)  # one a state component
-        if self.p["controller"] in ("projected", "cosine"):
+        self.bandwidth = json.loads(self.p["policy_config"])["bandwidth"]
+        if self.p["policy"] != "kernel":
+            self.rows = np.ascontiguousarray((self.p["frequencies"] / self.bandwidth).T)  # one per state component
+        if self.p["policy"] in ("projected", "cosine"):
             maps = {"projected": lambda rows: np.stack([self.features(row) for row in rows]), "cosine": cos}
-            self.theta = maps[self.p["controller"]](self.theta)
+            self.theta = maps[self.p["policy"]](self.theta)
 
     def reset(self) -> None:
         """The moment of release: the fingers hold the object, and nothing else does."""
@@ -59,9 +62,9 @@ class Policy:
 
     def act(self) -> np.ndarray:
         """One action (8,) [rad]; the servos' targets follow from it."""
-        if self.p["controller"] == "kernel":
+        if self.p["policy"] == "kernel":
             difference = self.theta - self.x
-            powers = (difference * difference).sum(axis=-1) * (-0.5 / self.p["bandwidth"] ** 2)
+            powers = (difference * difference).sum(axis=-1) * (-0.5 / self.bandwidth**2)
             a = np.array([math.exp(power) for power in powers])
         else:
             a = (self.theta * self.features(self.x)).sum(axis=-1)
@@ -74,7 +77,7 @@ class Policy:
 
     def features(self, x: np.ndarray) -> np.ndarray:
         """Random Fourier features z(x), (d,) -> (D,)."""
-        angle = self.p["c"].copy()
+        angle = self.p["phases"].copy()
         for row, value in zip(self.rows, x, strict=True):
             angle += row * value
         return np.sqrt(2.0 / len(angle)) * cos(angle)

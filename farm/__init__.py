@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from farm.policies.base import PolicyConfig as PolicyConfig
     from farm.settings import Settings as Settings
     from farm.settings import setting as setting
+    from farm.sim.channels import Camera as Camera
+    from farm.sim.channels import Channel as Channel
     from farm.sim.sim import Backend as Backend
     from farm.sim.sim import Sim as Sim
-    from farm.tasks.base import Camera as Camera
-    from farm.tasks.base import Channel as Channel
     from farm.tasks.base import Record as Record
     from farm.tasks.base import Score as Score
     from farm.tasks.base import Task as Task
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _WHERE: Final = {
     "learn": "learner.run", "load": "learner.replay", "RunConfig": "learner.config", "configure": "learner.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
-    "Channel": "farm.tasks.base", "Camera": "farm.sim.camera", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
+    "Channel": "farm.sim.channels", "Camera": "farm.sim.channels", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
     "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",
     "Algorithm": "learner.algorithms", "SearchState": "learner.algorithms",
     "Backend": "farm.sim.sim", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",

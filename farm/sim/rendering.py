@@ -1,49 +1,52 @@
-"""Pictures of a hand by MuJoCo's own renderer, without a window; a door to mujoco.
+"""Pictures of a rollout by MuJoCo's own renderer, without a window; a door to mujoco.
 
 Where there is no display, MUJOCO_GL (osmesa or egl) has to be set before MuJoCo is imported.
 """
 
+import copy
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
+from farm.arrays import FloatArray
 from farm.errors import RunError
-from farm.sim import scene as scenes
-from farm.sim.scene import HandScene
-from farm.tasks.finger_gait.task import Frames
+from farm.sim.channels import Camera, Channel
+from farm.sim.scene import AWAY, BESIDE, Scene
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
-FIRM: Final = 3.0
-"""Force from which a fingertip has its finger's full colour [N]."""
+BACKGROUND: Final = (0.94, 0.95, 0.96)
+"""Red, green, blue in [0, 1]."""
 
-_LOOK: Final = """
-<asset>
-  <texture type="skybox" builtin="flat" rgb1="0.94 0.95 0.96" rgb2="0.94 0.95 0.96" width="64" height="64"/>
-</asset>
-<visual>
-  <global offwidth="1600" offheight="1600"/><quality shadowsize="1024" offsamples="0"/>
-  <headlight ambient="0.45 0.45 0.45" diffuse="0.55 0.55 0.55"/>
-</visual>
-"""
-_COLOURS: Final = ((86, 180, 233), (0, 158, 115), (204, 121, 167))  # of the fingers, as in the recording
+_AMBIENT: Final = (0.45, 0.45, 0.45)
+_DIFFUSE: Final = (0.55, 0.55, 0.55)
+_FOG: Final = (3.0, 6.0)  # where fog begins and is complete, in distances of the camera from what it looks at
+_WALL: Final = 7.0  # where the background's wall stands: in complete fog
+_PAINT: Final = (213, 94, 0)  # of channels without colours
 _SMOOTH: Final = 2  # drawn so much larger, for smooth edges
 
 
 def pictures(
-    object_name: str, frames: Frames, size: tuple[int, int], *, distance: float = 0.34, glow: bool = True
+    model: mujoco.MjModel,
+    qpos: FloatArray,
+    size: tuple[int, int],
+    *,
+    camera: Camera | None,
+    channels: Sequence[Channel] = (),
+    values: Mapping[str, FloatArray] | None = None,
 ) -> Iterator[Picture]:
     """Draw moments of a rollout.
 
     Args:
-      object_name: what the hand holds.
-      frames: (F,) moments.
-      size: width and height [pixels], at most 800.
-      distance: of the camera from the hand [m].
-      glow: colour the fingertips by the force on them.
+      model: of the physics; it is not changed.
+      qpos: (F, nq) positions.
+      size: width and height [pixels].
+      camera: where the pictures are taken from; None: from beside what moves.
+      channels: of the task; geometries that scalars name in `geoms` are painted by their values.
+      values: of these channels, by name, (F, n).
 
     Yields:
       (height, width, 3), one for each moment.
@@ -51,24 +54,46 @@ def pictures(
     Raises:
       RunError: nothing can be drawn here.
     """
-    scene = lit(object_name)
-    model, data = scene.model, mujoco.MjData(scene.model)
+    camera = camera or beside(Scene(model))
+    painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
+    model = lit(model, camera.distance, size)
+    data = mujoco.MjData(model)
     with _renderer(model, size) as renderer:
-        for qpos, force in zip(frames.qpos, frames.force, strict=True):
-            data.qpos[:] = qpos
-            if glow:
-                for geom, newton, colour in zip(scene.tip_geoms, force.sum(axis=-1).tolist(), _COLOURS, strict=True):
-                    model.geom_rgba[geom] = _glow(newton, colour)
+        for frame, row in enumerate(qpos):
+            for channel in painted:
+                _paint(model, channel, (values or {})[channel.name][frame])
+            data.qpos[:] = row
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, _camera(distance))
-            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = 0
+            renderer.update_scene(data, _free(camera))
+            _backdrop(renderer.scene, model)
             yield _halved(renderer.render())
 
 
-def lit(object_name: str) -> HandScene:
-    """The scene with that object, with a light background; its physics is the same."""
-    text = scenes.text(object_name).replace("</mujoco>", f"{_LOOK}</mujoco>")
-    return HandScene(mujoco.MjModel.from_xml_string(text), object_name)
+def beside(scene: Scene) -> Camera:
+    """Camera of a scene that has none of its own: beside what moves, or the middle of a scene where nothing does."""
+    x, y, z = scene.model.stat.center.tolist() if scene.mover is None else scene.mover.centre
+    return Camera(lookat=(x, y, z), distance=AWAY * scene.radius, azimuth=BESIDE[0], elevation=BESIDE[1])
+
+
+def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)) -> mujoco.MjModel:
+    """A copy of a model with bright light, and fog of the background's colour; its physics is the same.
+
+    Args:
+      model: that is copied.
+      distance: of the camera from what it looks at [m].
+      size: of the pictures [pixels].
+    """
+    model = copy.copy(model)
+    look = model.vis
+    look.global_.offwidth = max(look.global_.offwidth, size[0] * _SMOOTH)
+    look.global_.offheight = max(look.global_.offheight, size[1] * _SMOOTH)
+    look.quality.offsamples, look.quality.shadowsize = 0, 1024
+    look.headlight.ambient[:], look.headlight.diffuse[:] = _AMBIENT, _DIFFUSE
+    look.rgba.fog[:3] = BACKGROUND
+    far = distance / model.stat.extent
+    look.map.fogstart, look.map.fogend = (part * far for part in _FOG)
+    look.map.zfar = max(look.map.zfar, 2 * _WALL * far)
+    return model
 
 
 def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
@@ -84,17 +109,42 @@ def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
         ) from None
 
 
-def _camera(distance: float) -> mujoco.MjvCamera:
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = (0.035, 0.014, 0.01)
-    camera.distance, camera.azimuth, camera.elevation = distance, 150.0, -14.0
-    return camera
+def _free(camera: Camera) -> mujoco.MjvCamera:
+    free = mujoco.MjvCamera()
+    free.lookat[:] = camera.lookat
+    free.distance, free.azimuth, free.elevation = camera.distance, camera.azimuth, camera.elevation
+    return free
 
 
-def _glow(force: float, colour: tuple[int, int, int]) -> list[float]:
-    """RGBA of a fingertip, in [0, 1]: white where it touches nothing, its finger's colour from FIRM on."""
-    share = 0.0 if not force else 0.45 + 0.55 * min(force / FIRM, 1.0)  # the lightest touch shows
-    return [*((1.0 - share) * 0.95 + share * value / 255 for value in colour), 1.0]
+def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
+    """Put a wall in complete fog behind the scene: a compiled model takes no new sky, and without one it is black."""
+    for flag, on in (("FOG", 1), ("SKYBOX", 0), ("HAZE", 0), ("REFLECTION", 0)):  # a floor would mirror the wall
+        scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = on
+    view = scene.camera[0]
+    ahead, up = np.array(view.forward), np.array(view.up)
+    away = 0.5 * model.vis.map.zfar * model.stat.extent
+    turned = np.stack([np.cross(ahead, up), up, -ahead], axis=1)
+    wall, scene.ngeom = scene.geoms[scene.ngeom], scene.ngeom + 1
+    sides, colour = [2 * away, 2 * away, 0.01 * away], np.array([*BACKGROUND, 1.0], np.float32)
+    mujoco.mjv_initGeom(
+        wall, mujoco.mjtGeom.mjGEOM_BOX, sides, np.array(view.pos) + away * ahead, turned.ravel(), colour
+    )
+    wall.category = mujoco.mjtCatBit.mjCAT_DECOR  # these throw no shadow
+
+
+def _paint(model: mujoco.MjModel, channel: Channel, values: FloatArray) -> None:
+    """Colour the channel's geometries by its values (n,)."""
+    colours = channel.colours or [_PAINT] * len(channel.geoms)
+    for geom, value, colour in zip(channel.geoms, values.tolist(), colours, strict=True):
+        index = model.geom(geom).id
+        model.geom_matid[index] = -1
+        model.geom_rgba[index] = _glow(value / channel.top, colour)
+
+
+def _glow(share: float, colour: tuple[int, int, int]) -> list[float]:
+    """RGBA of a painted geometry, in [0, 1]: white at a share of 0, its colour from 1 on; the least above 0 shows."""
+    mix = 0.45 + 0.55 * min(share, 1.0) if share > 0 else 0.0
+    return [*((1.0 - mix) * 0.95 + mix * value / 255 for value in colour), 1.0]
 
 
 def _halved(picture: Picture) -> Picture:

@@ -1,17 +1,24 @@
-"""Assets to a compiled MuJoCo model with named indices, and what there is to draw; a door to mujoco."""
+"""A compiled MuJoCo model, and what of it is drawn; a door to mujoco."""
 
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import mujoco
 import numpy as np
 
-from farm.arrays import FloatArray
-from farm.errors import ConfigError
+from farm.arrays import BoolArray, FloatArray
+from farm.errors import ConfigError, brief
 
 STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """What a simulator state holds: everything that the next step depends on, as mujoco.batch keeps it."""
+
+BESIDE: Final = (106.0, -25.0)
+"""Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots walk along x."""
+
+AWAY: Final = 3.5
+"""Distance from which it is seen, in radii of what moves."""
 
 _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
@@ -21,6 +28,7 @@ _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
 }
+_UNPAINTED: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geometry that was given none
 
 
 @dataclass(frozen=True)
@@ -43,24 +51,68 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class Mover:
+    """What moves in a scene, in the model's initial pose."""
+
+    centre: tuple[float, float, float]
+    """Middle of the box around all that moves [m]."""
+    radius: float
+    """Half the box's diagonal [m]."""
+    body: str
+    """The first body of it: the others mostly hang on it."""
+
+
+@dataclass(frozen=True)
 class Scene:
     """A compiled model, and what of it is drawn."""
 
     model: mujoco.MjModel
 
-    @property
+    @cached_property
     def bodies(self) -> tuple[str, ...]:
-        """Every body that is drawn, in the model's order: all that have a geometry."""
+        """Names of every body that is drawn, in the model's order: all that have a geometry."""
         return tuple(_name(self.model.body(i).name, f"body_{i}") for i in self._drawn)
 
-    @property
+    @cached_property
     def fixed(self) -> frozenset[str]:
-        """The drawn bodies that never move."""
-        return frozenset(n for n, i in zip(self.bodies, self._drawn, strict=True) if self.model.body_weldid[i] == 0)
+        """Names of the drawn bodies that never move."""
+        moving = self._moving[self._drawn]
+        return frozenset(name for name, moves in zip(self.bodies, moving, strict=True) if not moves)
+
+    @cached_property
+    def mover(self) -> Mover | None:
+        """What moves; None where nothing does."""
+        model, data = self.model, mujoco.MjData(self.model)
+        mujoco.mj_kinematics(model, data)
+        geoms = np.flatnonzero(self._moving[model.geom_bodyid])
+        if not len(geoms):
+            return None
+        centres, reach = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
+        least, most = (centres - reach).min(axis=0), (centres + reach).max(axis=0)
+        first = self.bodies[self._drawn.index(model.geom_bodyid[geoms[0]])]
+        x, y, z = (0.5 * (least + most)).tolist()
+        return Mover((x, y, z), 0.5 * float(np.linalg.norm(most - least)), first)
 
     @property
-    def _drawn(self) -> list[int]:
-        return sorted(set(self.model.geom_bodyid.tolist()))
+    def radius(self) -> float:
+        """Radius of what moves, or of the scene where nothing does [m]."""
+        return float(self.model.stat.extent) if self.mover is None else self.mover.radius
+
+    @property
+    def left_out(self) -> int:
+        """Number of geometries that are not drawn: meshes and height fields."""
+        return sum(int(kind) not in _SHAPES for kind in self.model.geom_type)
+
+    def index(self, body: str) -> int:
+        """Index among `bodies` of the body with this name in the model.
+
+        Raises:
+          ConfigError: no such body, or it has no geometry.
+        """
+        name = _name(body, body)
+        if name not in self.bodies:
+            raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
+        return self.bodies.index(name)
 
     def poses(self, qpos: FloatArray) -> FloatArray:
         """Where the drawn bodies are.
@@ -72,38 +124,60 @@ class Scene:
           (F, B, 7): position [m] and quaternion wxyz of each of `bodies`, in the world.
         """
         data = mujoco.MjData(self.model)
-        ids = self._drawn
-        out = np.empty((len(qpos), len(ids), 7))
+        out = np.empty((len(qpos), len(self._drawn), 7))
         for frame, row in zip(out, qpos, strict=True):
             data.qpos[:] = row
             mujoco.mj_kinematics(self.model, data)
-            frame[:, :3], frame[:, 3:] = data.xpos[ids], data.xquat[ids]
+            frame[:, :3], frame[:, 3:] = data.xpos[self._drawn], data.xquat[self._drawn]
         return out
 
     def geometries(self) -> list[Geometry]:
-        """Everything there is to draw; meshes and height fields are left out."""
-        out, bodies = [], dict(zip(self._drawn, self.bodies, strict=True))
-        for i in range(self.model.ngeom):
-            geom, shape = self.model.geom(i), _SHAPES.get(mujoco.mjtGeom(self.model.geom_type[i]))
-            if shape is None:
-                continue
-            out.append(
-                Geometry(
-                    name=_name(geom.name, f"geom_{i}"),
-                    body=bodies[int(geom.bodyid[0])],
-                    shape=shape,
-                    size=tuple(geom.size.tolist()),
-                    position=tuple(geom.pos.tolist()),
-                    quaternion=tuple(geom.quat.tolist()),
-                    colour=tuple(geom.rgba.tolist()),
-                )
-            )
-        return out
+        """Every primitive to draw; meshes and height fields are left out."""
+        names = dict(zip(self._drawn, self.bodies, strict=True))
+        return [self._geometry(i, names) for i in range(self.model.ngeom) if int(self.model.geom_type[i]) in _SHAPES]
+
+    def _geometry(self, i: int, bodies: dict[int, str]) -> Geometry:
+        geom = self.model.geom(i)
+        return Geometry(
+            name=_name(geom.name, f"geom_{i}"),
+            body=bodies[int(geom.bodyid[0])],
+            shape=_SHAPES[mujoco.mjtGeom(int(geom.type[0]))],
+            size=tuple(geom.size.tolist()),
+            position=tuple(geom.pos.tolist()),
+            quaternion=tuple(geom.quat.tolist()),
+            colour=tuple(self._colour(i).tolist()),
+        )
+
+    def _colour(self, i: int) -> FloatArray:
+        """A geometry's own colour, else its material's, as MuJoCo's renderer has it (4,)."""
+        own, material = self.model.geom_rgba[i], int(self.model.geom_matid[i])
+        if material < 0 or not np.allclose(own, _UNPAINTED) or (self.model.mat_texid[material] >= 0).any():
+            return own
+        return self.model.mat_rgba[material]
+
+    @cached_property
+    def _drawn(self) -> list[int]:
+        return sorted(set(self.model.geom_bodyid.tolist()))
+
+    @property
+    def _moving(self) -> BoolArray:
+        """Whether each body of the model can move, by joints or as a mocap body, (nbody,)."""
+        return np.asarray(self.model.body_weldid != 0)
 
 
-def _name(given: str, fallback: str) -> str:
-    """A name that can stand in a path: environments name things as they like, or not at all."""
-    return re.sub(r"[^\w.-]", "_", given, flags=re.ASCII) or fallback
+def compiled(mjcf: str, name: str) -> mujoco.MjModel:
+    """Compile an MJCF text that needs no other file.
+
+    Raises:
+      ConfigError: MuJoCo refuses it; `name` says in the message whose it is.
+    """
+    try:
+        model = mujoco.MjModel.from_xml_string(mjcf)
+    except (ValueError, mujoco.FatalError) as error:
+        raise ConfigError(f"{name}: MuJoCo refuses the model: {brief(str(error))}") from None
+    # A state that has blown up stays visible, so that its rollout is reported as failed.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model
 
 
 def quiet() -> None:
@@ -116,16 +190,6 @@ def quiet() -> None:
     mujoco.MjLogConfig.set(config)
 
 
-def compiled(mjcf: str, name: str) -> mujoco.MjModel:
-    """The model of an MJCF text that needs no other file.
-
-    Raises:
-      ConfigError: MuJoCo refuses it; names it.
-    """
-    try:
-        model = mujoco.MjModel.from_xml_string(mjcf)
-    except ValueError as error:
-        raise ConfigError(f"{name}: MuJoCo refuses its model: {' '.join(str(error).split())[:300]}") from None
-    # A state that has blown up stays visible, so that its rollout is reported as failed.
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    return model
+def _name(given: str, fallback: str) -> str:
+    """A name that can stand in a path: models name things as they like, or not at all."""
+    return re.sub(r"[^\w.-]", "_", given, flags=re.ASCII) or fallback

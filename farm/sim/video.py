@@ -1,7 +1,4 @@
-"""Pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg; an extra, and the only door to both.
-
-Raises ConfigError where the extra is missing; says what to install.
-"""
+"""Pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg; an extra, and the only door to both."""
 
 import importlib.util
 from collections.abc import Iterable, Sequence
@@ -24,7 +21,7 @@ _COLOURS: Final = 256  # of a gif
 
 
 def check(path: Path) -> None:
-    """Whether a video can be written there.
+    """Check that a video can be written there.
 
     Raises:
       ConfigError: unknown suffix, missing package, or no such folder.
@@ -73,7 +70,7 @@ def _gif(path: Path, pictures: list[Picture]) -> None:
     sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
     for i, image in enumerate(some):
         sheet.paste(image, (0, i * image.height))
-    # Half of its colours are those that are frequent, half so chosen that rare ones, a fingertip's, are there as well.
+    # Half of its colours are the frequent ones, half are chosen so that rare ones, a painted geometry's, are there.
     ways = (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)
     halves = [(sheet.quantize(_COLOURS // 2, way).getpalette() or [])[: 3 * (_COLOURS // 2)] for way in ways]
     palette = Image.new("P", (1, 1))

@@ -10,8 +10,8 @@ import mujoco
 import mujoco.viewer
 
 from farm.errors import RunError
+from farm.sim.channels import Camera
 from farm.sim.engines import DataEngine
-from farm.sim.camera import Camera
 from farm.sim.sim import Sim
 
 _CLOSING: Final = 10.0  # [s]

@@ -36,12 +36,12 @@ class CheckCommand:
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
+    draw_offscreen()  # before anything imports MuJoCo
     name = next((word for word in words if not word.startswith("-")), None)
     own = None if name is None else RunConfig(task=plugin_path("tasks", name))
     default = CheckCommand(name=tyro.MISSING, task=own.task_config if own else TaskConfig())
     command = settings.parse(CheckCommand, words, "farm check", default)
     assert own is not None
-    draw_offscreen()
     try:
         for line in checked(RunConfig(task=own.task, task_config=command.task), command.picture):
             sys.stdout.write(f"{line}\n")

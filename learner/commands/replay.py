@@ -46,10 +46,10 @@ class ReplayCommand:
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
+    draw_offscreen()  # before anything imports MuJoCo
     own = task_of(words)
     default = ReplayCommand(run=tyro.MISSING, task=own or TaskConfig())
     command = settings.parse(ReplayCommand, words, "farm replay", default)
-    draw_offscreen()
     from farm.sim import video
     from learner.replay import loaded
     from learner.run import check_rerun

@@ -1,92 +1,102 @@
-"""Layouts of the viewer: a learning run, and a replay of rollouts. They travel in the file."""
+"""Layouts of the viewer: a learning run, a replay of rollouts, and a comparison of runs. They travel in the file."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, Literal
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from farm.tasks.finger_gait.hand import FINGERS
-from learner.recording.drawing import Mover
+from farm.arrays import FloatArray
+from farm.sim.channels import Camera, Channel
+from farm.sim.rendering import beside
+from farm.sim.scene import Scene
+from farm.tasks.base import TaskSpec
+from learner.recording.channels import entities, path, title
 
 _BACKGROUND: Final = [74, 80, 88, 255]
-_EYE: Final = rrb.EyeControls3D(
-    kind=rrb.Eye3DKind.Orbital,
-    position=(0.275, -0.145, 0.085),
-    look_target=(0.03, 0.014, 0.007),
-    eye_up=(0, 0, 1),
-)
-_BESIDE: Final = (0.25, -0.87, 0.42)
-"""Where the eye is from what moves in a scene without a hand, as a direction: most walk along x."""
-_AWAY: Final = 3.5
-"""How far, in its radii."""
-_JOINTS: Final = "Joints [rad]: lighter to darker along the finger, targets thin"
-_PICTURES: Final = 0.42
-"""Height of the pictures below a scene of 1."""
+_DARK: Final = [24, 25, 28, 255]
+_NEARER: Final = 0.88  # Rerun's eye sees a wider field than MuJoCo's camera
+_PICTURES: Final = 0.42  # height of the pictures below a scene of 1
+_CAPTION: Final = 0.16  # and of a caption alone
+_LEGEND: Final = 6  # more curves than these have no legend: it would hide them
+_MARGIN: Final = 1.6  # so many rollouts before the cursor: the legend covers the older ones
+_FIRST: Final = 1.2  # height of the first plots, whose legend is mostly the longest; of others 1
+_ROWS: Final = 3  # more plots of a rollout stand in two columns
 
 
-def learning(horizon: float, *, touch: bool = True, mover: Mover | None = None) -> rrb.Blueprint:
-    """Layout of a run.
+@dataclass(frozen=True)
+class Eye:
+    """Where a scene is looked at from."""
+
+    target: FloatArray
+    """[m], (3,)"""
+    away: FloatArray
+    """From the target to the eye [m], (3,)"""
+    tracked: str | None = None
+    """Entity that the eye goes with."""
+
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera | None) -> "Eye":
+        """Return the task's camera; without one, an eye beside what moves, which goes with it."""
+        view = camera or beside(scene)
+        a, e = np.deg2rad([view.azimuth, view.elevation])
+        ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        tracked = None if camera or scene.mover is None else f"/world/{scene.mover.body}"
+        return cls(np.array(view.lookat), -_NEARER * view.distance * ahead, tracked)
+
+    def controls(self) -> rrb.EyeControls3D:
+        """Return it as a part of a 3D view."""
+        return rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=self.target + self.away,
+            look_target=self.target,
+            eye_up=(0, 0, 1),
+            tracking_entity=self.tracked,
+        )
+
+
+def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
+    """Layout of a run."""
+    pictures = rrb.Horizontal(*_images(spec), name="Images")
+    traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
+    parts = [part for part, there in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if there]
+    left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
+    tabs = rrb.Tabs(_learning(success=spec.success), _rollout(spec, spec.steps * spec.period), _config())
+    return _blueprint(_beside(left, _PICTURES, tabs, 0.45), "generation", "following")
+
+
+def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
+    """Layout of rollouts that are played one after the other; curves show `window` [s] around the cursor."""
+    shown = rrb.TextDocumentView(origin="/rollout", name="Shown")
+    images = _images(spec)
+    below = rrb.Horizontal(shown, *images) if images else shown
+    tabs = rrb.Tabs(_rollout(spec, window), _config())
+    left = [_scene("Replay", eye), below]
+    return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), "sim_time", "playing")
+
+
+def comparison(roots: Sequence[str], eye: Eye, compared: Channel | None, *, success: bool) -> rrb.Blueprint:
+    """Layout of several runs, each below its root.
 
     Args:
-      horizon: of a rollout [s]; the rollout's curves show so much to either side of the cursor.
-      touch: whether there are fingertips, and success; without them it is any scene.
-      mover: what to look at in any scene.
+      roots: entities that the runs are below.
+      eye: where all scenes together are looked at from.
+      compared: scalars that all runs have, drawn label by label.
+      success: whether any of the runs knows success.
     """
-    name = "The mean policy's rollout"
-    if not touch:
-        tabs = rrb.Tabs(_learning(touch=False), rrb.Vertical(*_plain(horizon), name="Rollout"), _config())
-        parts = rrb.Horizontal(_plain_scene(name, mover), tabs, column_shares=[0.45, 0.55])
-        return _blueprint(parts, "generation", "following")
-    left = rrb.Vertical(
-        _scene(name),
-        rrb.Horizontal(
-            *_fingertips(),
-            _picture("/tactile/trace/best", "Best"),
-            _picture("/tactile/trace/worst", "Worst"),
-        ),
-        row_shares=[1.0, _PICTURES],
-    )
-    tabs = rrb.Tabs(_learning(), rrb.Vertical(*_curves(horizon), name="Rollout"), _config())
-    return _blueprint(rrb.Horizontal(left, tabs, column_shares=[0.45, 0.55]), "generation", "following")
-
-
-def replay(horizon: float, *, touch: bool = True, mover: Mover | None = None) -> rrb.Blueprint:
-    """Layout of rollouts that are played one after the other, with a window of `horizon` [s]; else as `learning`."""
-    if not touch:
-        shown = rrb.TextDocumentView(origin="/rollout", name="Shown")
-        tabs = rrb.Tabs(rrb.Vertical(shown, *_plain(horizon), name="Rollout"), _config())
-        parts = rrb.Horizontal(_plain_scene("Replay", mover), tabs, column_shares=[0.6, 0.4])
-        return _blueprint(parts, "sim_time", "playing")
-    left = rrb.Vertical(
-        _scene("Replay"),
-        rrb.Horizontal(rrb.TextDocumentView(origin="/rollout", name="Shown"), *_fingertips()),
-        row_shares=[1.0, _PICTURES],
-    )
-    tabs = rrb.Tabs(rrb.Vertical(*_curves(horizon), name="Rollout"), _config())
-    return _blueprint(rrb.Horizontal(left, tabs, column_shares=[0.6, 0.4]), "sim_time", "playing")
-
-
-def comparison(roots: Sequence[str], spacing: float) -> rrb.Blueprint:
-    """Layout of several runs, each below its root, their hands so far apart [m]."""
-    middle, count = 0.5 * spacing * (len(roots) - 1), len(roots)
-    eye = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=(0.2 + 0.1 * count, middle - 0.05 * count, 0.04 + 0.03 * count),
-        look_target=(0.03, middle + 0.02, 0.03),
-        eye_up=(0, 0, 1),
-    )
-    hands = rrb.Spatial3DView(
+    scenes = rrb.Spatial3DView(
         origin="/",
         contents=[f"+ {root}/{part}" for root in roots for part in ("world/**", "label")],
         name="Final policies: play the timeline sim_time",
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye,
+        eye_controls=eye.controls(),
     )
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))  # also after a change of the timeline
-    left = rrb.Vertical(hands, rrb.TextDocumentView(origin="/table", name="Runs"), row_shares=[1.0, 1.0])
+    left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs")]
 
     def plot(name: str, entity: str, legend: rrb.Corner2D | None = None) -> rrb.View:
         return _plot(name, *(f"{root}/{entity}" for root in roots), legend=legend, axis_x=whole)
@@ -94,16 +104,23 @@ def comparison(roots: Sequence[str], spacing: float) -> rrb.Blueprint:
     learning = rrb.Vertical(
         plot("Return of the mean policy", "return", legend=rrb.Corner2D.RightBottom),
         plot("Return of the exploring rollouts, mean ± std", "band"),
-        rrb.Horizontal(plot("Success of the exploring rollouts", "success"), plot("Sigma, mean", "sigma")),
+        rrb.Horizontal(
+            *([plot("Success of the exploring rollouts", "success")] if success else []), plot("Sigma, mean", "sigma")
+        ),
         row_shares=[1.5, 1.2, 1],
         name="Learning",
     )
-    forces = [plot(f"Force on the {finger} [N]", f"force/{finger}") for finger in FINGERS]
-    rollout = rrb.Vertical(
-        plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom), *forces, name="Rollout (sim_time)"
+    curves = (
+        []
+        if compared is None
+        else [
+            plot(f"{title(compared)}: {label}", entity[1:])
+            for label, entity in zip(compared.names, entities(compared), strict=True)
+        ]
     )
-    tabs = rrb.Tabs(learning, rollout)
-    return _blueprint(rrb.Horizontal(left, tabs, column_shares=[0.5, 0.5]), "generation", "following")
+    reward = plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom)
+    tabs = rrb.Tabs(learning, _stacked([reward, *curves], [], "Rollout (sim_time)"))
+    return _blueprint(_beside(left, 1.0, tabs, 0.5), "generation", "following")
 
 
 def _blueprint(root: rrb.Container, timeline: str, play: Literal["following", "playing"]) -> rrb.Blueprint:
@@ -115,60 +132,56 @@ def _blueprint(root: rrb.Container, timeline: str, play: Literal["following", "p
     )
 
 
-def _scene(name: str) -> rrb.View:
+def _beside(
+    left: Sequence[rrb.View | rrb.Container], below: float, right: rrb.Container, share: float
+) -> rrb.Container:
+    """A scene with what stands below it, if anything does, of that height; and tabs to its right."""
+    column = rrb.Vertical(*left, row_shares=[1.0, below][: len(left)])
+    return rrb.Horizontal(column, right, column_shares=[share, 1.0 - share])
+
+
+def _scene(name: str, eye: Eye) -> rrb.View:
     return rrb.Spatial3DView(
         origin="/world",
         name=name,
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=_EYE,
-    )
-
-
-def _plain_scene(name: str, mover: Mover | None) -> rrb.View:
-    """Any scene, seen from beside what moves, and a little from above; the eye goes with it."""
-    eye = None
-    if mover is not None:
-        eye = rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=[c + _AWAY * mover.radius * way for c, way in zip(mover.centre, _BESIDE, strict=True)],
-            look_target=mover.centre,
-            eye_up=(0, 0, 1),
-            tracking_entity=mover.entity,
-        )
-    return rrb.Spatial3DView(
-        origin="/world",
-        name=name,
-        background=_BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye,
+        eye_controls=eye.controls(),
     )
 
 
 def _picture(origin: str, name: str) -> rrb.View:
-    return rrb.Spatial2DView(origin=origin, name=name, background=[24, 25, 28, 255])
+    return rrb.Spatial2DView(origin=origin, name=name, background=_DARK)
 
 
-def _fingertips() -> list[rrb.View]:
-    return [_picture(f"/tactile/{finger}", finger.capitalize()) for finger in FINGERS]
+def _images(spec: TaskSpec) -> list[rrb.View]:
+    """A picture of each image; several channels' have the channel's name before their label."""
+    channels = [channel for channel in spec.channels if channel.kind == "images"]
+    names = {c.name: f"{title(c)} " if len(channels) > 1 or not c.labels else "" for c in channels}
+    return [
+        _picture(entity, (names[channel.name] + label)[:1].upper() + (names[channel.name] + label)[1:])
+        for channel in channels
+        for label, entity in zip(channel.names, entities(channel), strict=True)
+    ]
 
 
 def _config() -> rrb.View:
     return rrb.TextDocumentView(origin="/config", name="Config")
 
 
-def _learning(*, touch: bool = True) -> rrb.Container:
+def _learning(*, success: bool) -> rrb.Container:
+    bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
     return rrb.Vertical(
-        _plot("Return", "/learning/return", "/learning/return_std", legend=rrb.Corner2D.RightBottom),
+        _plot("Return", "/learning/return", "/learning/return_std", legend=bottom),
         rrb.Horizontal(
-            *([_plot("Success", "/learning/success")] if touch else []),
-            _plot("Sigma", "/learning/sigma"),
+            *([_plot("Success", "/learning/success", legend=bottom)] if success else []),
+            _plot("Sigma", "/learning/sigma", legend=top),
             _plot("Norm of mu", "/learning/mean_norm", legend=None),
         ),
         rrb.Horizontal(
             _plot("Farm", "/farm/workers", "/farm/reissued"),
             _plot("Rollouts a second", "/farm/rollouts_per_s", legend=None),
-            _plot("Lost rollouts", "/learning/lost"),
+            _plot("Lost rollouts", "/learning/lost", legend=top),
         ),
         _log(),
         row_shares=[2.4, 1.1, 1.1, 1],
@@ -191,32 +204,34 @@ def _log() -> rrb.View:
     return rrb.TextLogView(origin="/log", name="Log", columns=columns)
 
 
-def _plain(horizon: float) -> list[rrb.View]:
-    window = _window(horizon)
-    return [
-        rrb.TimeSeriesView(origin=origin, name=name, time_ranges=window)
-        for origin, name in (("/reward/terms", "Reward"), ("/actions", "Actions"))
-    ]
-
-
-def _window(horizon: float) -> rr.VisibleTimeRange:
-    """So much of a rollout's time to either side of the cursor [s]."""
-    return rr.VisibleTimeRange(
+def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:
+    """Curves and lanes of a rollout, `horizon` [s] to either side of the cursor."""
+    window = rr.VisibleTimeRange(
         "sim_time",
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-horizon),
+        start=rr.TimeRangeBoundary.cursor_relative(seconds=-_MARGIN * horizon),
         end=rr.TimeRangeBoundary.cursor_relative(seconds=horizon),
     )
-
-
-def _curves(horizon: float) -> list[rrb.View]:
-    window = _window(horizon)
-    plots = [
-        rrb.TimeSeriesView(origin=origin, name=name, time_ranges=window, plot_legend=legend)
-        for origin, name, legend in (
-            ("/reward/terms", "Reward terms", rrb.PlotLegend(rrb.Corner2D.LeftBottom)),
-            ("/contacts/force", "Fingertip forces [N]", rrb.PlotLegend(rrb.Corner2D.LeftTop)),
-            ("/joints", _JOINTS, rrb.PlotLegend(visible=False)),
+    curves = [("/reward/terms", "Reward terms", len(spec.terms)), ("/actions", "Actions", spec.action)]
+    curves += [(path(c.name), title(c), c.shape[0]) for c in spec.channels if c.kind == "scalars"]
+    plots: list[rrb.View] = [
+        rrb.TimeSeriesView(
+            origin=origin,
+            name=name,
+            time_ranges=window,
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=count <= _LEGEND),
         )
+        for origin, name, count in curves
     ]
     # A window would not move these lanes' axis, only empty the rest of it.
-    return [*plots, rrb.StateTimelineView(origin="/contacts/state", name="Contact")]
+    lanes: list[rrb.View] = [
+        rrb.StateTimelineView(origin=path(c.name), name=title(c)) for c in spec.channels if c.kind == "flags"
+    ]
+    return _stacked(plots, lanes, "Rollout")
+
+
+def _stacked(views: list[rrb.View], lanes: list[rrb.View], name: str) -> rrb.Container:
+    """Plots below each other, many in pairs, so that their legends fit; lanes below them."""
+    each = 1 if len(views) <= _ROWS else 2
+    pairs = [rrb.Horizontal(*views[i : i + each]) for i in range(0, len(views), each)]
+    rows = [*(pairs if each > 1 else views), *lanes]
+    return rrb.Vertical(*rows, row_shares=[_FIRST, *[1.0] * (len(rows) - 1)], name=name)

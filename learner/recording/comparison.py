@@ -1,16 +1,16 @@
-"""Several runs in one recording: learning curves over each other, hands side by side.
+"""Several runs in one recording: learning curves over each other, scenes side by side.
 
-    /runs/<name>                 where its hand stands (static)
+    /runs/<name>                 where its scene stands (static)
     /runs/<name>/world/...       the final policy's rollout, as in a run's own recording
     /runs/<name>/return, /band, /success, /sigma     learning curves
-    /runs/<name>/force/<finger>, /reward             of the rollout
+    /runs/<name>/reward, /<channel>/<label>          of the rollout
 
-Curves stand on the timelines `generation` and `rollouts`, rollouts on `sim_time`; on the first two the hands
-stay as they are at the rollouts' ends.
+Of the channels, the first one of scalars is drawn, where all runs have it. Curves stand on the timelines `generation`
+and `rollouts`, rollouts on `sim_time`; on the first two the scenes stay as they are at the rollouts' ends.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,23 +18,26 @@ import numpy as np
 import rerun as rr
 
 from farm.arrays import FloatArray
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
+from farm.sim.channels import Camera, Channel
+from farm.sim.rendering import beside
 from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
-from farm.tasks.finger_gait.hand import FINGERS
+from farm.tasks.base import TaskSpec
 from learner.recording import blueprint
-from learner.recording.curves import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, Colour, lines
+from learner.recording.blueprint import Eye
+from learner.recording.channels import entities
+from learner.recording.curves import PALETTE, Colour, lines
 from learner.recording.drawing import Drawing
-from learner.recording.rows import begin, flush, log_static
+from learner.recording.rows import begin, flush, log_static, markdown
 
-COLOURS: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
+COLOURS: Final = PALETTE
 """One a run."""
 
-SPACING: Final = 0.22
-"""Between two hands [m]."""
-
 _APPLICATION: Final = "rolloutfarm comparison"  # a layout of its own, which never becomes that of a run
-_LABEL: Final = (0.0, 0.0, 0.19)  # over the fingers [m]
+_VIEW: Final = (160.0, -15.0)  # azimuth and elevation [deg]: robots that walk along x come towards the eye
+_SPACING: Final = 1.35  # in radii of the largest scene
+_WIDER: Final = 0.55  # so much farther away is the eye for each further scene, in spacings
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,10 @@ class Shown:
 
     name: str
     scene: Scene
-    progress: Sequence[Progress]
+    spec: TaskSpec
+    progress: Sequence[GenerationStats]
     rollout: Trajectory
+    camera: Camera | None = None
 
 
 def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
@@ -60,55 +65,84 @@ def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
     """
     path.touch()  # fails with an errno; Rerun's own error has none
     roots = [f"/runs/{rr.escape_entity_path_part(run.name)}" for run in runs]
-    layout = blueprint.comparison(roots, SPACING)
+    step, eye = _arrangement(runs)
+    compared = _compared(runs)
+    success = any(run.spec.success for run in runs)
+    layout = blueprint.comparison(roots, eye, compared, success=success)
     stream = begin("comparison", [rr.FileSink(path)], layout, _APPLICATION)
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log("/table", rr.TextDocument(table, media_type="text/markdown"), static=True)
+    stream.log("/table", markdown(table), static=True)
     for number, (root, run, colour) in enumerate(zip(roots, runs, COLOURS, strict=False)):
-        drawing = Drawing(run.scene)
-        place = rr.Transform3D(translation=(0.0, number * SPACING, 0.0))
-        hand = [(root + entity, value) for entity, value in drawing.static() if entity.startswith("/world/")]
-        log_static(stream, [(root, place), *hand, *((root + e, v) for e, v in _names(run.name, colour))])
+        drawing = Drawing(run.scene, run.spec)
+        world = [(root + entity, value) for entity, value in drawing.static() if entity.startswith("/world/")]
+        names = [(root + entity, value) for entity, value in _names(run, colour, compared)]
+        log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
         _send_curves(stream, root, run.progress)
-        _send_rollout(stream, root, drawing, run.rollout)
+        _send_rollout(stream, root, drawing, run.rollout, compared)
     flush(stream)
     stream.disconnect()
 
 
-def _names(name: str, colour: Colour) -> Iterator[tuple[str, Any]]:
-    """What never changes but the hand: names and the run's colour."""
-    yield "/label", rr.Points3D([_LABEL], labels=[name], colors=[colour], radii=[0.004], show_labels=True)
-    yield "/return", lines((name,), (colour,), width=2.5)
-    yield "/band", rr.Measurements.from_fields(names=f"{name}, exploring ± std", colors=[colour], widths=[1.0])
-    for entity in ("/success", "/sigma", "/reward", *(f"/force/{finger}" for finger in FINGERS)):
-        yield entity, lines((name,), (colour,))
+def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
+    """From each scene to the next [m] (3,), across what the eye looks along; and the eye, before all of them."""
+    sizes = [run.scene.radius for run in runs]
+    largest = runs[int(np.argmax(sizes))]
+    camera = largest.camera or replace(beside(largest.scene), azimuth=_VIEW[0], elevation=_VIEW[1])
+    eye = Eye.of(largest.scene, camera)
+    along_y = abs(eye.away[0]) >= abs(eye.away[1])
+    step = _SPACING * max(sizes) * np.array([0.0, 1.0, 0.0] if along_y else [1.0, 0.0, 0.0])
+    further = len(runs) - 1
+    wider = 1.0 + _WIDER * further * float(np.linalg.norm(step)) / camera.distance
+    return step, Eye(eye.target + 0.5 * further * step, eye.away * wider)
 
 
-def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[Progress]) -> None:
+def _compared(runs: Sequence[Shown]) -> Channel | None:
+    """The first channel of scalars, if all runs have one of its name and labels."""
+    first = next((channel for channel in runs[0].spec.channels if channel.kind == "scalars"), None)
+    known = [{(c.name, c.kind, c.names) for c in run.spec.channels} for run in runs]
+    return first if first and all((first.name, first.kind, first.names) in names for names in known) else None
+
+
+def _names(run: Shown, colour: Colour, compared: Channel | None) -> Iterator[tuple[str, Any]]:
+    """What never changes but the scene: names and the run's colour."""
+    size = run.scene.radius
+    above = Eye.of(run.scene, run.camera).target + (0.0, 0.0, size)
+    point = rr.Points3D([above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True)
+    yield "/label", point
+    yield "/return", lines((run.name,), (colour,), width=2.5)
+    yield "/band", rr.Measurements.from_fields(names=f"{run.name}, exploring ± std", colors=[colour], widths=[1.0])
+    for entity in ("/success", "/sigma", "/reward", *(() if compared is None else entities(compared))):
+        yield entity, lines((run.name,), (colour,))
+
+
+def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats]) -> None:
     """The learning curves. The mean policy's return and success are those of the mean that was explored around."""
     at = [
-        rr.TimeColumn("generation", sequence=[p.generation for p in progress]),
-        rr.TimeColumn("rollouts", sequence=[p.rollouts for p in progress]),
+        rr.TimeColumn("generation", sequence=[s.generation for s in progress]),
+        rr.TimeColumn("rollouts", sequence=[s.rollouts for s in progress]),
     ]
     for entity, values in (
-        ("/return", [p.mean_policy_return for p in progress]),
-        ("/success", [np.nan if p.success_rate is None else p.success_rate for p in progress]),
-        ("/sigma", [p.sigma_mean for p in progress]),
+        ("/return", [s.mean_policy_return for s in progress]),
+        ("/success", [np.nan if s.success_rate is None else s.success_rate for s in progress]),
+        ("/sigma", [s.sigma_mean for s in progress]),
     ):
         stream.send_columns(root + entity, at, rr.Scalars.columns(scalars=values))
-    means, spreads = [p.return_mean for p in progress], [p.return_std**2 for p in progress]
+    means, spreads = [s.return_mean for s in progress], [s.return_std**2 for s in progress]
     stream.send_columns(f"{root}/band", at, rr.Measurements.columns(values=means, variances=spreads))
 
 
-def _send_rollout(stream: rr.RecordingStream, root: str, drawing: Drawing, rollout: Trajectory) -> None:
+def _send_rollout(
+    stream: rr.RecordingStream, root: str, drawing: Drawing, rollout: Trajectory, compared: Channel | None
+) -> None:
     at = _times(rollout.times)
     for part in drawing.columns(rollout):
         if part.entity.startswith("/world/"):
             stream.send_columns(root + part.entity, at, part.columns)
-    forces = rollout.images.sum(axis=-1)
-    for finger, force in zip(FINGERS, forces.T, strict=True):
-        stream.send_columns(f"{root}/force/{finger}", at[:1], rr.Scalars.columns(scalars=force))
-    stream.send_columns(f"{root}/reward", at[:1], rr.Scalars.columns(scalars=rollout.terms.sum(axis=-1)))
+    curves = {"/reward": rollout.terms.sum(axis=-1)}
+    if compared is not None:
+        curves |= dict(zip(entities(compared), rollout.channels[compared.name].T, strict=True))
+    for entity, values in curves.items():
+        stream.send_columns(root + entity, at[:1], rr.Scalars.columns(scalars=values))
 
 
 def _times(times: FloatArray) -> list[rr.TimeColumn]:

@@ -1,13 +1,14 @@
 """Colours, and the curves of a run: their names, and a generation's values as Rerun entities."""
 
 from collections.abc import Iterable, Sequence
+from itertools import cycle, islice
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 
 from farm.arrays import FloatArray, IntArray
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
 
 Colour = tuple[int, int, int]
 
@@ -20,19 +21,26 @@ BLUE: Final = (0, 114, 178)
 VERMILLION: Final = (213, 94, 0)
 GREY: Final = (150, 150, 150)
 
+PALETTE: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
+"""Colours of what has none of its own, by Okabe and Ito."""
 
 _RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
     [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
 )
 
 
+def palette(count: int) -> list[Colour]:
+    """So many colours; they repeat after seven."""
+    return list(islice(cycle(PALETTE), count))
+
+
 def lines(
-    names: Sequence[str], colours: Iterable[Colour], width: float = 2.0, hidden: Sequence[str] = ()
+    names: Sequence[str], colours: Iterable[Colour] | None = None, width: float = 2.0, hidden: Sequence[str] = ()
 ) -> rr.SeriesLines:
     """Names and colours of an entity's curves; hidden ones are a click on the legend away."""
     return rr.SeriesLines(
         names=list(names),
-        colors=list(colours),
+        colors=palette(len(names)) if colours is None else list(colours),
         widths=[width] * len(names),
         visible_series=[name not in hidden for name in names],
     )
@@ -52,43 +60,42 @@ def pack(colour: Colour) -> int:
     return red << 24 | green << 16 | blue << 8 | 255
 
 
-def static() -> list[tuple[str, Any]]:
-    """Names and colours of the learning curves, in the order of `statistics`."""
+def static(*, success: bool) -> list[tuple[str, Any]]:
+    """Names and colours of the learning curves, in the order of `statistics`; with success where the task knows it."""
     returns = ("mean", "min", "max", "best", "baseline", "mean policy")
     colours = (SKY, VERMILLION, GREEN, ORANGE, GREY, YELLOW)
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
+    succeeded = [("/learning/success", lines(("exploring", "mean policy"), (SKY, YELLOW)))]
     return [
         ("/learning/return", lines(returns, colours, hidden=("mean", "min", "max"))),
         ("/learning/return_std", band),
         ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",))),
         ("/learning/mean_norm", lines(("norm of mu",), (SKY,))),
-        ("/learning/success", lines(("exploring", "mean policy"), (SKY, YELLOW))),
-        ("/learning/lost", lines(("dropped", "failed", "clamped"), (ORANGE, VERMILLION, GREY))),
+        *(succeeded if success else []),
+        ("/learning/lost", lines(("ended early", "failed", "clamped"), (ORANGE, VERMILLION, GREY))),
         ("/farm/workers", lines(("workers",), (GREEN,))),
         ("/farm/rollouts_per_s", lines(("rollouts per s",), (SKY,))),
         ("/farm/reissued", lines(("reissued",), (ORANGE,))),
     ]
 
 
-def statistics(progress: Progress, rate: float) -> list[tuple[str, Any]]:
+def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
     """A generation's values; rate is of exploring rollouts [1/s]."""
-    p = progress
-    baseline = np.nan if p.baseline is None else p.baseline
+    s = stats
+    baseline = np.nan if s.baseline is None else s.baseline
     success = []
-    if p.success_rate is not None and p.mean_policy_success is not None:
-        success.append(("/learning/success", rr.Scalars([p.success_rate, float(p.mean_policy_success)])))
-    mean, spread = p.return_mean, (p.return_min, p.return_max)
+    if s.success_rate is not None and s.mean_policy_success is not None:
+        success.append(("/learning/success", rr.Scalars([s.success_rate, float(s.mean_policy_success)])))
+    band = rr.Measurements.from_fields(values=[s.return_mean], variances=[s.return_std**2])
+    returns = [s.return_mean, s.return_min, s.return_max, s.best, baseline, s.mean_policy_return]
     return [
-        ("/learning/return", rr.Scalars([mean, *spread, p.best, baseline, p.mean_policy_return])),
-        (
-            "/learning/return_std",
-            rr.Measurements.from_fields(values=[mean], variances=[p.return_std**2]),
-        ),
-        ("/learning/sigma", rr.Scalars([p.sigma_mean, p.sigma_min, p.sigma_max])),
-        ("/learning/mean_norm", rr.Scalars([p.mean_norm])),
+        ("/learning/return", rr.Scalars(returns)),
+        ("/learning/return_std", band),
+        ("/learning/sigma", rr.Scalars([s.sigma_mean, s.sigma_min, s.sigma_max])),
+        ("/learning/mean_norm", rr.Scalars([s.mean_norm])),
         *success,
-        ("/learning/lost", rr.Scalars([p.dropped, p.failed, p.clamped])),
-        ("/farm/workers", rr.Scalars([p.workers])),
+        ("/learning/lost", rr.Scalars([s.ended, s.failed, s.clamped])),
+        ("/farm/workers", rr.Scalars([s.workers])),
         ("/farm/rollouts_per_s", rr.Scalars([rate])),
-        ("/farm/reissued", rr.Scalars([p.reissued])),
+        ("/farm/reissued", rr.Scalars([s.reissued])),
     ]

@@ -1,8 +1,7 @@
-"""The files of a recording: parts that a run left behind, merged, mended and compacted.
+"""The files of a recording: parts that a run left behind, merged, repaired and compacted.
 
-Rerun overwrites a file it is given, and a file whose last bytes a crash tore off cannot be read
-until `rerun rrd optimize` has mended it. So a run that goes on mends what is there and begins a
-part of its own.
+Rerun overwrites a file it is given, and a file whose last bytes a crash tore off cannot be read until `rerun rrd
+optimize` has repaired it. So a run that goes on repairs what is there and begins a part of its own.
 """
 
 import json
@@ -28,7 +27,7 @@ def parts(path: Path) -> list[Path]:
 
 
 def compact(path: Path) -> bool:
-    """Merge a recording's parts into one compact file, mending an end that a crash tore off.
+    """Merge a recording's parts into one compact file, repairing an end that a crash tore off.
 
     Returns:
       whether it worked; where not, every part is as it was.

@@ -1,9 +1,9 @@
-"""A run as a Rerun recording: into a file, and live to whoever looks.
+"""A run as a Rerun recording: into a file, and live to viewers.
 
 One recording a run, its id the run's name. Every row stands on three timelines:
 
     generation   updates done, a sequence
-    sim_time     generation x horizon + time in its sample rollout, a duration without gaps
+    sim_time     generation x length of a rollout + time in its sample rollout, a duration without gaps
     wall_time    when it was recorded; a rollout's frames fill the time since the last one
 
 A file is never overwritten: a run that goes on writes run.part2.rrd, and closing merges the parts
@@ -17,6 +17,7 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,17 +26,31 @@ import rerun as rr
 
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
-from farm.net.stats import Progress
+from farm.net.stats import GenerationStats
+from farm.sim.channels import Camera
 from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory, joined
+from farm.tasks.base import TaskSpec
 from learner.recording import blueprint, curves
-from learner.recording.drawing import Drawing, trace
-from learner.recording.files import compact, next_part, parts
-from learner.recording.rows import begin, flush, log_static, row, rows, send, send_properties, times
+from learner.recording.blueprint import Eye
+from learner.recording.channels import trace
+from learner.recording.drawing import Drawing
+from learner.recording.files import compact
+from learner.recording.replay import record_replay
+from learner.recording.rows import (
+    begin,
+    file_sink,
+    flush,
+    log_static,
+    markdown,
+    row,
+    rows,
+    send,
+    send_properties,
+    times,
+)
 
 log = logging.getLogger(__name__)
-
-__all__ = ["Recorder", "parts", "record_replay"]
 
 HOLD: Final = 0.5
 """Rollouts of so long are written together, statistics at once: a row costs much more than what it says [s]."""
@@ -43,8 +58,6 @@ RESERVE: Final = 32 << 20
 """Free space on the disk below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
 """A rollout's last frame comes so much before the next one's first, which would hide it [s]."""
-PAUSE: Final = 0.1
-"""Between two rollouts of a replay [s]."""
 _LEVELS: Final = {"WARNING": "WARN"}  # the standard library's name in Rerun's
 
 
@@ -57,8 +70,9 @@ class Recorder:
         *,
         run: str,
         scene: Scene,
+        spec: TaskSpec,
+        camera: Camera | None = None,
         config: str,
-        horizon: float,
         serve: tuple[str, int] | None = None,
         done: int = 0,
         properties: Mapping[str, object] | None = None,
@@ -69,8 +83,9 @@ class Recorder:
           path: of the recording; where it is there already, its next part is begun.
           run: name of the run.
           scene: what is drawn.
+          spec: of the task.
+          camera: where the scene is looked at from; None: from beside what moves.
           config: the resolved configuration, Markdown.
-          horizon: nominal length of a rollout [s].
           serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
           properties: what tells the run from others.
@@ -81,27 +96,27 @@ class Recorder:
         """
         if path is None and serve is None:
             raise ConfigError("a recording without a file and without an address to serve; give one")
-        self._path, self._horizon, self._generation = path, horizon, done
-        self._last = time.time() - horizon
+        self._path, self._horizon, self._generation = path, spec.steps * spec.period, done
+        self._last = time.time() - self._horizon
         self._held: list[_Held] = []
         self._broken = False
-        self._run, self._scene, self._config = run, scene, config
-        self._drawing = Drawing(scene)
-        if self._drawing.left_out:
-            log.info("%d meshes or height fields of the scene are not drawn", self._drawing.left_out)
+        self._spec = spec
+        self._replay = partial(record_replay, run=run, scene=scene, spec=spec, camera=camera, config=config)
+        self._drawing = Drawing(scene, spec)
+        if scene.left_out:
+            log.info("%d meshes or height fields of the scene are not drawn", scene.left_out)
         self._server = None if serve is None else (serve[0], _free_port(*serve))
         sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
         if path is not None:
-            sinks.append(_file(path))
-        self._stream = begin(
-            run, sinks, blueprint.learning(horizon, touch=self._drawing.touch, mover=self._drawing.mover())
-        )
+            sinks.append(file_sink(path))
+        self._stream = begin(run, sinks, blueprint.learning(spec, Eye.of(scene, camera)))
         send_properties(self._stream, "run", properties or {})
-        log_static(self._stream, [*self._drawing.static(), *curves.static(), _config(config)])
+        static = [*self._drawing.static(), *curves.static(success=spec.success), ("/config", markdown(config))]
+        log_static(self._stream, static)
 
     @property
     def uri(self) -> str | None:
-        """What a viewer opens to look on: `rerun URI`."""
+        """Address that a viewer opens: `rerun URI`; None where nothing is served."""
         if self._server is None:
             return None
         host, port = self._server
@@ -109,7 +124,7 @@ class Recorder:
 
     def generation(
         self,
-        progress: Progress,
+        stats: GenerationStats,
         sample: Trajectory | None,
         traces: Mapping[str, AnyArray],
         rate: float,
@@ -117,10 +132,10 @@ class Recorder:
         """Record a generation that is over; its rollout may be held back for HOLD, or until `settle` or `close`.
 
         Args:
-          progress: its statistics.
+          stats: its statistics.
           sample: a rollout at control rate, usually the mean policy's.
-          traces: taxels over rollouts [N]: `best` and `worst` (T, 54) as pictures; `all`
-            (2N, T, 54) float32, kept bit by bit.
+          traces: `best` and `worst` (T, K) are drawn as pictures; `all` (2N, T, K) float32 is kept bit by bit. K are
+            the traced channels' values side by side, see `farm.tasks.base.flat`.
           rate: exploring rollouts a second.
 
         Raises:
@@ -130,18 +145,17 @@ class Recorder:
         self._check_space()
         if sample is not None:
             self._drawing.check(sample)
-        self._generation = progress.generation
+        self._generation = stats.generation
         start, now = self._start, time.time()
-        at = times("generation", np.array([progress.generation]), np.array([start]), np.array([now]))
-        for entity, values in curves.statistics(progress, rate):
+        at = times("generation", np.array([stats.generation]), np.array([start]), np.array([now]))
+        for entity, values in curves.statistics(stats, rate):
             self._stream.send_columns(entity, at, row(values))
         for name, values in traces.items():
-            entity, picture = _trace(name, values)
-            self._stream.send_columns(entity, at, row(picture))
+            self._stream.send_columns(f"/traces/{name}", at, row(self._trace(name, values)))
         if sample is not None:
             wall = now + (sample.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
             end = start + self._horizon - SEAM
-            self._held.append(_Held(now, progress.generation, np.minimum(start + sample.times, end), wall, sample))
+            self._held.append(_Held(now, stats.generation, np.minimum(start + sample.times, end), wall, sample))
         self._last = now
         if self._held and now - self._held[0].since >= HOLD:
             self._draw()
@@ -163,18 +177,18 @@ class Recorder:
         self._stream.send_columns("/log", at, row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
     def result(self, values: Mapping[str, object]) -> None:
-        """Record what came out, as properties of the recording."""
+        """Record the run's results, as properties of the recording."""
         send_properties(self._stream, "result", values)
 
     def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
         """Record named rollouts at physics rate into a file of their own; see `record_replay`."""
-        record_replay(path, run=self._run, scene=self._scene, config=self._config, rollouts=rollouts)
+        self._replay(path, rollouts=rollouts)
 
     def close(self, *, merge: bool = True) -> None:
         """Write everything out, merge the parts and compact them; a broken recording is left as it is.
 
         Args:
-          merge: false leaves the parts as they are, for somebody in a hurry.
+          merge: false leaves the parts as they are, which is quicker.
 
         Raises:
           OSError: the file takes no more.
@@ -186,6 +200,14 @@ class Recorder:
         self._stream.disconnect()
         if self._path is not None and merge:
             compact(self._path)
+
+    def _trace(self, name: str, values: AnyArray) -> Any:  # noqa: ANN401  (archetypes have no public base)
+        """A trace as an archetype; see `generation`."""
+        if values.ndim != 2 + (name == "all") or values.shape[-2:] != self._spec.trace:
+            raise ValueError(f"trace {name} of shape {values.shape}, expected {self._spec.trace} for each rollout")
+        if name != "all":
+            return trace(values, self._spec.traced[0].top)
+        return rr.Tensor(np.ascontiguousarray(values, dtype=np.float32), dim_names=("rollout", "step", "value"))
 
     def _draw(self) -> None:
         """Send the rollouts that are held back, each entity's rows of all of them together."""
@@ -199,7 +221,7 @@ class Recorder:
         send(self._stream, columns, rows("generation", numbers, sim, wall))
 
     def _flush(self) -> None:
-        """See every row into the file: a kill loses what is held back or waits to be recorded, no more."""
+        """Wait until every row is in the file: a kill loses only what is held back or waits to be recorded."""
         try:
             flush(self._stream)
         except OSError:
@@ -219,47 +241,6 @@ class Recorder:
     def _start(self) -> float:
         """Where the generation begins on sim_time [s]."""
         return self._generation * self._horizon
-
-
-def record_replay(
-    path: Path, *, run: str, scene: Scene, config: str, rollouts: Sequence[tuple[str, Trajectory]]
-) -> None:
-    """Write rollouts into a file of their own, one after the other; it may replace one.
-
-    Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1.
-
-    Args:
-      path: of the recording.
-      run: name of the run; the recording's id is `<run>-replay`.
-      scene: what is drawn.
-      config: the resolved configuration, Markdown.
-      rollouts: names and rollouts, at any rate.
-
-    Raises:
-      OSError: the file cannot be written; one that was there stays.
-    """
-    drawing = Drawing(scene)
-    longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
-    aside = path.with_name(f"{path.stem}.new{path.suffix}")
-    aside.unlink(missing_ok=True)
-    stream = begin(
-        f"{run}-replay", [_file(aside)], blueprint.replay(longest, touch=drawing.touch, mover=drawing.mover())
-    )
-    log_static(stream, [*drawing.static(), _config(config)])
-    start = 0.0
-    for number, (name, rollout) in enumerate(rollouts, 1):
-        at = times("rollout", np.array([number]), np.array([start]))
-        stream.send_columns("/rollout", at, row(_caption(name, rollout)))
-        send(
-            stream,
-            drawing.columns(rollout),
-            rows("rollout", np.full(len(rollout.times), number), start + rollout.times),
-        )
-        start += float(rollout.times[-1]) + PAUSE
-    flush(stream)
-    stream.disconnect()
-    compact(aside)
-    aside.replace(path)
 
 
 @dataclass(frozen=True)
@@ -287,29 +268,3 @@ def _free_port(host: str, port: int) -> int:
     except (OSError, OverflowError) as error:
         place = f"{host}:{port}"
         raise ConfigError(f"cannot serve the recording at {place}: {error}; choose another") from error
-
-
-def _config(text: str) -> tuple[str, Any]:
-    return "/config", _markdown(text)
-
-
-def _file(path: Path) -> rr.FileSink:
-    part = next_part(path)
-    part.touch()  # fails with an errno; Rerun's own error has none
-    return rr.FileSink(part)
-
-
-def _caption(name: str, rollout: Trajectory) -> rr.TextDocument:
-    success = {True: "success", False: "no success", None: ""}[rollout.success]
-    return _markdown(f"### {name}\n\nreturn {rollout.value:.4g}\n\n{success}")
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")
-
-
-def _trace(name: str, values: AnyArray) -> tuple[str, Any]:
-    if name != "all":
-        return f"/tactile/trace/{name}", trace(values)
-    array = np.ascontiguousarray(values, dtype=np.float32)
-    return "/tactile/traces", rr.Tensor(array, dim_names=("rollout", "step", "taxel"))

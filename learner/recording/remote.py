@@ -1,22 +1,27 @@
-"""A run's recording made elsewhere: a folder of its own, gone on with where its file ends."""
+"""A recording of a run that is learnt elsewhere, in a folder of its own, continued where its file ends."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rerun.chunk import RrdReader
 
-from farm import tasks
 from farm.errors import ConfigError, MessageError, RunError
 from farm.net.telemetry import RunEnd, RunReport
+from farm.sim.channels import Camera
+from farm.sim.scene import Scene
+from farm.tasks.base import TaskSpec
 from learner.config import RunConfig
 from learner.recording.files import compact, parts
-from learner.recording.run import Recording
+from learner.recording.run import RunRecording
 from learner.run_folder import RunFolder
 from learner.telemetry.report import unpacked
-from learner.telemetry.subscriber import Follower, other
+from learner.telemetry.subscriber import other
+
+if TYPE_CHECKING:
+    from learner.telemetry.subscriber import Subscriber
 
 _STATISTICS: Final = "/learning/return"  # an entity that has one row a generation
 
@@ -25,7 +30,7 @@ _STATISTICS: Final = "/learning/return"  # an entity that has one row a generati
 class Remote:
     """A recording of a run that is learnt elsewhere."""
 
-    recording: Recording
+    recording: RunRecording
     folder: RunFolder | None
     """Where the files go, None for none."""
     done: int
@@ -33,13 +38,13 @@ class Remote:
     end: RunEnd | None = None
     """How the run ended, once it has."""
 
-    def follow(self, follower: Follower, stopped: Callable[[], bool]) -> None:
+    def follow(self, subscriber: "Subscriber", stopped: Callable[[], bool]) -> None:
         """Record until the run is over.
 
         Raises:
           RunError: the recording failed, or the run cannot be followed.
         """
-        for message in follower.follow(self.done, stopped):
+        for message in subscriber.follow(self.done, stopped):
             for line in message.lines:
                 self.recording.line(line.level, line.text)
             if isinstance(message, RunEnd):
@@ -68,44 +73,45 @@ class Remote:
 
 
 @contextmanager
-def open_remote(path: Path | None, *, name: str, config: RunConfig, serve: tuple[str, int] | None) -> Iterator[Remote]:
-    """Begin a recording in a folder, or go on with the one that is there.
+def open_remote(
+    path: Path | None,
+    *,
+    name: str,
+    config: RunConfig,
+    serve: tuple[str, int] | None,
+    spec: TaskSpec,
+    scene: Scene,
+    camera: Camera | None = None,
+) -> Iterator[Remote]:
+    """Begin a recording in a folder, or continue the one that is there.
 
     Args:
       path: the folder; None to serve only.
       name: the recording's id.
       config: the run's configuration.
       serve: host and port for viewers.
+      spec: of the task.
+      scene: what is drawn.
+      camera: where the scene is looked at from; None: from beside what moves.
 
     Raises:
       ConfigError: the folder is another run's or the learner's, or the address is taken.
     """
-    if path is None:
-        with _recording(None, name, config, serve, 0) as recording:
-            yield Remote(recording, None, 0)
-        return
-    folder = _folder(path, config)
-    with folder.held():
-        done = _recorded(folder.recording)
-        with _recording(folder, name, config, serve, done) as recording:
+    folder = None if path is None else _folder(path, config)
+    with nullcontext() if folder is None else folder.held():
+        done = 0 if folder is None else _recorded(folder.recording)
+        recording = RunRecording(
+            None if folder is None else folder.recording, replay=None if folder is None else folder.replay, run=name,
+            config=config, scene=scene, spec=spec, camera=camera, done=done, serve=serve,
+        )  # fmt: skip
+        try:
             yield Remote(recording, folder, done)
-
-
-@contextmanager
-def _recording(
-    folder: RunFolder | None, name: str, config: RunConfig, serve: tuple[str, int] | None, done: int
-) -> Iterator[Recording]:
-    path, replay = (None, None) if folder is None else (folder.recording, folder.replay)
-    scene = tasks.scene(config.task)
-    recording = Recording(path, replay=replay, run=name, config=config, scene=scene, done=done, serve=serve)
-    try:
-        yield recording
-    finally:
-        recording.finish()
+        finally:
+            recording.finish()
 
 
 def _recorded(path: Path) -> int:
-    """The last generation that a recording's files hold, 0 where there are none; what is torn is mended first.
+    """The last generation that a recording's files hold, 0 where there are none; torn files are repaired first.
 
     Raises:
       ConfigError: a file cannot be read.

@@ -1,6 +1,7 @@
 """A Rerun recording, and how rows get into it: several at once, on timelines of our own."""
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -8,7 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from farm.arrays import FloatArray, IntArray
-from learner.recording.drawing import Columns
+from learner.recording.channels import Columns
+from learner.recording.files import next_part
 
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
@@ -19,7 +21,7 @@ Times = list[rr.TimeColumn]
 def begin(
     recording: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION
 ) -> rr.RecordingStream:
-    """A recording of that id into these sinks, its layout first; the viewer keeps one layout an application."""
+    """Open a recording of that id into these sinks, its layout first; the viewer keeps one layout an application."""
     rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
     stream = rr.RecordingStream(application, recording_id=recording)
     stream.set_sinks(*sinks)
@@ -28,8 +30,19 @@ def begin(
     return stream
 
 
+def file_sink(path: Path) -> rr.FileSink:
+    """Open a recording's next file.
+
+    Raises:
+      OSError: it cannot be written.
+    """
+    part = next_part(path)
+    part.touch()  # fails with an errno; Rerun's own error has none
+    return rr.FileSink(part)
+
+
 def flush(stream: rr.RecordingStream) -> None:
-    """See every row into the files: what goes wrong is noticed.
+    """Wait until every row is in the files.
 
     Raises:
       OSError: the files take no more; the stream writes nothing any more.
@@ -47,21 +60,26 @@ class _Abandoned:
     """Stands in for a native recording that must not be waited for."""
 
     def is_forked_child(self) -> bool:
-        """Yes: Rerun lets go of those without a word."""
+        """Return true: Rerun releases those without waiting."""
         return True
 
 
 def send_properties(stream: rr.RecordingStream, name: str, values: Mapping[str, object]) -> None:
-    """What a table of recordings shows of this one; sent again, they replace what was said before."""
-    said: dict[str, Any] = {key: value for key, value in values.items() if value is not None}
-    if said:
-        stream.send_property(name, rr.AnyValues(**said))
+    """Send what a table of recordings shows of this one; sent again, they replace the former values."""
+    known: dict[str, Any] = {key: value for key, value in values.items() if value is not None}
+    if known:
+        stream.send_property(name, rr.AnyValues(**known))
 
 
 def log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:
-    """What holds at any time."""
+    """Log what holds at any time."""
     for entity, archetype in entities:
         stream.log(entity, archetype, static=True)
+
+
+def markdown(text: str) -> rr.TextDocument:
+    """A text with headings, tables and code."""
+    return rr.TextDocument(text, media_type="text/markdown")
 
 
 def row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no public base)

@@ -1,28 +1,130 @@
-"""A run's recordings: the live one behind its thread, and the replays at physics rate."""
+"""A run's recordings: the live one, written by a thread of its own, and the replays at physics rate."""
 
+import contextlib
 import json
 import logging
+import queue
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from farm import tasks
+from farm.arrays import AnyArray
 from farm.errors import ConfigError
+from farm.net.stats import GenerationStats
+from farm.sim.channels import Camera
 from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
+from farm.tasks.base import TaskSpec
 from learner import config as configs
 from learner.config import RunConfig
 from learner.recording.files import COMPACTING
 from learner.recording.recorder import Recorder
-from learner.recording.thread import RecorderThread
-from learner.telemetry.report import Report
+
+if TYPE_CHECKING:
+    from learner.telemetry.report import Report
 
 log = logging.getLogger(__name__)
+
+WAITING: Final = 256
+"""Messages that may wait before rollouts and traces are dropped."""
+
+QUIET: Final = 0.5
+"""When nothing has come for so long, what the recorder holds back is written [s]."""
 
 _CLOSE: Final = 60.0  # [s] for what still waits to be written
 
 
-class Recording(logging.Handler):
-    """Takes reports and messages; whatever goes wrong here never reaches the learning."""
+class RecorderThread:
+    """Calls a recorder in a thread of its own: learning never waits for it, nor fails with it.
+
+    When more than `waiting` messages wait, rollouts and traces are dropped, and counted; statistics and lines never. A
+    recorder that fails (a full disk) ends the recording with one line in the log.
+    """
+
+    def __init__(self, recorder: Recorder, waiting: int = WAITING) -> None:
+        self._recorder, self._waiting = recorder, waiting
+        self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._failed = threading.Event()
+        self._merge = True
+        self.dropped = 0
+        """Generations recorded without their rollout and traces, because too many waited."""
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    @property
+    def failed(self) -> bool:
+        """Whether the recording ended before its time."""
+        return self._failed.is_set()
+
+    def put(self, call: Callable[[], None]) -> None:
+        """Queue a call of one of the recorder's methods."""
+        if not self.failed:
+            self._queue.put(call)
+
+    def generation(
+        self, stats: GenerationStats, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
+    ) -> None:
+        """Queue a generation; see `Recorder.generation`."""
+        if self._queue.qsize() >= self._waiting and (sample is not None or traces):
+            sample, traces = None, {}
+            self.dropped += 1
+        self.put(lambda: self._recorder.generation(stats, sample, traces, rate))
+
+    def settled(self) -> bool:
+        """Wait until what was queued is recorded; return false when the recording ended before its time."""
+        reached = threading.Event()
+        self.put(self._recorder.settle)
+        self.put(reached.set)
+        while not (reached.wait(0.1) or self.failed):
+            pass
+        return not self.failed
+
+    def close(self, timeout: float | None = None, *, merge: bool = True) -> bool:
+        """Record what waits and end the recording.
+
+        Args:
+          timeout: how long that may take [s]; None for as long as it takes.
+          merge: whether to compact the file as well.
+
+        Returns:
+          whether everything is recorded.
+        """
+        self._merge = merge
+        self._queue.put(None)
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            log.warning("the recording is not complete after %g s: left as it is", timeout)
+            return False
+        return not self.failed
+
+    def _work(self) -> None:
+        try:
+            while (call := self._next()) is not None:
+                call()
+            self._recorder.close(merge=self._merge)
+        except Exception as error:
+            self._failed.set()
+            log.error("the recording ends here, learning goes on: %s", error)
+            self._abandon()
+
+    def _next(self) -> Callable[[], None] | None:
+        """Return the next call; where none comes for a while, the one that writes what is held back."""
+        try:
+            return self._queue.get(timeout=QUIET)
+        except queue.Empty:
+            return self._recorder.settle
+
+    def _abandon(self) -> None:
+        """Empty the queue, and keep what is recorded as far as that goes."""
+        while not self._queue.empty():
+            self._queue.get()
+        with contextlib.suppress(Exception):
+            self._recorder.close(merge=self._merge)
+
+
+class RunRecording(logging.Handler):
+    """A run's recordings, from its reports and log messages; what goes wrong here never reaches the learning."""
 
     def __init__(
         self,
@@ -32,6 +134,8 @@ class Recording(logging.Handler):
         run: str,
         config: RunConfig,
         scene: Scene,
+        spec: TaskSpec,
+        camera: Camera | None = None,
         done: int,
         serve: tuple[str, int] | None,
     ) -> None:
@@ -43,6 +147,8 @@ class Recording(logging.Handler):
           run: name that the run began with, the recording's id.
           config: the run's configuration.
           scene: what is drawn.
+          spec: of the task.
+          camera: where the scene is looked at from; None: from beside what moves.
           done: generations that were recorded before.
           serve: host and port for viewers.
 
@@ -51,16 +157,15 @@ class Recording(logging.Handler):
         """
         super().__init__(logging.INFO)
         self._replay = replay
-        sizes = tasks.sizes(config.task)
         try:
-            recorder = Recorder(
-                path, run=run, scene=scene, config=markdown(config),
-                horizon=sizes.steps * sizes.period, serve=serve, done=done, properties=configs.properties(config),
+            self._recorder = Recorder(
+                path, run=run, scene=scene, spec=spec, camera=camera, config=markdown(config), serve=serve, done=done,
+                properties=configs.properties(config),
             )  # fmt: skip
         except OSError as error:
             raise ConfigError(f"cannot write {path}: {error.strerror}") from None
-        self.uri = recorder.uri
-        self._thread = RecorderThread(recorder)
+        self.uri = self._recorder.uri
+        self._thread = RecorderThread(self._recorder)
         self._best: tuple[str, Trajectory] | None = None
         self._ended = False
         logging.getLogger().addHandler(self)
@@ -71,53 +176,55 @@ class Recording(logging.Handler):
         return self._thread.dropped
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Show a message in the recording."""
-        self._thread.log(record.getMessage(), record.levelname)
+        """Record a message of the log."""
+        self.line(record.levelname, record.getMessage())
 
-    def generation(self, report: Report) -> None:
-        """Show a generation; the best rollout at physics rate goes into replay.rrd when there is a new one."""
+    def line(self, level: str, text: str) -> None:
+        """Record a line; levels are those of the standard library."""
+        self._thread.put(lambda: self._recorder.log(text, level))
+
+    def generation(self, report: "Report") -> None:
+        """Record a generation; the best rollout at physics rate goes into replay.rrd when there is a new one."""
         self._thread.generation(report.progress, report.sample, report.traces, report.rate)
         if report.progress.return_max >= report.progress.best:
-            self._thread.log(f"new best rollout: return {report.progress.best:.3f}")
+            self.line("INFO", f"new best rollout: return {report.progress.best:.3f}")
         if report.replay is not None:
             self._best = (f"best rollout, generation {report.replay_generation}", report.replay)
-            self._show([self._best])
+            self._write_replay([self._best])
 
     def end(self, generation: int, mean: Trajectory | None, best: Trajectory | None, best_generation: int) -> None:
-        """The run is over: write replay.rrd once more.
+        """Record a run's end, and write replay.rrd once more.
 
         Args:
           generation: updates done.
           mean: the final mean policy's rollout.
-          best: the best rollout, None where `generation` has shown it.
+          best: the best rollout, None where `generation` has had it.
           best_generation: the generation it came from.
         """
         self._ended = True
         if best is not None:
             self._best = (f"best rollout, generation {best_generation}", best)
-        shown = [] if self._best is None else [self._best]
+        rollouts = [] if self._best is None else [self._best]
         if mean is not None:
-            self._thread.result({"generations": generation, "return": mean.value, "success": mean.success})
-            shown.append((f"mean policy after generation {generation}", mean))
-        if shown:
-            self._show(shown)
-
-    def line(self, level: str, text: str) -> None:
-        """Show a message from elsewhere."""
-        self._thread.log(text, level)
+            result = {"generations": generation, "return": mean.value, "success": mean.success}
+            self._thread.put(lambda: self._recorder.result(result))
+            rollouts.append((f"mean policy after generation {generation}", mean))
+        if rollouts:
+            self._write_replay(rollouts)
 
     def settled(self) -> bool:
-        """Wait until everything so far is recorded; whether it is."""
+        """Wait until everything so far is recorded; return whether it is."""
         return self._thread.settled()
 
     def finish(self) -> None:
-        """Write out what waits, and close; an interrupted run is in a hurry and merges when it goes on."""
+        """Write out what waits, and close; an interrupted run's parts are merged only when it goes on."""
         logging.getLogger().removeHandler(self)
         self._thread.close(_CLOSE + (COMPACTING if self._ended else 0.0), merge=self._ended)
 
-    def _show(self, rollouts: list[tuple[str, Trajectory]]) -> None:
-        if self._replay is not None:
-            self._thread.replay(self._replay, rollouts)
+    def _write_replay(self, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
+        path = self._replay
+        if path is not None:
+            self._thread.put(lambda: self._recorder.replay(path, rollouts))
 
 
 def markdown(config: RunConfig) -> str:

@@ -1,4 +1,4 @@
-"""A running viewer, told what to show."""
+"""The viewer's program, and the table of recordings in a running viewer."""
 
 import logging
 import os
@@ -15,16 +15,16 @@ from rerun.experimental import ViewerClient
 log = logging.getLogger(__name__)
 
 _LOADING: Final = 60.0  # [s]
-_LOOK: Final = 0.2  # [s] between two looks at a viewer that starts
+_PERIOD: Final = 0.2  # [s] between two questions to a viewer that starts
 
 
 def program() -> str:
-    """The viewer itself: `python -m rerun` would only be its parent, and end without it."""
+    """Path of the viewer itself: `python -m rerun` would only be its parent, and end without it."""
     return os.environ.get("RERUN_CLI_PATH") or str(Path(rerun_cli.__file__).with_name("rerun"))
 
 
 def free_port(rather: int = 0) -> int:
-    """A port on this machine that nobody uses: this one if it is free."""
+    """A free port on this machine: `rather` if it is free."""
     with socket.socket() as probe:
         try:
             probe.bind(("127.0.0.1", rather))
@@ -49,7 +49,7 @@ def show_table(port: int, gone: Callable[[], bool]) -> bool:
                 return True
         except Exception as error:  # not listening yet, or a viewer of the user's that knows no tables
             log.debug("no table yet: %s", error)
-        time.sleep(_LOOK)
+        time.sleep(_PERIOD)
     return False
 
 

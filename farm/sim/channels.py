@@ -1,0 +1,78 @@
+"""What a rollout shows besides its bodies, and where it is seen from. Pure."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+
+Kind = Literal["scalars", "flags", "images", "arrows", "points"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Channel:
+    """Something that a rollout shows besides its bodies: n curves, pictures, arrows or points in each frame."""
+
+    name: str
+    """Its place in recordings, for example `contacts/force`."""
+    kind: Kind
+    """What a frame holds, with the shape that goes with it:
+
+    scalars (n,)        curves
+    flags   (n,)        0 or 1, drawn as lanes
+    images  (n, h, w)   pictures; with `places` also points on bodies
+    arrows  (n, 6)      start [m], and vector [unit]
+    points  (n, 4)      position [m], and value [unit]
+    """
+    shape: tuple[int, ...]
+    """Of a frame."""
+    labels: tuple[str, ...] = ()
+    """Names of the n; without: their numbers."""
+    unit: str = ""
+    top: float = 1.0
+    """Value drawn in the brightest colour (images, points, painted geometries) [unit]."""
+    colours: tuple[tuple[int, int, int], ...] = ()
+    """Red, green, blue of each of the n, 0 to 255; without: a palette's."""
+    bodies: tuple[str, ...] = ()
+    """Bodies in whose frames the n arrows, points or places are; without: the world's."""
+    places: FloatArray | None = None
+    """Where an image's pixels lie on its body [m], (n, h * w, 3)."""
+    length: float = 0.01
+    """An arrow's length [m/unit]."""
+    longest: float = 0.1
+    """Longer arrows are cut here [m]."""
+    geoms: tuple[str, ...] = ()
+    """Geometries that a video paints by these n scalars: white at 0, their colour from `top` on."""
+    trace: bool = False
+    """Whether it travels with results: of the best and the worst rollout of a generation, or of all."""
+
+    def __post_init__(self) -> None:
+        """Check the shape."""
+        sizes = {"scalars": 1, "flags": 1, "images": 3, "arrows": 2, "points": 2}
+        if self.kind not in sizes or len(self.shape) != sizes[self.kind]:
+            raise ConfigError(f"channel {self.name}: kind {self.kind!r} of shape {self.shape}; see Channel.kind")
+        last = {"arrows": 6, "points": 4}.get(self.kind, self.shape[-1])
+        if self.shape[-1] != last or min(self.shape) < 1:
+            raise ConfigError(f"channel {self.name}: {self.kind} of shape {self.shape}; expected (n, {last})")
+        for what in ("labels", "colours", "bodies", "geoms"):
+            if len(getattr(self, what)) not in (0, self.shape[0]):
+                raise ConfigError(f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels, or numbers from 1."""
+        return self.labels or tuple(str(i + 1) for i in range(self.shape[0]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A point of view, as MuJoCo's free camera has it."""
+
+    lookat: tuple[float, float, float]
+    """[m]"""
+    distance: float
+    """[m]"""
+    azimuth: float = 120.0
+    """[deg]"""
+    elevation: float = -15.0
+    """[deg]"""

@@ -1,0 +1,193 @@
+"""A task's channels as Rerun entities, by kind: what never changes, and columns for a rollout's frames.
+
+Scalars are curves at /NAME, flags state lanes at /NAME/LABEL, images pictures at /NAME/LABEL (and with places points on
+their bodies, at /world/BODY/NAME), arrows and points are at /world/NAME.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+
+from farm.arrays import AnyArray, FloatArray, IntArray
+from farm.sim.channels import Channel
+from farm.sim.scene import Scene
+from learner.recording.curves import lines, pack, palette, ramp
+from learner.recording.solids import rotate
+
+STATES: Final = ("off", "on")
+"""Names of a flag's values."""
+
+_OFF: Final = (52, 54, 58)
+_ARROW: Final = (255, 255, 255)  # of arrows without colours
+_POINT_RADIUS: Final = 0.0085  # in radii of the scene
+_ARROW_RADIUS: Final = 0.012
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Rows of one entity, to be sent together."""
+
+    entity: str
+    columns: rr.ComponentColumnList
+    rows: IntArray | None = None
+    """Which frames the rows belong to; all of them where None."""
+
+
+class ChannelDrawing:
+    """How one channel is drawn."""
+
+    def __init__(self, channel: Channel, scene: Scene) -> None:
+        self._channel = channel
+        self._bodies = [scene.index(body) for body in channel.bodies]
+        self._size = scene.radius
+        name = path(channel.name)
+        self._entity = f"/world{name}" if channel.kind in ("arrows", "points") else name
+        self._on = [] if channel.places is None else _on_bodies(channel, [scene.bodies[i] for i in self._bodies])
+
+    def static(self) -> Iterator[tuple[str, Any]]:
+        """Entities and archetypes that are logged once."""
+        channel = self._channel
+        colours = channel.colours or palette(channel.shape[0])
+        if channel.kind == "scalars":
+            yield self._entity, lines(channel.names, colours)
+        elif channel.kind == "flags":
+            for entity, colour in zip(entities(channel), colours, strict=True):
+                yield entity, rr.StateConfiguration(values=STATES, colors=[_OFF, colour])
+        elif channel.kind == "images":
+            style = _image_style(channel)
+            yield from ((entity, style) for entity in entities(channel))
+            for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
+                yield entity, rr.Points3D.from_fields(positions=places, radii=_POINT_RADIUS * self._size)
+
+    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:
+        """A rollout's frames, or those of several that are joined.
+
+        Args:
+          values: (F, *shape) of the channel.
+          bodies: (F, B, 7) poses of the drawn bodies [m], quaternions wxyz.
+          begins: (F,) number of the rollout that the frame belongs to.
+        """
+        match self._channel.kind:
+            case "scalars":
+                yield Columns(self._entity, scalars(values))
+            case "flags":
+                yield from self._flags(values, begins)
+            case "images":
+                yield from self._images(values)
+            case "arrows":
+                yield Columns(self._entity, self._arrows(values, bodies))
+            case "points":
+                yield Columns(self._entity, self._points(values, bodies))
+
+    def arrows(self, values: FloatArray, bodies: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Origins [m] and vectors [m] of arrows in the world, (F, n, 3) each.
+
+        Args:
+          values: (F, n, 6) starts [m] and vectors [unit] in the frames of the channel's bodies.
+          bodies: (F, B, 7) poses of the drawn bodies [m], quaternions wxyz.
+        """
+        vectors = values[..., 3:] * self._channel.length
+        extent = np.linalg.norm(vectors, axis=-1, keepdims=True)
+        vectors = vectors * np.minimum(1.0, self._channel.longest / np.where(extent > 0, extent, 1.0))
+        if self._bodies:
+            vectors = rotate(bodies[:, self._bodies, 3:], vectors)
+        return self._in_world(values[..., :3], bodies), vectors
+
+    def _in_world(self, places: FloatArray, bodies: FloatArray) -> FloatArray:
+        """Places in the frames of the channel's bodies, in the world's (F, n, 3)."""
+        if not self._bodies:
+            return places
+        poses = bodies[:, self._bodies]
+        return poses[..., :3] + rotate(poses[..., 3:], places)
+
+    def _flags(self, values: FloatArray, begins: IntArray) -> Iterator[Columns]:
+        for entity, flags in zip(entities(self._channel), (values > 0).T, strict=True):
+            rows = changes(2 * begins + flags)  # and where a rollout begins
+            yield Columns(entity, rr.StateChange.columns(state=[STATES[int(flags[row])] for row in rows]), rows)
+
+    def _images(self, values: FloatArray) -> Iterator[Columns]:
+        for entity, image in zip(entities(self._channel), np.moveaxis(values, 1, 0), strict=True):
+            pixels = np.ascontiguousarray(image.reshape(len(image), -1), dtype=np.float32)
+            yield Columns(entity, rr.DepthImage.columns(buffer=pixels.view(np.uint8)))
+        for i, entity in enumerate(self._on):
+            pixels = values[:, i].reshape(len(values), -1)
+            colours = rr.Points3D.columns(colors=ramp(pixels.reshape(-1), self._channel.top))
+            yield Columns(entity, colours.partition(np.full(len(pixels), pixels.shape[1])))
+
+    def _arrows(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
+        """Arrows that are not zero."""
+        origins, vectors = self.arrows(values, bodies)
+        drawn = (vectors != 0).any(axis=-1)
+        colours = [pack(colour) for colour in self._channel.colours or [_ARROW] * values.shape[1]]
+        columns = rr.Arrows3D.columns(
+            origins=origins[drawn],
+            vectors=vectors[drawn],
+            colors=np.broadcast_to(np.array(colours, np.uint32), drawn.shape)[drawn],
+            radii=np.full(int(drawn.sum()), _ARROW_RADIUS * self._size),
+        )
+        return columns.partition(drawn.sum(axis=1))
+
+    def _points(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
+        frames, count, _ = values.shape
+        columns = rr.Points3D.columns(
+            positions=self._in_world(values[..., :3], bodies).reshape(-1, 3),
+            colors=ramp(values[..., 3].reshape(-1), self._channel.top),
+            radii=np.full(frames * count, 2 * _POINT_RADIUS * self._size),
+        )
+        return columns.partition(np.full(frames, count))
+
+
+def path(name: str) -> str:
+    """A name that may hold slashes as an entity's path."""
+    return "".join(f"/{rr.escape_entity_path_part(part)}" for part in name.split("/"))
+
+
+def entities(channel: Channel) -> list[str]:
+    """Paths of the channel's parts, by their labels."""
+    return [f"{path(channel.name)}{path(label)}" for label in channel.names]
+
+
+def _on_bodies(channel: Channel, bodies: list[str]) -> list[str]:
+    """Paths of the images' pixels as points: on their bodies, by label where several are on one."""
+    if not bodies:
+        return [f"/world{entity}" for entity in entities(channel)]
+    labels = ["" if bodies.count(body) == 1 else path(label) for body, label in zip(bodies, channel.names, strict=True)]
+    return [f"/world/{body}{path(channel.name)}{label}" for body, label in zip(bodies, labels, strict=True)]
+
+
+def title(channel: Channel) -> str:
+    """Name of the channel's view, with its unit."""
+    name = " ".join(channel.name.replace("_", " ").split("/"))
+    return f"{name[:1].upper()}{name[1:]}" + (f" [{channel.unit}]" if channel.unit else "")
+
+
+def trace(values: AnyArray, top: float) -> rr.DepthImage:
+    """A rollout's trace (T, K) as a picture of K rows and T columns, brightest at `top`."""
+    image = np.ascontiguousarray(values.T, dtype=np.float32)
+    return rr.DepthImage(image, depth_range=(0.0, top), **_STYLE)
+
+
+def scalars(values: FloatArray) -> rr.ComponentColumnList:
+    """Curves (F, n) as columns."""
+    count, width = values.shape
+    return rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(count, width))
+
+
+def changes(states: AnyArray) -> IntArray:
+    """The first row, and those that differ from the row before, (F,) -> (n,)."""
+    return np.flatnonzero(np.append(True, states[1:] != states[:-1]))
+
+
+_STYLE: Final = {
+    "colormap": rr.components.Colormap.Viridis,
+    "magnification_filter": rr.components.MagnificationFilter.Nearest,
+}
+
+
+def _image_style(channel: Channel) -> rr.DepthImage:
+    _, height, width = channel.shape
+    size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
+    return rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)

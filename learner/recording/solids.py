@@ -1,0 +1,52 @@
+"""Primitives of a MuJoCo model as Rerun archetypes, and turning by quaternions."""
+
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+
+from farm.arrays import FloatArray
+from farm.sim.scene import Geometry
+
+ENDLESS: Final = 50.0
+"""Half a side of a plane without end, as it is drawn [m]."""
+
+_THIN: Final = 0.001  # [m]
+
+
+def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (archetypes without a common base)
+    """A MuJoCo primitive as a Rerun one, in its body's frame."""
+    quaternion = np.array(geometry.quaternion)
+    style = {
+        "quaternions": [xyzw(quaternion)],
+        "colors": [[round(255 * part) for part in geometry.colour]],
+        "fill_mode": rr.components.FillMode.Solid,
+    }
+    centre, size = np.array(geometry.position), geometry.size
+    if geometry.shape == "box":
+        return rr.Boxes3D(half_sizes=[size[:3]], centers=[centre], **style)
+    if geometry.shape == "plane":  # Rerun has none: a thin box below it
+        sides = [side or ENDLESS for side in size[:2]]
+        below = centre - rotate(quaternion, np.array([0.0, 0.0, _THIN]))
+        return rr.Boxes3D(half_sizes=[[*sides, _THIN]], centers=[below], **style)
+    if geometry.shape == "ellipsoid":
+        return rr.Ellipsoids3D(half_sizes=[size], centers=[centre], **style)
+    if geometry.shape == "sphere":
+        return rr.Ellipsoids3D(radii=[size[0]], centers=[centre], **style)
+    if geometry.shape == "cylinder":
+        return rr.Cylinders3D(radii=[size[0]], lengths=[2 * size[1]], centers=[centre], **style)
+    # MuJoCo's capsule is centred, Rerun's starts where its axis begins.
+    start = centre - rotate(quaternion, np.array([0.0, 0.0, size[1]]))
+    return rr.Capsules3D(radii=[size[0]], lengths=[2 * size[1]], translations=[start], **style)
+
+
+def rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+    """Turn vectors (..., 3) by unit quaternions wxyz (..., 4): v + 2 w (u x v) + 2 u x (u x v)."""
+    scalar, axis = quaternion[..., :1], quaternion[..., 1:]
+    cross = np.cross(axis, vector)
+    return np.asarray(vector + 2.0 * (scalar * cross + np.cross(axis, cross)))
+
+
+def xyzw(quaternion: FloatArray) -> FloatArray:
+    """Quaternions wxyz in Rerun's order (..., 4)."""
+    return np.roll(quaternion, -1, axis=-1)

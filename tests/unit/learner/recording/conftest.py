@@ -1,0 +1,160 @@
+"""A made-up task with a channel of each kind, one without channels, and recordings read back by Rerun's own reader."""
+
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from farm.arrays import AnyArray
+from farm.net.stats import GenerationStats
+from farm.sim.scene import Scene, compiled
+from farm.sim.trajectory import Trajectory
+from farm.tasks.base import Channel, TaskSpec, flat
+from learner.recording.recorder import Recorder
+
+STEPS, PERIOD = 15, 0.1
+
+MJCF = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body name="ball" pos="0 0 1"><freejoint/><geom name="ball" type="sphere" size="0.1"/></body>
+    <body name="arm" pos="1 0 1" quat="0.8 0.6 0 0">
+      <joint axis="0 1 0"/><geom name="arm" type="capsule" size="0.05" fromto="0 0 0.1 0 0 0.5"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+PLACES = np.stack([np.arange(18.0).reshape(6, 3) / 100, np.arange(18.0).reshape(6, 3) / 50])
+CHANNELS = (
+    Channel(name="touch/force", kind="scalars", shape=(2,), labels=("left", "right side"), unit="N"),
+    Channel(name="touch/state", kind="flags", shape=(2,), labels=("left", "right side")),
+    Channel(
+        name="pads", kind="images", shape=(2, 2, 3), labels=("left", "right side"), top=2.0, bodies=("ball", "arm"),
+        places=PLACES, trace=True,
+    ),
+    Channel(name="touch/push", kind="arrows", shape=(2, 6), bodies=("ball", "arm"), length=0.5, longest=1.0),
+    Channel(name="goals", kind="points", shape=(3, 4), top=4.0),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return Scene(compiled(MJCF, "made up"))
+
+
+@pytest.fixture(scope="session")
+def scene_text() -> str:
+    return MJCF
+
+
+@pytest.fixture(scope="session")
+def spec() -> TaskSpec:
+    return TaskSpec(
+        observation=8, action=2, steps=STEPS, period=PERIOD, terms=("reach", "cost"), success=True, channels=CHANNELS
+    )
+
+
+@pytest.fixture(scope="session")
+def plain() -> TaskSpec:
+    return TaskSpec(observation=8, action=3, steps=STEPS, period=PERIOD)
+
+
+@pytest.fixture
+def start(tmp_path: Path, scene: Scene, spec: TaskSpec) -> Callable[..., Recorder]:
+    """Begin a recorder of a run called `try`."""
+
+    def begin(name: str = "run.rrd", done: int = 0, spec: TaskSpec = spec) -> Recorder:
+        return Recorder(tmp_path / name, run="try", scene=scene, spec=spec, config="# settings", done=done)
+
+    return begin
+
+
+@pytest.fixture
+def stats() -> Callable[..., GenerationStats]:
+    def make(generation: int = 1, **others: Any) -> GenerationStats:
+        numbers: dict[str, Any] = {
+            "generation": generation, "rollouts": 30 * generation, "return_mean": -5.0 + 0.1 * generation,
+            "return_min": -40.0, "return_max": -1.0, "return_std": 2.0, "best": -0.5, "baseline": -5.0,
+            "mean_policy_return": -4.0, "mean_policy_success": False, "success_rate": 0.25, "sigma_mean": 2.0,
+            "sigma_min": 1.0, "sigma_max": 3.0, "mean_norm": 8.0, "ended": 2, "failed": 0, "clamped": 0, "reissued": 1,
+            "workers": 3, "seconds": 1.0,
+        }  # fmt: skip
+        return GenerationStats(**{**numbers, **others})
+
+    return make
+
+
+@pytest.fixture
+def rollout(scene: Scene, spec: TaskSpec) -> Callable[..., Trajectory]:
+    """Make a rollout of the task; without touch in the first half of its frames."""
+
+    def make(frames: int = STEPS + 1, step: float = PERIOD, spec: TaskSpec = spec) -> Trajectory:
+        rng = np.random.default_rng(0)
+        qpos = np.repeat(scene.model.qpos0[None], frames, axis=0) + rng.normal(size=(frames, 8))
+        qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+        channels = {c.name: rng.uniform(0.1, 1.0, (frames, *c.shape)) for c in spec.channels}
+        if channels:
+            channels["touch/state"] = np.tile(np.arange(frames)[:, None] >= frames // 2, 2) * 1.0
+            channels["touch/push"][: frames // 2, :, 3:] = 0.0
+        return Trajectory(
+            times=np.arange(frames) * step, bodies=scene.poses(qpos), actions=rng.normal(size=(frames, spec.action)),
+            terms=rng.normal(size=(frames, len(spec.terms))), channels=channels, value=-3.25,
+            success=True if spec.success else None,
+        )  # fmt: skip
+
+    return make
+
+
+@pytest.fixture
+def traces(rollout: Callable[..., Trajectory], spec: TaskSpec) -> Callable[..., dict[str, AnyArray]]:
+    def make(rollouts: int = 4) -> dict[str, AnyArray]:
+        one = flat(spec.traced, rollout().channels)[1:]
+        every = np.stack([one + i for i in range(rollouts)]).astype("<f4")
+        return {"best": every[0], "worst": every[-1], "all": every}
+
+    return make
+
+
+class Rows:
+    """What a file holds, by entity."""
+
+    def __init__(self, path: Path) -> None:
+        self.batches: dict[str, list[Any]] = defaultdict(list)
+        self.static: set[str] = set()
+        for chunk in RrdReader(path).stream():
+            self.batches[chunk.entity_path].append(chunk.to_record_batch())
+            if chunk.is_static:
+                self.static.add(chunk.entity_path)
+
+    def column(self, entity: str, name: str) -> list[Any]:
+        """Return a column's values in the order of sim_time."""
+        rows = []
+        for batch in self.batches[entity]:
+            found = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
+            if found and "sim_time" in batch.schema.names:
+                times = batch.column("sim_time").cast("int64").to_pylist()
+                rows += zip(times, batch.column(found[0]).to_pylist(), strict=True)
+        return [value for _, value in sorted(rows, key=lambda row: row[0]) if value is not None]
+
+    def fixed(self, entity: str, name: str) -> Any:
+        """Return a static value."""
+        for batch in self.batches[entity]:
+            for found in batch.schema.names:
+                if found.endswith(f":{name}") and "sim_time" not in batch.schema.names:
+                    return batch.column(found).to_pylist()[0]
+        raise KeyError(name)
+
+    def times(self, entity: str) -> list[int]:
+        """Return an entity's sim_time [ns]."""
+        timed = [b for b in self.batches[entity] if "sim_time" in b.schema.names]
+        return sorted(t for b in timed for t in b.column("sim_time").cast("int64").to_pylist())
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[[str], Rows]:
+    return lambda name="run.rrd": Rows(tmp_path / name)

@@ -1,0 +1,175 @@
+"""What a task's channels become in a recording, and how primitives are drawn."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from farm.errors import ConfigError
+from farm.sim.scene import Geometry, Scene, compiled
+from farm.tasks.base import Camera, Channel, TaskSpec
+from learner.recording.blueprint import Eye
+from learner.recording.channels import ChannelDrawing, changes, title
+from learner.recording.curves import ramp
+from learner.recording.drawing import Drawing
+from learner.recording.solids import ENDLESS, rotate, solid
+
+
+@pytest.fixture
+def written(start, rollout, stats, read):
+    shown = rollout(7)  # it ended early
+    recorder = start()
+    recorder.generation(stats(), shown, {}, rate=1.0)
+    recorder.close()
+    return shown, read()
+
+
+def test_curves_hold_what_the_rollout_held(written):
+    shown, rows = written
+    np.testing.assert_array_equal(rows.column("/reward/terms", "scalars"), shown.terms)
+    np.testing.assert_array_equal(rows.column("/actions", "scalars"), shown.actions)
+    np.testing.assert_array_equal(rows.column("/touch/force", "scalars"), shown.channels["touch/force"])
+    assert rows.fixed("/touch/force", "names") == ["left", "right side"]
+    assert rows.fixed("/reward/terms", "names") == ["reach", "cost"]
+    assert rows.fixed("/actions", "names") == ["1", "2"]
+
+
+def test_bodies_are_where_they_were(written, scene):
+    shown, rows = written
+    poses = shown.bodies[:, scene.bodies.index("arm")]
+    np.testing.assert_allclose(
+        np.array(rows.column("/world/arm", "quaternion"))[:, 0], poses[:, [4, 5, 6, 3]], atol=1e-6
+    )
+    np.testing.assert_allclose(np.array(rows.column("/world/arm", "translation"))[:, 0], poses[:, :3], atol=1e-6)
+    assert {"/config", "/world/world", "/world/world/floor", "/world/arm/arm"} <= rows.static
+
+
+def test_flags_are_recorded_where_they_change(written):
+    _, rows = written
+    assert rows.column("/touch/state/left", "state") == [["off"], ["on"]]
+    assert rows.times("/touch/state/right\\ side") == [1_500_000_000, 1_800_000_000]
+
+
+def test_images_are_pictures_and_points_on_their_bodies(written):
+    shown, rows = written
+    images = shown.channels["pads"]
+    pixels = np.array(rows.column("/pads/right\\ side", "buffer"), dtype=np.uint8)[:, 0]
+    np.testing.assert_array_equal(
+        np.ascontiguousarray(pixels).view(np.float32), images[:, 1].reshape(7, -1).astype("f4")
+    )
+    colours = np.array(rows.column("/world/arm/pads", "colors"))
+    np.testing.assert_array_equal(colours, ramp(images[:, 1].reshape(7, -1), 2.0))
+    places = np.array(rows.fixed("/world/ball/pads", "positions"))
+    np.testing.assert_allclose(places, np.arange(18.0).reshape(6, 3) / 100, atol=1e-6)
+
+
+def test_arrows_stand_on_their_bodies(written, scene):
+    shown, rows = written
+    values, found = shown.channels["touch/push"], rows.column("/world/touch/push", "vectors")
+    assert [len(arrows) for arrows in found] == [0, 0, 0, 2, 2, 2, 2], "arrows of zero length are not drawn"
+    origins = rows.column("/world/touch/push", "origins")
+    for frame in range(3, 7):
+        for i, body in enumerate(("ball", "arm")):
+            pose, place, vector = shown.bodies[frame, scene.bodies.index(body)], np.zeros(3), np.zeros(3)
+            mujoco.mju_rotVecQuat(place, values[frame, i, :3], pose[3:])
+            mujoco.mju_rotVecQuat(vector, 0.5 * values[frame, i, 3:], pose[3:])
+            np.testing.assert_allclose(origins[frame][i], pose[:3] + place, atol=1e-6)
+            np.testing.assert_allclose(found[frame][i], vector, atol=1e-6)
+
+
+def test_long_arrows_are_cut(scene):
+    channel = Channel(name="a", kind="arrows", shape=(1, 6), length=2.0, longest=0.5)
+    _, vectors = ChannelDrawing(channel, scene).arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
+    np.testing.assert_allclose(vectors, [[[0.3, 0.0, 0.4]]])
+
+
+def test_points_are_coloured_by_value(written):
+    shown, rows = written
+    values = shown.channels["goals"]
+    np.testing.assert_allclose(rows.column("/world/goals", "positions"), values[..., :3], atol=1e-6)
+    np.testing.assert_array_equal(rows.column("/world/goals", "colors"), ramp(values[..., 3], 4.0))
+
+
+def test_a_task_without_channels_has_bodies_actions_and_reward(start, rollout, stats, read, plain):
+    recorder = start(spec=plain)
+    unknown = {"mean_policy_success": None, "success_rate": None}
+    recorder.generation(stats(**unknown), rollout(spec=plain), {}, rate=1.0)
+    recorder.close()
+    rows = read()
+    moving = {"/world/ball", "/world/arm", "/reward/terms", "/actions"}
+    assert {entity for entity in rows.batches if len(rows.times(entity)) == 16} == moving
+    assert "/learning/success" not in rows.batches
+
+
+def test_the_layout_travels_in_the_file(start, tmp_path):
+    start().close()
+    reader = RrdReader(tmp_path / "run.rrd")
+    assert len(reader.blueprints()) == 1
+    assert [(r.recording_id, r.application_id) for r in reader.recordings()] == [("try", "rolloutfarm")]
+
+
+def test_the_eye_is_the_cameras_or_beside_what_moves(scene):
+    eye = Eye.of(scene, Camera(lookat=(1, 2, 3), distance=2.0, azimuth=90.0, elevation=-30.0))
+    assert (eye.target.tolist(), eye.tracked) == ([1, 2, 3], None)
+    np.testing.assert_allclose(eye.away / np.linalg.norm(eye.away), [0, -np.cos(np.pi / 6), 0.5], atol=1e-12)
+    assert Eye.of(scene, None).tracked == "/world/ball"
+    still = Scene(compiled('<mujoco><worldbody><geom type="plane" size="4 4 1"/></worldbody></mujoco>', "still"))
+    assert Eye.of(still, None).tracked is None
+
+
+def test_another_tasks_rollout_is_refused(scene, spec, plain, rollout):
+    good, drawing = rollout(), Drawing(scene, spec)
+    for wrong, name in (
+        (replace(good, bodies=good.bodies[:, 1:]), "bodies"),
+        (replace(good, terms=good.terms[1:]), "terms"),
+        (replace(good, channels={**good.channels, "goals": good.channels["goals"][:, 1:]}), "channels/goals"),
+        (rollout(spec=plain), "actions"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} of shape .* another scene or task"):
+            list(drawing.columns(wrong))
+
+
+def test_a_channel_on_an_unknown_body_is_refused(scene):
+    channel = Channel(name="a", kind="arrows", shape=(1, 6), bodies=("leg",))
+    spec = TaskSpec(observation=1, action=1, steps=1, period=1.0, channels=(channel,))
+    with pytest.raises(ConfigError, match="no body 'leg' .* known are world, ball, arm"):
+        Drawing(scene, spec)
+
+
+def test_titles_say_the_unit():
+    assert title(Channel(name="touch/contact_force", kind="scalars", shape=(1,), unit="N")) == "Touch contact force [N]"
+    assert title(Channel(name="x", kind="scalars", shape=(1,))) == "X"
+
+
+def test_a_capsule_starts_where_its_axis_begins(scene):
+    drawn = solid(next(g for g in scene.geometries() if g.name == "arm"))
+    start = np.array(drawn.translations.as_arrow_array().to_pylist()[0])
+    [turn], [length] = drawn.quaternions.as_arrow_array().to_pylist(), drawn.lengths.as_arrow_array().to_pylist()
+    end = start + rotate(np.roll(turn, 1), np.array([0.0, 0.0, length]))
+    np.testing.assert_allclose(sorted([start[2], end[2]]), [0.1, 0.5], atol=1e-6)
+
+
+@pytest.mark.parametrize(("size", "sides"), [((2.0, 3.0, 0.1), [2.0, 3.0]), ((0.0, 3.0, 0.1), [ENDLESS, 3.0])])
+def test_a_plane_is_a_thin_box_with_its_top_where_the_plane_is(size, sides):
+    half = np.sqrt(0.5)  # turned by 90 degrees about x: its normal is -y
+    plane = Geometry("floor", "world", "plane", size, (1.0, 2.0, 3.0), (half, half, 0.0, 0.0), (0.5, 0.5, 0.5, 1.0))
+    drawn = solid(plane)
+    [extent], [centre] = (part.as_arrow_array().to_pylist() for part in (drawn.half_sizes, drawn.centers))
+    np.testing.assert_allclose(extent, [*sides, 0.001], atol=1e-9)
+    np.testing.assert_allclose(centre, [1.0, 2.001, 3.0], atol=1e-6)
+
+
+def test_an_ellipsoid_has_three_radii():
+    shape = Geometry("e", "b", "ellipsoid", (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (1.0, 0, 0, 0), (1.0, 0, 0, 1.0))
+    np.testing.assert_allclose(solid(shape).half_sizes.as_arrow_array().to_pylist(), [[0.1, 0.2, 0.3]], rtol=1e-6)
+
+
+def test_colours_run_from_violet_to_yellow():
+    assert [hex(c) for c in ramp(np.array([-1.0, 0.0, 2.0, 9.0]), 2.0)] == ["0x440154ff"] * 2 + ["0xfde725ff"] * 2
+
+
+def test_changes_are_the_first_row_and_every_other_state():
+    assert changes(np.array([False, False, True, True, False])).tolist() == [0, 2, 4]
+    assert changes(np.array([True])).tolist() == [0]
