@@ -1,8 +1,8 @@
 """One look-up for tasks, policies, algorithms, backends and commands: built in, installed packages, files.
 
-    finger-gait            built in: a line in BUILT_IN
-    my-task                an installed package: an entry point of the group `rolloutfarm.tasks`
-    pendulum.py:Pendulum   a class in a file, named by its path
+finger-gait            built in: a line in BUILT_IN
+my-task                an installed package: an entry point of the group `rolloutfarm.tasks`
+pendulum.py:Pendulum   a class in a file, named by its path
 """
 
 import ast
@@ -161,7 +161,8 @@ def _file_module(path: Path, kind: str) -> Any:  # noqa: ANN401  a module
         raise ConfigError(f"{_one(kind)} {path}: there is no such file")
     name = _MODULES + hashlib.sha256(str(path).encode()).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look for their annotations there
     try:

@@ -1,4 +1,4 @@
-"""What a run simulates, built from its specification: jobs in, results out. For workers, and for a learner's own use."""
+"""What a run simulates, built from its specification: jobs in, results out. For workers and learners alike."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -108,9 +108,7 @@ def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping
 _SAME = "install the learner's release on both sides"
 
 
-def _plugin(
-    kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]
-) -> plugins.Plugin:
+def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]) -> plugins.Plugin:
     """The class that a specification names, if its code is the learner's."""
     if name.rpartition(":")[0].endswith(".py"):
         return plugins.allowed(kind, name, digest or "", files)

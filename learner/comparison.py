@@ -7,7 +7,7 @@ from typing import Any
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
-from learner.config import RunConfig, changes, preset_of, settings
+from learner.config import RunConfig, changes, flat, preset_of
 from learner.run_folder import RunFolder
 
 
@@ -70,7 +70,7 @@ def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
         values = []
         for run in runs:
             changed = {key: value for key, _, value in changes(first, run.config)}
-            values.append(changed[name] if name in changed else settings(first)[name])
+            values.append(changed[name] if name in changed else flat(first)[name])
         yield name, *(str(value) for value in values)
 
 
