@@ -28,7 +28,9 @@ def test_no_baseline() -> None:
 
 
 def test_further_fields_do_no_harm() -> None:
-    assert GenerationStats.from_dict({**json.loads(STORED), "weather": "fine"}) == GenerationStats.from_dict(json.loads(STORED))
+    assert GenerationStats.from_dict({**json.loads(STORED), "weather": "fine"}) == GenerationStats.from_dict(
+        json.loads(STORED)
+    )
 
 
 def test_refused() -> None:

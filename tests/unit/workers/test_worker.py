@@ -399,7 +399,9 @@ def test_messages_it_cannot_read(
             b"\xc1",
             newer,
             codec.encode(replace(learner.header, run="a//b")),
-            codec.encode(WorkRequest(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)),
+            codec.encode(
+                WorkRequest(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)
+            ),
         ):
             stage.session.publish(key, payload)
     learner.announce()

@@ -127,7 +127,9 @@ MESSAGES = {
             ),
         ),
     ),  # fmt: skip
-    "want": WorkRequest(worker="host/a1", credits=64, idle=(), version="0.1.0", assets="a", canary="c", host="h", cores=2),
+    "want": WorkRequest(
+        worker="host/a1", credits=64, idle=(), version="0.1.0", assets="a", canary="c", host="h", cores=2
+    ),
     "want nothing": WorkRequest(
         worker="host/a1", credits=0, idle=("run-1", "second"), version="", assets="a", canary="c", host="h", cores=2
     ),

@@ -8,7 +8,9 @@ from learner.scheduler.census import Census
 
 
 def want(worker: str = "a/1", assets: str = "hand", canary: str = "bits") -> WorkRequest:
-    return WorkRequest(worker=worker, credits=4, idle=(), version="7.7", assets=assets, canary=canary, host="h", cores=2)
+    return WorkRequest(
+        worker=worker, credits=4, idle=(), version="7.7", assets=assets, canary=canary, host="h", cores=2
+    )
 
 
 def test_the_first_worker_decides_whose_numbers_count() -> None:

@@ -32,7 +32,8 @@ SPEC = Spec(
 )  # fmt: skip
 SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
 NEWER = codec.encode(
-    WorkRequest(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2), codec.SCHEMA + 1
+    WorkRequest(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2),
+    codec.SCHEMA + 1,
 )
 PATIENT = SchedulerConfig(straggler_seconds=60.0)
 WAIT = 20.0
