@@ -136,7 +136,7 @@ class Dispatcher:
         self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
         self._round = RoundResults(jobs, traces, self._trace, self._shapes)
         self._scheduler.begin(len(jobs))
-        self._hand_out()
+        self._issue()
 
     def collect(self) -> RoundResults:
         """Wait for the results of the round that has begun.
@@ -149,7 +149,7 @@ class Dispatcher:
         while not self._scheduler.complete:
             for event in self._events():
                 self._take(event)
-            self._hand_out()
+            self._issue()
             self._tell_when_alone()
             self._tell_status()
             if self._stopped():
@@ -303,7 +303,7 @@ class Dispatcher:
             self.admission.deserted()
         return again
 
-    def _hand_out(self) -> None:
+    def _issue(self) -> None:
         assert self._round is not None
         for worker, indices in self._scheduler.assign(time.monotonic()):
             # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.

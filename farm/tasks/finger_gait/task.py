@@ -7,6 +7,7 @@ the controller sets joint targets; a demonstration of the goal grip defines the 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
@@ -111,6 +112,8 @@ class FingerGaitConfig(TaskConfig):
     def __post_init__(self) -> None:
         """Check every value."""
         super().__post_init__()
+        if self.object.endswith(".xml"):  # so that a run can be repeated from anywhere
+            object.__setattr__(self, "object", str(Path(self.object).resolve()))
         for kind, name, known in (
             ("grip", self.start_grip, GRIPS),
             ("grip", self.goal_grip, GRIPS),
