@@ -147,11 +147,11 @@ def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
     return [*flags, "--farm", sharing.farm, *(["--tls", str(sharing.tls)] if sharing.tls else [])]
 
 
-def _workers(sharing: Sharing, flags: Sequence[str], configs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
+def _workers(sharing: Sharing, flags: Sequence[str], runs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
     """Local workers, which may serve the files that these runs come from."""
     if not sharing.workers:
         return None
-    chosen = {("tasks", config.task) for config in configs} | {("policies", config.policy) for config in configs}
+    chosen = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
     files = sorted({str(file) for kind, name in chosen if (file := plugins.find(kind, name).file)})
     own = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
     own += [word for file in files for word in ("--allow-file", file)]
