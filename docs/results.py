@@ -26,8 +26,8 @@ HEAD = """# Results
 
 What Plage 2016 found, and the questions it left open, with this project: question by question, claim by claim. This
 page is made by `docs/results.py` from the data in `docs/results/`. From a checkout, `python -m benchmarks.thesis plot
-docs/results` draws the figures again from it, and `python -m benchmarks.thesis NAME` does an experiment anew (`python -m
-benchmarks.thesis thesis` all of them; `--list` says what each costs).
+docs/results` draws the figures again from it, and `python -m benchmarks.thesis NAME` does an experiment anew (`thesis`
+instead of a name all of them; `--list` says what each costs).
 
 A set-up is run with seeds 0 to {last}. Its settings are the preset `thesis` with what the figure's caption or text
 says, or the preset `default` (`docs/method.md`). **Learnt** means: the final mean policy does the gait on the nominal

@@ -16,7 +16,7 @@ from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, Ke
 from benchmarks.thesis.folder import ExperimentFolder
 from benchmarks.thesis.series import load, read_arrays, write_arrays
 from farm import seeds
-from farm.arrays import AnyArray, FloatArray
+from farm.arrays import AnyArray
 from farm.errors import ConfigError
 from farm.policies.fourier import FeaturesConfig, Projected
 from farm.sim.sim import Sim
