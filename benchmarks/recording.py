@@ -23,10 +23,10 @@ from pathlib import Path
 
 import rerun_cli
 
-from farm import tasks
+from farm.net.session import free_endpoint
 from learner.config import RunConfig
-from learner.recording.run import Recording
-from learner.run import Place, Run, free_endpoint, open_run
+from learner.recording.run import RunRecording
+from learner.run import Placement, Run, open_run
 
 BLOCK = 10
 """Generations of a block; the first of each is left out, and of every run the first four blocks."""
@@ -76,7 +76,7 @@ def main() -> None:
             f"| {thread[1]:.2f} | {(thread[1] - thread[0]) / wall[0]:+.1%} | {recorder:.1f} |"
         )
     with tempfile.TemporaryDirectory() as folder:
-        place = Place(workers=2, listen=free_endpoint())
+        place = Placement(workers=2, listen=free_endpoint())
         with open_run(RunConfig(generations=arguments.long), Path(folder, "r"), place) as run:
             for _ in run.learn():
                 pass
@@ -86,12 +86,13 @@ def main() -> None:
 
 def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
     """Learn, recording every other pair of blocks."""
-    place = Place(workers=2, listen=free_endpoint(), record=False)
+    place = Placement(workers=2, listen=free_endpoint(), record=False)
     port = int(free_endpoint().rpartition(":")[2])
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
-        recording = Recording(
-            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config,
-            scene=tasks.scene(config.task), done=0, serve=("127.0.0.1", port) if kind else None,
+        problem = run.learner.problem
+        recording = RunRecording(
+            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config, scene=problem.scene,
+            spec=problem.spec, camera=problem.task.camera, done=0, serve=("127.0.0.1", port) if kind else None,
         )  # fmt: skip
         looking = (
             _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("looks", "stopped") else nullcontext()
@@ -103,7 +104,7 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
             recording.finish()
 
 
-def _learn(run: Run, recording: Recording, without: Times, with_: Times) -> None:
+def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> None:
     """Note what each generation took, but for the first of a block and those of the first four blocks."""
     before = _now()
     for report in run.learn():

@@ -53,6 +53,13 @@ def hashes(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.fixture
+def farm(tmp_path: Path):
+    started = Farm(tmp_path)
+    yield started
+    started.close()
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory):
     farm = Farm(tmp_path_factory.mktemp("experiment"))
