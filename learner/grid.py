@@ -110,14 +110,15 @@ class Sweep:
 
     def _check_same(self, told: Any, file: Path) -> None:  # noqa: ANN401  parsed JSON
         """See that what is there is this sweep, perhaps with fewer seeds."""
-        if not isinstance(told, dict) or told.get("version") != _VERSION:
+        lists = isinstance(told, dict) and all(isinstance(told.get(name), list) for name in ("seeds", "settings"))
+        if not lists or told.get("version") != _VERSION:
             raise ConfigError(f"{file} is not of version {_VERSION}")
         if told.get("vary") != self.vary:
             there, here = _words(told.get("vary")), _words(self.vary)
             raise ConfigError(f"{self.path} varies {there}; here it is {here}: give the same, or another --out")
-        if missing := [str(seed) for seed in told.get("seeds", []) if seed not in self.seeds]:
+        if missing := [str(seed) for seed in told["seeds"] if seed not in self.seeds]:
             raise ConfigError(f"{self.path} has seeds {', '.join(missing)} as well: give them too, or another --out")
-        for setting, kept in zip(self.settings, told.get("settings", []), strict=False):
+        for setting, kept in zip(self.settings, told["settings"], strict=False):
             for name, old, new in configs.changes(configs.from_dict(kept, str(file)), setting.config):
                 raise ConfigError(
                     f"{self.path} was begun with --{name} {old}; here it is {new}: give the same, or another --out"
