@@ -10,7 +10,6 @@ from processes import Farm, children
 
 from farm.net.session import free_endpoint
 
-
 SHORT = ("sweep", "--vary", "initial_sigma=0.4,0.8", "--seeds", "0-1", "--pairs", "6", "--generations", "6")
 """Four runs."""
 
