@@ -4,7 +4,7 @@
 
 A run at N 15 that is recorded in two blocks of ten generations of every four, the middle ones: both kinds of blocks
 have the same share of a noisy machine and of the learning (rollouts take longer as fewer end early). Into a file, and
-live with no viewer, one that looks on, and one that has stopped. Compared are the medians of a generation's time, and
+live with no viewer, one that watches, and one that has stopped. Compared are the medians of a generation's time, and
 the processor time of the learner's thread and of the recorder's.
 """
 
@@ -33,8 +33,8 @@ BLOCK = 10
 
 KINDS = {
     "into a file": "",
-    "file and live, nobody looks": "live",
-    "file and live, a viewer looks on": "looks",
+    "file and live, without a viewer": "live",
+    "file and live, a viewer watches": "watches",
     "file and live, the viewer has stopped": "stopped",
 }
 
@@ -95,7 +95,7 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
             spec=problem.spec, camera=problem.task.camera, done=0, serve=("127.0.0.1", port) if kind else None,
         )  # fmt: skip
         looking = (
-            _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("looks", "stopped") else nullcontext()
+            _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("watches", "stopped") else nullcontext()
         )
         try:
             with looking:
@@ -129,7 +129,7 @@ def _now() -> tuple[float, float, float]:
 
 @contextmanager
 def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
-    """A viewer without a window that looks on, or has stopped doing so."""
+    """A viewer without a window that watches, or has stopped doing so."""
     program, port = Path(rerun_cli.__file__).with_name("rerun"), free_endpoint().rpartition(":")[2]
     command = [str(program), uri, "--headless", "--bind", "127.0.0.1", "--port", port]
     with tempfile.TemporaryDirectory() as home:

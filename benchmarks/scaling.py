@@ -246,7 +246,7 @@ def _measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
     """A process full of workers, until its standard input closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for who began us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for the process that began us
     Emulated.pair, over, agenda = pair, threading.Event(), Agenda()
     with ExitStack() as stack:
         emulated: list[Emulated] = []

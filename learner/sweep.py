@@ -51,7 +51,7 @@ class Sharing:
     backend: str = "cpu"
     """What they simulate with."""
     connect: tuple[str, ...] = ()
-    """Routers of a farm to dial, instead of one of our own."""
+    """Routers of a farm to connect to; without: one of our own."""
     tls: Path | None = None
     """Folder with the learner's certificates."""
     farm: str = "farm"
@@ -231,7 +231,7 @@ def _end(learners: list[_Learner]) -> None:
 
 
 def _learn(words: Sequence[str]) -> int:
-    """`farm learner`, ended as by SIGTERM when whoever started it is gone."""
+    """`farm learner`, ended as by SIGTERM when the process that started it is gone."""
     from farm.__main__ import main
 
     def watch() -> None:

@@ -29,7 +29,7 @@ class SharingOptions:
     backend: str = "cpu"
     """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
     connect: tuple[str, ...] = ()
-    """Use the workers of a farm: dial its router, repeatable."""
+    """Use the workers of a farm: its router, repeatable."""
     tls: Path | None = None
     """Folder with the learner's certificates."""
     farm: str = "farm"
