@@ -7,11 +7,11 @@ import argparse
 
 import numpy as np
 
-from farm.policies.fourier import Features, Policy, PolicyConfig
-from farm.tasks.finger_gait.hand import FINGERS
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import Simulation
-from farm.tasks.finger_gait.task import TIMESTEP, TaskConfig, moved
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks.finger_gait.hand import FINGERS, JOINTS
+from farm.tasks.finger_gait.task import CONTROL_PERIOD, TIMESTEP, FingerGait, FingerGaitConfig, moved
+from farm.tasks.loop import Batch, Rollouts, again, whole
 
 SECONDS = (0.0, 0.5, 1.0, 2.0, 3.0)
 
@@ -24,27 +24,37 @@ def main() -> None:
     fingers = " | ".join(f"{finger} [N]" for finger in FINGERS)
     print(f"| grip | s after release | {fingers} | drift [mm] | turn [deg] |\n|---|---|---|---|---|---|---|")
     for grip in ("index+thumb", "index+middle+thumb"):
-        hold(arguments.object, grip)
+        show(grip, hold(arguments.object, grip))
 
 
-def hold(object_name: str, grip: str) -> None:
-    """A rollout of a controller that always says zero: the start grip's commands stay as they are."""
-    steps = round(SECONDS[-1] / 0.1)
-    config = TaskConfig(object=object_name, start_grip=grip, steps=steps)
-    kernel = PolicyConfig(controller="kernel")
-    size = STATES[config.state].size
-    policy = Policy(kernel, size, Features.draw(kernel, size, np.random.default_rng(0)))
-    far = np.full((1, policy.size), 50.0)  # so far from any joint position that the kernel is zero
-    rollouts = Simulation(config, policy).run(far, [None], substeps=1)
-    start = rollouts.start.pose
-    held = rollouts.outcome.steps[0] * 0.1
-    for seconds in (s for s in SECONDS if s <= held):
-        frames = rollouts.start if seconds == 0 else rollouts.frames
-        at = () if seconds == 0 else (round(seconds / TIMESTEP) - 1,)
-        force = frames.force[(0, *at)].sum(axis=-1)
-        shift, turn = moved(frames.pose[(0, *at)], start[0])
-        felt = " | ".join(f"{f:.2f}" for f in force)
-        print(f"| {grip if seconds == 0 else ''} | {seconds:g} | {felt} | {1e3 * shift:.2f} | {np.degrees(turn):.2f} |")
+def hold(object_name: str, grip: str) -> Rollouts:
+    """A rollout whose actions are zero: the start grip's commands stay as they are."""
+    config = FingerGaitConfig(object=object_name, start_grip=grip, steps=round(SECONDS[-1] / CONTROL_PERIOD))
+    task = FingerGait(config)
+    sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
+
+    def held() -> Rollouts:
+        task.setup(sim)
+        batch = Batch(task, sim, [None], every=1)
+        while not batch.over:
+            batch.step(np.zeros((1, len(JOINTS))))
+        return batch.rollouts()
+
+    rollouts: Rollouts = again(held)
+    return rollouts
+
+
+def show(grip: str, rollouts: Rollouts) -> None:
+    """Rows of the table."""
+    frames = whole(rollouts, 0)
+    pose, force = frames["qpos"][:, len(JOINTS) :], frames["force"].sum(axis=-1)
+    for seconds in SECONDS:
+        at = round(seconds / TIMESTEP)
+        if at < len(pose):
+            shift, turn = moved(pose[at], pose[0])
+            felt = " | ".join(f"{f:.2f}" for f in force[at])
+            first = grip if seconds == 0 else ""
+            print(f"| {first} | {seconds:g} | {felt} | {1e3 * shift:.2f} | {np.degrees(turn):.2f} |")
 
 
 if __name__ == "__main__":

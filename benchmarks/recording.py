@@ -4,7 +4,7 @@
 
 A run at N 15 that is recorded in two blocks of ten generations of every four, the middle ones: both kinds of blocks
 have the same share of a noisy machine and of the learning (rollouts take longer as fewer end early). Into a file, and
-live with no viewer, one that looks on, and one that has stopped. Compared are the medians of a generation's time, and
+live with no viewer, one that watches, and one that has stopped. Compared are the medians of a generation's time, and
 the processor time of the learner's thread and of the recorder's.
 """
 
@@ -23,18 +23,18 @@ from pathlib import Path
 
 import rerun_cli
 
-from farm import tasks
+from farm.net.session import free_endpoint
 from learner.config import RunConfig
-from learner.recording.run import Recording
-from learner.run import Place, Run, free_endpoint, open_run
+from learner.recording.run import RunRecording
+from learner.run import Placement, Run, open_run
 
 BLOCK = 10
 """Generations of a block; the first of each is left out, and of every run the first four blocks."""
 
 KINDS = {
     "into a file": "",
-    "file and live, nobody looks": "live",
-    "file and live, a viewer looks on": "looks",
+    "file and live, without a viewer": "live",
+    "file and live, a viewer watches": "watches",
     "file and live, the viewer has stopped": "stopped",
 }
 
@@ -76,7 +76,7 @@ def main() -> None:
             f"| {thread[1]:.2f} | {(thread[1] - thread[0]) / wall[0]:+.1%} | {recorder:.1f} |"
         )
     with tempfile.TemporaryDirectory() as folder:
-        place = Place(workers=2, listen=free_endpoint())
+        place = Placement(workers=2, listen=free_endpoint())
         with open_run(RunConfig(generations=arguments.long), Path(folder, "r"), place) as run:
             for _ in run.learn():
                 pass
@@ -86,15 +86,16 @@ def main() -> None:
 
 def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
     """Learn, recording every other pair of blocks."""
-    place = Place(workers=2, listen=free_endpoint(), record=False)
+    place = Placement(workers=2, listen=free_endpoint(), record=False)
     port = int(free_endpoint().rpartition(":")[2])
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
-        recording = Recording(
-            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config,
-            scene=tasks.scene(config.task), done=0, serve=("127.0.0.1", port) if kind else None,
+        problem = run.learner.problem
+        recording = RunRecording(
+            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config, scene=problem.scene,
+            spec=problem.spec, camera=problem.task.camera, done=0, serve=("127.0.0.1", port) if kind else None,
         )  # fmt: skip
         looking = (
-            _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("looks", "stopped") else nullcontext()
+            _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("watches", "stopped") else nullcontext()
         )
         try:
             with looking:
@@ -103,7 +104,7 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
             recording.finish()
 
 
-def _learn(run: Run, recording: Recording, without: Times, with_: Times) -> None:
+def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> None:
     """Note what each generation took, but for the first of a block and those of the first four blocks."""
     before = _now()
     for report in run.learn():
@@ -128,7 +129,7 @@ def _now() -> tuple[float, float, float]:
 
 @contextmanager
 def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
-    """A viewer without a window that looks on, or has stopped doing so."""
+    """A viewer without a window that watches, or has stopped doing so."""
     program, port = Path(rerun_cli.__file__).with_name("rerun"), free_endpoint().rpartition(":")[2]
     command = [str(program), uri, "--headless", "--bind", "127.0.0.1", "--port", port]
     with tempfile.TemporaryDirectory() as home:

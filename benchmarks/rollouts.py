@@ -22,12 +22,14 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from farm.policies.fourier import Features, Policy
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import CLOSING, Simulation
-from farm.tasks.finger_gait.task import SUBSTEPS, Perturbation
-from learner.config import PRESETS, RunConfig
-from learner.run import Place, Run, free_endpoint, open_run
+from farm.net.session import free_endpoint
+from farm.rollouts import Runner
+from farm.sim.engines import BatchEngine
+from farm.tasks.finger_gait.task import CLOSING, SUBSTEPS
+from farm.tasks.loop import Batch, Seed, again
+from learner.config import RunConfig, configure
+from learner.run import Placement, Run, open_run
+from learner.setup import problem
 from learner.telemetry.report import Report
 
 STILL = 50.0  # every parameter: so far from any joint position that the kernel is zero
@@ -56,7 +58,7 @@ def main() -> None:
 
 
 def _preset(name: str, cores: int, generations: int, repeats: int) -> None:
-    config = PRESETS[name]
+    config = configure(preset=name)
     closed_loop = _ClosedLoop(config, cores)
     rows: list[tuple[str, Callable[[], Measured]]] = [
         (f"(a) physics alone, {cores} threads", closed_loop.physics),
@@ -70,36 +72,32 @@ def _preset(name: str, cores: int, generations: int, repeats: int) -> None:
         ratio = float(np.median([turn[i].steps_per_second / turn[0].steps_per_second for turn in measured]))
         rate = float(np.median([turn[i].rollouts_per_second for turn in measured]))
         cpu = float(np.median([turn[i].cpu_per_rollout for turn in measured]))
-        print(
-            f"| {name} ({config.policy.controller}) | {what} | {rate:.0f} | {1e3 * cpu:.2f} | {ratio:.2f} |", flush=True
-        )
+        print(f"| {name} ({config.policy}) | {what} | {rate:.0f} | {1e3 * cpu:.2f} | {ratio:.2f} |", flush=True)
 
 
 class _ClosedLoop:
     """A hundred pairs in one process."""
 
     def __init__(self, config: RunConfig, cores: int) -> None:
-        size = STATES[config.task.state].size
-        rng = np.random.default_rng(0)
-        policy = Policy(config.policy, size, Features.draw(config.policy, size, rng))
-        self._simulation = Simulation(config.task, policy, threads=cores, capacity=200)
-        self._theta = np.full((200, policy.size), STILL)
-        draws: list[Perturbation | None] = [None] * 100
-        if config.task.perturb:
-            draws = [Perturbation.draw(np.random.default_rng(i), config.task.steps) for i in range(100)]
-        self._perturbations = [draw for draw in draws for _ in range(2)]
-        self._steps = 200 * config.task.steps * SUBSTEPS + (100 * CLOSING if config.task.perturb else 0)
+        found = problem(config)
+        self._runner = Runner(found.task, found.policy, lambda model: BatchEngine(model, 200, cores))
+        self._theta = np.full((200, found.policy.size), STILL)
+        self._seeds: list[Seed] = [(i,) if config.task_config.perturb else None for i in range(100) for _ in range(2)]
+        self._steps = 200 * found.task.steps * SUBSTEPS + len(set(self._seeds)) * CLOSING
         self._cores = cores
 
     def run(self) -> Measured:
         """The closed loop."""
-        return self._timed(lambda: self._simulation.run(self._theta, self._perturbations))
+        return self._timed(lambda: self._runner.rollouts(self._theta, self._seeds))
 
     def physics(self) -> Measured:
         """As many physics steps from the same start, all in one call."""
-        batch = mujoco.batch.Batch(self._simulation.scene.model, 200, self._cores)
-        batch.state[:] = self._simulation.start.rows
-        return self._timed(lambda: batch.step(nstep=self._steps // 200))
+        sim = self._runner.sim
+        again(lambda: Batch(self._runner.task, sim, self._seeds))
+        bare = mujoco.batch.Batch(sim.model, 200, self._cores)
+        for name in ("qpos", "qvel", "ctrl", "eq_active", "mocap_pos", "mocap_quat"):
+            bare.bind(name)[:] = getattr(sim, name)
+        return self._timed(lambda: bare.step(nstep=self._steps // 200))
 
     def _timed(self, work: Callable[[], object]) -> Measured:
         wall, cpu = time.perf_counter(), time.process_time()
@@ -111,20 +109,20 @@ class _ClosedLoop:
 def _farm(config: RunConfig, pairs: int, generations: int) -> Measured:
     """Generations of a run that learns nothing, timed from the second on."""
     still = replace(
-        config.algorithm,
+        config.algorithm_config,
         pairs=pairs,
         initial_mu=STILL,
         initial_sigma=1e-3,
         learning_rate_mu=0.0,
         learning_rate_sigma=0.0,
     )
-    config = replace(config, algorithm=still, generations=generations)
+    config = replace(config, algorithm_config=still, generations=generations)
     with tempfile.TemporaryDirectory() as folder:
-        place = Place(workers=2, listen=free_endpoint(), record=False)
+        place = Placement(workers=2, listen=free_endpoint(), record=False)
         with open_run(config, Path(folder) / "run", place) as run:
             wall, own, theirs, done = _generations(run)
-    closing = pairs * CLOSING if config.task.perturb else 0
-    steps = (2 * pairs + 1) * config.task.steps * SUBSTEPS + closing
+    closing = pairs * CLOSING if config.task_config.perturb else 0
+    steps = (2 * pairs + 1) * run.learner.problem.task.steps * SUBSTEPS + closing
     return Measured(steps * done / wall, (2 * pairs + 1) * done / wall, (own + theirs) / done / (2 * pairs + 1))
 
 

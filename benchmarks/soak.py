@@ -19,8 +19,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from farm.net.session import free_endpoint
 from learner.config import RunConfig
-from learner.run import Place, free_endpoint, open_run
+from learner.run import Placement, open_run
 from learner.telemetry import report_log as history
 
 MOST = 4  # workers at a time
@@ -77,7 +78,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         soaked, crowd, learner = _soak(config, Path(folder) / "soaked", arguments.minutes * 60, arguments.every)
         calm = replace(config, generations=soaked["generations"])
-        place = Place(workers=2, listen=free_endpoint(), record=False)
+        place = Placement(workers=2, listen=free_endpoint(), record=False)
         with open_run(calm, Path(folder) / "calm", place) as run:
             for _ in run.learn():
                 pass
@@ -96,7 +97,7 @@ def main() -> None:
 
 def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[dict[str, object], Crowd, list[float]]:
     until, learner = time.monotonic() + seconds, []
-    place = Place(listen=free_endpoint(), record=False)
+    place = Placement(listen=free_endpoint(), record=False)
     with open_run(config, path, place, stopped=lambda: time.monotonic() > until) as run:
         crowd = Crowd(place.listen, every)
         try:

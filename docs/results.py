@@ -1,6 +1,6 @@
-"""Makes docs/results.md and docs/results/ from a folder of `farm experiment thesis`.
+"""Makes docs/results.md and docs/results/ from a folder of `python -m benchmarks.thesis thesis`.
 
-    python docs/results.py runs/thesis [--machine SENTENCE]        (docs/results itself: the page and figures again)
+    python -m docs.results runs/thesis [--machine SENTENCE]        (docs/results itself: the page and figures again)
 
 Figures and data are copied; every number in the tables comes from the data. What is written by hand stands in
 docs/results/notes.md: under a heading with the experiment's name, what its result means.
@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.thesis.catalogue import EXPERIMENTS, TRIALS, minutes
-from benchmarks.thesis.experiment import Experiment
+from benchmarks.thesis.experiment import Data, Experiment, judge, spread, verdict
 from benchmarks.thesis.figures import draw
-from benchmarks.thesis.findings import Data, judge, spread, verdict
 from benchmarks.thesis.folder import ExperimentFolder
 from benchmarks.thesis.measure import measure
 
@@ -26,9 +25,9 @@ HERE = Path(__file__).parent
 HEAD = """# Results
 
 What Plage 2016 found, and the questions it left open, with this project: question by question, claim by claim. This
-page is made by `docs/results.py` from the data in `docs/results/`; `farm plot docs/results` draws the figures again
-from it, and `farm experiment NAME` does an experiment anew (`farm experiment thesis` all of them; `--list` says what
-each costs).
+page is made by `docs/results.py` from the data in `docs/results/`. From a checkout, `python -m benchmarks.thesis plot
+docs/results` draws the figures again from it, and `python -m benchmarks.thesis NAME` does an experiment anew (`thesis`
+instead of a name all of them; `--list` says what each costs).
 
 A set-up is run with seeds 0 to {last}. Its settings are the preset `thesis` with what the figure's caption or text
 says, or the preset `default` (`docs/method.md`). **Learnt** means: the final mean policy does the gait on the nominal
@@ -37,7 +36,7 @@ the greatest. To compare returns (weights *projected*): holding still gives -5.4
 once -0.07.
 
 Nothing was tuned until it agreed. A verdict is arithmetic: each part of a claim is a comparison in
-`learner/experiments/claims.py`; *reproduced* says that all hold, *in part* some, *not reproduced* none. Why a
+`benchmarks/thesis/claims.py`; *reproduced* says that all hold, *in part* some, *not reproduced* none. Why a
 result is as it is, is said below it, and what stands behind that in the experiments whose names begin with `why-`.
 
 {machine}
@@ -127,7 +126,8 @@ def section(experiment: Experiment, data: Data, note: str) -> str:
     if data.series:
         lines += ["\\* wall time of its runs, four at a time on the same workers.", ""]
     cost = f", about {minutes(tuple(experiment.curves.values())) * TRIALS:.0f} min on two cores" if data.series else ""
-    lines += [f"Again: `farm experiment {experiment.name}`{cost}; the figure alone: `farm plot docs/results`.", ""]
+    again = f"Again: `python -m benchmarks.thesis {experiment.name}`{cost}"
+    lines += [f"{again}; the figure alone: `python -m benchmarks.thesis plot docs/results`.", ""]
     return "\n".join(lines)
 
 

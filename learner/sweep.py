@@ -51,7 +51,7 @@ class Sharing:
     backend: str = "cpu"
     """What they simulate with."""
     connect: tuple[str, ...] = ()
-    """Routers of a farm to dial, instead of one of our own."""
+    """Routers of a farm to connect to; without: one of our own."""
     tls: Path | None = None
     """Folder with the learner's certificates."""
     farm: str = "farm"
@@ -147,11 +147,11 @@ def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
     return [*flags, "--farm", sharing.farm, *(["--tls", str(sharing.tls)] if sharing.tls else [])]
 
 
-def _workers(sharing: Sharing, flags: Sequence[str], configs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
+def _workers(sharing: Sharing, flags: Sequence[str], runs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
     """Local workers, which may serve the files that these runs come from."""
     if not sharing.workers:
         return None
-    chosen = {("tasks", config.task) for config in configs} | {("policies", config.policy) for config in configs}
+    chosen = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
     files = sorted({str(file) for kind, name in chosen if (file := plugins.find(kind, name).file)})
     own = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
     own += [word for file in files for word in ("--allow-file", file)]
@@ -231,7 +231,7 @@ def _end(learners: list[_Learner]) -> None:
 
 
 def _learn(words: Sequence[str]) -> int:
-    """`farm learner`, ended as by SIGTERM when whoever started it is gone."""
+    """`farm learner`, ended as by SIGTERM when the process that started it is gone."""
     from farm.__main__ import main
 
     def watch() -> None:

@@ -1,38 +1,25 @@
-"""Every experiment, by name. A new one is a few lines here: its set-ups, then the experiment. Pure.
+"""Every experiment, by name. A new one is a few lines here: its set-ups, then the experiment.
 
 The set-up of the thesis' experiments is `--preset thesis` with what the figure's caption and text say; where they
 are silent the preset's value stays (docs/method.md says what that leaves open).
 """
 
-from dataclasses import replace
 from typing import Any, Final
 
 from benchmarks.thesis import claims
 from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer
-from learner.algorithms import PGPE
-from learner.config import PRESETS, RunConfig
+from learner.algorithms.pgpe import PGPE
+from learner.config import RunConfig, configure
 
 TRIALS: Final = 5
 """Trials of a set-up unless told otherwise; the thesis has three."""
 
 OBJECTS: Final = ("bar", "thin-bar", "thick-bar", "cylinder", "bolt")
 
-_TASK: Final = set(RunConfig().task.__dataclass_fields__)
-_POLICY: Final = set(RunConfig().policy.__dataclass_fields__)
-_RUN: Final = set(RunConfig.__dataclass_fields__)
-
 
 def setup(preset: str, **settings: Any) -> RunConfig:  # noqa: ANN401  values of any setting
     """A preset with some settings changed, each by its flag's name."""
-    base = PRESETS[preset]
-    task = {k: v for k, v in settings.items() if k in _TASK}
-    policy = {k: v for k, v in settings.items() if k in _POLICY}
-    run = {k: v for k, v in settings.items() if k in _RUN}
-    rest = {k: v for k, v in settings.items() if k not in _TASK | _POLICY | _RUN}
-    return replace(
-        base, task=replace(base.task, **task), policy=replace(base.policy, **policy),
-        algorithm=replace(base.algorithm, **rest), traces="none", **run,
-    )  # fmt: skip
+    return configure("finger-gait", preset, traces="none", **settings)
 
 
 def _projected(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: ANN401
@@ -41,7 +28,7 @@ def _projected(state: str, features: int, **settings: Any) -> RunConfig:  # noqa
 
 def _direct(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: ANN401
     own = {"weights": "direct", "clip": False, **settings}
-    return setup("thesis", controller="direct", state=state, features=features, **own)
+    return setup("thesis", policy="direct", state=state, features=features, **own)
 
 
 _RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb"}
@@ -70,14 +57,14 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "direct-joints-N5": _direct("joints", 100, pairs=5, generations=450),
     "direct-joints-N15": _direct("joints", 100, pairs=15),
     "direct-joints-N50": _direct("joints", 100, pairs=50, generations=45),
-    "cosine-joints-D100": setup("thesis", controller="cosine", features=100),
-    "cosine-joints-D1500": setup("thesis", controller="cosine", features=1500),
+    "cosine-joints-D100": setup("thesis", policy="cosine", features=100),
+    "cosine-joints-D1500": setup("thesis", policy="cosine", features=1500),
     "direct-joints-N15-projected-weights": _direct("joints", 100, weights="projected"),
     "joints-D1600": _projected("joints", 1600),
     "contacts-D3400": _projected("joints+contacts", 3400),
     "tactile-D10800": _projected("tactile", 10800),
     "joints-tactile-D12600": _projected("joints+tactile", 12600),
-    "joints-kernel": setup("thesis", controller="kernel"),
+    "joints-kernel": setup("thesis", policy="kernel"),
     "default-contacts": setup("default", state="joints+contacts"),
     "default-contacts-h2": setup("default", state="joints+contacts", bandwidth=2.0),
     "default-contacts-x0.3": setup("default", state="joints+contacts", contacts_scale=0.3),
@@ -89,10 +76,10 @@ SETUPS: Final[dict[str, RunConfig]] = {
     ),
     "joints-D8000-sehnke": _projected("joints", 8000, normaliser="sehnke"),
     **{f"default-{name}": setup("default", object=name) for name in OBJECTS},
-    "default-direct": setup("default", controller="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
+    "default-direct": setup("default", policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
     "release-kernel": setup("default", **_RELEASE),
     "release-direct": setup(
-        "default", controller="direct", features=100, initial_mu=0.0, initial_sigma=0.1, **_RELEASE
+        "default", policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1, **_RELEASE
     ),
     "default-optimal-baseline": setup("default", baseline="optimal"),
     "default-no-baseline": setup("default", baseline="none"),
@@ -380,14 +367,14 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 """By name, the thesis' own first."""
 
 RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}
-"""Rollouts a second of two cores, of the projected controller times its features; for estimates alone."""
+"""Rollouts a second of two cores, of the projected policy times its features; for estimates alone."""
 
 
 def rollouts(name: str) -> int:
     """Exploring rollouts of a trial of a set-up."""
     config = SETUPS[name]
-    assert isinstance(config.algorithm, PGPE)
-    return 2 * config.algorithm.pairs * config.generations
+    assert isinstance(config.algorithm_config, PGPE)
+    return 2 * config.algorithm_config.pairs * config.generations
 
 
 def minutes(names: tuple[str, ...]) -> float:
@@ -395,8 +382,8 @@ def minutes(names: tuple[str, ...]) -> float:
     seconds = 0.0
     for name in names:
         config = SETUPS[name]
-        rate = RATES[config.policy.controller]
-        if config.policy.controller == "projected":
-            rate = min(550.0, rate / config.policy.features)
+        rate = RATES[config.policy]
+        if config.policy == "projected":
+            rate = min(550.0, rate / config.policy_config.features)  # type: ignore[attr-defined]
         seconds += rollouts(name) / rate + 2.0
     return seconds / 60

@@ -5,23 +5,21 @@ success feels: which fingertips press.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 
-from farm.arrays import FloatArray, IntArray
+from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
-from farm.tasks.finger_gait.hand import FINGERS, GRIPS
-from farm.tasks.finger_gait.physics import CAPACITY
-from farm.tasks.finger_gait.task import (
-    PRESSES,
-    SUBSTEPS,
-    SUCCESS_STEPS,
-    Perturbation,
-    stayed,
-    touching,
-)
-from learner.replay import Stored
+from farm.policies.base import Policy
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS
+from farm.tasks.finger_gait.task import PRESSES, SUCCESS_STEPS, FingerGait, stayed
+from farm.tasks.loop import Batch, Seed, again
+from learner.replay import LoadedPolicy
 
 
 @dataclass(frozen=True)
@@ -36,58 +34,98 @@ class Chained:
     """(B, T, 3) how hard each fingertip pressed [N], zero after the end."""
 
 
-def chain(policies: Sequence[Stored], perturbations: Sequence[Perturbation], steps: int) -> Chained:
+class _Hand(FingerGait):
+    """The hand under whichever policy acts: actions are joint targets; it also ends where the object moved away."""
+
+    def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
+        """Remember where the object was released."""
+        super().prepare(sim, rngs)
+        sim.own["released"] = sim.qpos[:, len(JOINTS) :].copy()
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where no fingertip touches the object any more, or it is out of place."""
+        return super().ended(sim) | ~stayed(sim.qpos[:, len(JOINTS) :], sim.own["released"])
+
+
+@dataclass(frozen=True)
+class _Gait:
+    """A learnt policy, with its own observation and its own meaning of an action."""
+
+    task: FingerGait
+    policy: Policy
+    prepared: FloatArray
+    """Of its one parameter vector, (1, ...)."""
+    goal: BoolArray
+    """Fingers of its goal grip, (3,)."""
+
+    @classmethod
+    def of(cls, learnt: LoadedPolicy, steps: int) -> "_Gait":
+        """A gait that acts for up to so many steps."""
+        known = cast("FingerGait", learnt.runner.task)
+        task = FingerGait(replace(known.config, steps=steps), files=known.sources)
+        task.start_commands = known.start_commands
+        policy = learnt.problem.policy
+        goal = np.array([finger in GRIPS[task.config.goal_grip] for finger in FINGERS])
+        return cls(task, policy, policy.prepare(learnt.mu[None]), goal)
+
+    def targets(self, sim: Sim, rows: IntArray) -> FloatArray:
+        """Joint targets of some of the rollouts still going, (n, 8) [rad]."""
+        x = self.task.observe(sim)[rows]
+        actions = self.policy.act(np.repeat(self.prepared, len(rows), axis=0), x)
+        theirs: Any = SimpleNamespace(own={"target": sim.own["target"][rows]})
+        return self.task.act(theirs, actions)
+
+
+def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int) -> Chained:
     """Run policies in turn, the first one first, each from the grip in which the one before it ended.
 
     Args:
       policies: each one's goal grip has to be the next one's start grip.
-      perturbations: (B,) drawn for so many steps.
+      seeds: (B,) of perturbed starts.
       steps: control steps.
 
     Raises:
       ConfigError: the policies do not follow each other, or hold different objects.
     """
-    tasks = [policy.simulation.task for policy in policies]
-    for one, other in zip(tasks, [*tasks[1:], tasks[0]], strict=True):
-        if (one.config.goal_grip, one.config.object) != (other.config.start_grip, other.config.object):
-            raise ConfigError(f"a gait to {one.config.goal_grip} is not followed by one from {other.config.start_grip}")
-    batches = [_run(policies, perturbations[i : i + CAPACITY], steps) for i in range(0, len(perturbations), CAPACITY)]
-    parts = ([getattr(batch, name) for batch in batches] for name in ("changes", "acting", "force"))
-    return Chained(*(np.concatenate(part) for part in parts))
+    configs: list[Any] = [policy.problem.config.task_config for policy in policies]
+    for one, other in zip(configs, [*configs[1:], configs[0]], strict=True):
+        if (one.goal_grip, one.object) != (other.start_grip, other.object):
+            raise ConfigError(f"a gait to {one.goal_grip} is not followed by one from {other.start_grip}")
+    config = replace(configs[0], steps=steps, action="absolute", clip=False)  # each gait's own task clips
+    hand = _Hand(config, files=policies[0].problem.task.sources)
+    sim = Sim(hand.engine(BatchEngine))
+    again(lambda: hand.setup(sim))
+    gaits = [_Gait.of(policy, steps) for policy in policies]
+    size = sim.engine.size
+    parts = [again(lambda i=i: _run(hand, sim, gaits, seeds[i : i + size])) for i in range(0, len(seeds), size)]
+    return Chained(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("changes", "acting", "force")))
 
 
-def _run(policies: Sequence[Stored], perturbations: Sequence[Perturbation], steps: int) -> Chained:
+def _run(hand: _Hand, sim: Sim, gaits: Sequence[_Gait], seeds: Sequence[Seed]) -> Chained:
     """As many rollouts as are stepped together."""
-    tasks = [policy.simulation.task for policy in policies]
-    count, first = len(perturbations), policies[0].simulation
-    stepper, start, noise = first.begin(list(perturbations))
-    assert noise is not None
-    weights = [p.simulation.policy.weights(np.repeat(p.mu[None], count, axis=0)) for p in policies]
-    goals = np.array([[finger in GRIPS[task.config.goal_grip] for finger in FINGERS] for task in tasks])
-    released, last = start.frames.pose, np.repeat(tasks[0].commands[None], count, axis=0)
-    turn, felt, changes = (np.zeros(count, dtype=int) for _ in range(3))
-    acting, force = np.full((count, steps), -1), np.zeros((count, steps, len(FINGERS)))
-    active, now = np.arange(count), start.frames
-    for t in range(steps):
-        for i, (policy, task) in enumerate(zip(policies, tasks, strict=True)):
-            mine = turn[active] == i
-            rows = active[mine]
-            if len(rows):
-                x = task.observe(now.at(np.flatnonzero(mine)), noise[rows, t])
-                actions = policy.simulation.policy.actions(weights[i][rows], x)
-                last[rows] = policy.simulation.policy.targets(actions, task.commands, last[rows])
-        stepper.ctrl[active] = last[active]
-        stepper.step(active, SUBSTEPS)
-        now = stepper.frames(active)
-        pressing = now.force.sum(axis=-1)
-        acting[active, t], force[active, t] = turn[active], pressing
-        felt[active] = np.where(((pressing >= PRESSES) == goals[turn[active]]).all(axis=-1), felt[active] + 1, 0)
-        going = stayed(now.pose, released[active]) & touching(now.force) & ~stepper.blown_up(active)
-        there = active[going & (felt[active] >= SUCCESS_STEPS)]
+    batch = Batch(hand, sim, seeds)
+    goals = np.stack([gait.goal for gait in gaits])
+    turn, felt, changes = (np.zeros(len(seeds), dtype=int) for _ in range(3))
+    acting = np.full((len(seeds), hand.steps), -1)
+    while not batch.over:
+        going = batch.active
+        acting[going, sim.t] = turn[going]
+        batch.step(_targets(gaits, sim, turn[going]))
+        going = batch.active
+        pressing = hand.measure(sim)["force"].sum(axis=-1) >= PRESSES
+        felt[going] = np.where((pressing == goals[turn[going]]).all(axis=-1), felt[going] + 1, 0)
+        there = going[felt[going] >= SUCCESS_STEPS]
         changes[there] += 1
-        turn[there] = (turn[there] + 1) % len(policies)
+        turn[there] = (turn[there] + 1) % len(gaits)
         felt[there] = 0
-        active, now = active[going], now.at(np.flatnonzero(going))
-        if not len(active):
-            break
-    return Chained(changes, acting, force)
+    return Chained(changes, acting, batch.record().frames["force"].sum(axis=-1))
+
+
+def _targets(gaits: Sequence[_Gait], sim: Sim, turn: IntArray) -> FloatArray:
+    """Joint targets of the rollouts still going, each by the gait whose turn it is, (n, 8) [rad]."""
+    targets = np.empty((len(turn), len(JOINTS)))
+    for i, gait in enumerate(gaits):
+        mine = np.flatnonzero(turn == i)
+        if len(mine):
+            targets[mine] = gait.targets(sim, mine)
+    return targets

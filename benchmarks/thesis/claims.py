@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.thesis import shapes
-from benchmarks.thesis.findings import Data, Finding, counted, spread
+from benchmarks.thesis.experiment import Data, Finding, counted, spread
 from benchmarks.thesis.series import known_mean
 
 
@@ -159,7 +159,7 @@ def remedies(data: Data) -> list[Finding]:
     for row, (label, series) in zip(saturated, data.series.items(), strict=True):
         out.append(Finding(f"{label}: the gait is not learnt", not series.learnt.any(), counted(series)))
         config = data.configs[label]
-        if config.policy.clip or config.task.reward == "limited":
+        if config.task_config.clip or config.task_config.reward == "limited":  # type: ignore[attr-defined]
             early, last = row[:, min(9, row.shape[1] - 1)], np.array([r[~np.isnan(r)][-1] for r in row])
             said = f"part of the targets at a limit {spread(early)} at generation 10; {spread(last)} at the end"
             stuck = bool((early > 0.9).all() and (last > 0.9).all())

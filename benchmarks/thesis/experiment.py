@@ -1,13 +1,14 @@
-"""What an experiment is. Pure."""
+"""What an experiment is, and what recorded data says to its claim: parts with their numbers, and a verdict."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import numpy as np
+
+from benchmarks.thesis.series import Series
+from farm.arrays import FloatArray
 from learner.config import RunConfig
-
-if TYPE_CHECKING:
-    from benchmarks.thesis.findings import Data, Finding
 
 Panel = Literal["return", "mean policy", "success", "sigma", "mu_2", "sigma_2", "action"]
 """A quantity over the generations, one panel of a figure."""
@@ -58,12 +59,33 @@ class Chain:
 Figure = Curves | Transfer | Friction | Chain | KernelError
 
 
+@dataclass(frozen=True)
+class Data:
+    """All that is known of an experiment."""
+
+    series: Mapping[str, Series]
+    """By what the legend says."""
+    measured: Mapping[str, FloatArray]
+    """What was measured on the learnt policies."""
+    configs: Mapping[str, RunConfig]
+    """The set-ups, by what the legend says."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One part of a claim, and what came out."""
+
+    part: str
+    holds: bool
+    numbers: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """A named set of runs (configurations x trials) with a question, and the figure that answers it."""
 
     name: str
-    """As in `farm experiment NAME`; the thesis' figure or section, or the question in a word."""
+    """As in `python -m benchmarks.thesis NAME`; the thesis' figure or section, or the question in a word."""
     title: str
     question: str
     claim: str = ""
@@ -71,7 +93,7 @@ class Experiment:
     curves: Mapping[str, str] = field(default_factory=dict)
     """What a legend says -> name of the set-up (catalogue.SETUPS)."""
     figure: Figure = field(default_factory=Curves)
-    find: "Callable[[Data], list[Finding]] | None" = None
+    find: Callable[[Data], list[Finding]] | None = None
     """What the recorded data says to the claim."""
 
 
@@ -80,3 +102,42 @@ def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunC
     if generations is not None:
         setup = replace(setup, generations=min(generations, setup.generations))
     return replace(setup, seed=number)
+
+
+Verdict = Literal["reproduced", "not reproduced", "in part", "open"]
+
+
+def judge(experiment: Experiment, data: Data) -> list[Finding]:
+    """What the data says to an experiment's claim; nothing before every trial of it is over."""
+    if experiment.find is None or not all(_over(series) for series in data.series.values()):
+        return []
+    return experiment.find(data)
+
+
+def _over(series: Series) -> bool:
+    return set(series.states) <= {"finished", "diverged"} and not np.isnan(series.columns["return_mean"][:, 0]).any()
+
+
+def verdict(findings: Sequence[Finding]) -> Verdict:
+    """Over all parts of a claim; open if nothing is known of them."""
+    if not findings:
+        return "open"
+    held = [finding.holds for finding in findings]
+    return "reproduced" if all(held) else "in part" if any(held) else "not reproduced"
+
+
+def spread(values: FloatArray, digits: int = 2) -> str:
+    """Mean and range of what the trials gave."""
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return "none"
+    if len(known) == 1:
+        return f"{known[0]:.{digits}f}"
+    return f"{known.mean():.{digits}f} ({known.min():.{digits}f} to {known.max():.{digits}f})"
+
+
+def counted(series: Series) -> str:
+    """How many trials learnt, and since when."""
+    since = series.since[series.learnt]
+    when = f", each mean policy succeeding from generation {', '.join(f'{g:.0f}' for g in sorted(since))} on"
+    return f"{int(series.learnt.sum())} of {series.trials} learnt{when if len(since) else ''}"

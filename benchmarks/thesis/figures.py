@@ -12,11 +12,11 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 
 from benchmarks.thesis.claims import features_for
-from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Panel, Transfer
-from benchmarks.thesis.findings import Data
+from benchmarks.thesis.experiment import Chain, Curves, Data, Experiment, Friction, KernelError, Panel, Transfer
 from benchmarks.thesis.series import known_mean
 from farm.arrays import FloatArray
 from learner.config import RunConfig
+from learner.config import flat as settings
 
 _STYLE: Final = {
     "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
@@ -87,18 +87,19 @@ def _caption(experiment: Experiment, data: Data) -> str:
 def common(configs: Sequence[RunConfig]) -> list[str]:
     """What set-ups share of what tells them apart, in words."""
     told = (
-        lambda c: c.policy.controller,
-        lambda c: c.task.state,
-        lambda c: None if c.policy.controller == "kernel" else f"D {c.policy.features}",
-        lambda c: f"N {c.algorithm.pairs}",
-        lambda c: None if c.algorithm.estimator == "symmetric" else "plain PGPE",
-        lambda c: f"weights {c.task.weights}",
-        lambda c: c.task.object,
-        lambda c: f"sigma rule {c.algorithm.sigma_rule}",
-        lambda c: f"normaliser {c.algorithm.normaliser}",
-        lambda c: "perturbed training" if c.task.perturb else "unperturbed",
+        lambda c: c["policy"],
+        lambda c: c["state"],
+        lambda c: f"D {c['features']}" if "features" in c else None,
+        lambda c: f"N {c['pairs']}",
+        lambda c: None if c["estimator"] == "symmetric" else "plain PGPE",
+        lambda c: f"weights {c['weights']}",
+        lambda c: c["object"],
+        lambda c: f"sigma rule {c['sigma-rule']}",
+        lambda c: f"normaliser {c['normaliser']}",
+        lambda c: "perturbed training" if c["perturb"] else "unperturbed",
     )
-    found = [{tell(config) for config in configs} for tell in told]
+    flat = [settings(config) for config in configs]
+    found = [{tell(config) for config in flat} for tell in told]
     return [words for values in found if len(values) == 1 for words in values if words is not None]
 
 

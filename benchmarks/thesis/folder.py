@@ -17,15 +17,12 @@ from typing import Final
 
 from benchmarks.thesis import series
 from benchmarks.thesis.catalogue import EXPERIMENTS, SETUPS
-from benchmarks.thesis.experiment import Experiment, trial
-from benchmarks.thesis.findings import Data
+from benchmarks.thesis.experiment import Data, Experiment, trial
 from farm.errors import ConfigError
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
 
 _VERSION: Final = 1
-_OVER: Final = ("finished", "diverged")
-"""States that running again would not change."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,10 +103,11 @@ class ExperimentFolder:
         """The folder of a trial, whether it is there or not."""
         return RunFolder(self.path / "runs" / f"{setup}-s{number}")
 
-    def todo(self) -> list[tuple[str, int]]:
-        """Set-ups and trials that are not over, trial by trial: a first picture comes early."""
-        pairs = ((setup, number) for number in range(self.trials) for setup in self.setups)
-        return [pair for pair in pairs if not over(self.run(*pair))]
+    @property
+    def runs(self) -> dict[Path, RunConfig]:
+        """Configurations by run folder, trial by trial: a first picture comes early."""
+        pairs = [(setup, number) for number in range(self.trials) for setup in self.setups]
+        return {self.run(*pair).path: self.config(*pair) for pair in pairs}
 
     def check_runs(self, *, go_on: bool = False) -> None:
         """See that the runs that are there are the set-ups', and that none is gone whose data is kept.
@@ -175,11 +173,6 @@ def find(name: str) -> Experiment:
             f"unknown experiment {name!r}; known are {', '.join(EXPERIMENTS)}, and thesis for all of them"
         )
     return EXPERIMENTS[name]
-
-
-def over(folder: RunFolder) -> bool:
-    """Whether a run has ended in a way that running it again would not change."""
-    return (folder.read_summary() or {}).get("state") in _OVER
 
 
 def _count(name: str, value: object) -> int:

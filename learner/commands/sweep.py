@@ -1,0 +1,169 @@
+"""`farm sweep`: settings x seeds on one set of workers; a table and a figure."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from farm.commands import logs
+from farm.commands.signals import stop_flag
+from farm.commands.tables import compact, wide
+from farm.errors import ConfigError, RunError
+from learner import config as configs
+from learner import figure, grid, outcomes, sweep
+from learner.commands.learning import INTERRUPTED
+from learner.commands.options import parse
+from learner.commands.side_by_side import Runs, SharingOptions
+from learner.config import RunConfig
+from learner.grid import Setting, Sweep
+from learner.run import check_size
+from learner.setup import problem
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepCommand:
+    """Settings x seeds on one set of workers, then a table and a figure; given again, it goes on where it stopped."""
+
+    vary: tuple[str, ...] = ()
+    """NAME=V1,V2,...: a setting and its values, repeatable; every combination is done."""
+    seeds: str = "0-4"
+    """Seeds of every setting: A-B or A,B,C."""
+    out: Path = Path("sweeps/sweep")
+    """Folder of the sweep: its runs, table.csv, figure.svg."""
+    preset: str | None = None
+    """Settings to begin with, by name (farm tasks NAME lists a task's); None: the task's first."""
+    config: Path | None = None
+    """Settings to begin with: a config.json (other flags override it)."""
+    sharing: SharingOptions = field(default_factory=SharingOptions)
+    """Where the runs are done."""
+    run: RunConfig = field(default_factory=RunConfig)
+    """What all runs share."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    vary = grid.parse_vary(_given(words))
+    first = {name: values[0] for name, values in vary.items()}  # flags may be of a task or policy that is varied
+    command, _, begin = parse(SweepCommand, [*words, *_parts(first)], "farm sweep")
+    if command.run.seed != begin.seed:
+        raise ConfigError("--seed is for one run: give --seeds, for example --seeds 0-4")
+    seeds = grid.parse_seeds(command.seeds)
+    settings = tuple(_setting(values, words) for values in grid.combinations(vary, len(seeds)))
+    chosen = Sweep(command.out, settings, seeds)
+    grid.check(chosen)
+    sharing = command.sharing.sharing()
+    _check_begins(chosen)
+    logs.set_up("WARNING")
+    chosen.prepare()
+    with stop_flag("saving and ending") as stop:
+        with Runs(chosen.runs, chosen.path) as shown:
+            complete = sweep.run(chosen.runs, sharing, shown, stop.is_set)
+        table = outcomes.rows(chosen)
+        outcomes.write_csv(chosen.path / "table.csv", chosen, table)
+        if stop.is_set():
+            _say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command goes on with them")
+            return INTERRUPTED
+    _print(chosen, table)
+    _draw(chosen)
+    return 0 if complete else 1
+
+
+def _given(words: Sequence[str]) -> list[str]:
+    """What stands behind each --vary."""
+    pairs = zip(words, [*words[1:], ""], strict=True)
+    return [after if word == "--vary" else word[7:] for word, after in pairs if word.partition("=")[0] == "--vary"]
+
+
+def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
+    """One combination of values, as `farm run` would take it from these flags."""
+    own = [_word(name, value) for name, value in values.items()]
+    try:
+        known = configs.flat(parse(SweepCommand, [*words, *_parts(values)], "farm sweep")[2])
+        for name in values:
+            if name.replace("_", "-") not in known:
+                raise ConfigError(f"no such setting; known are {', '.join(known)}")
+        config = parse(SweepCommand, [*words, *own], "farm sweep")[0].run
+    except ConfigError as error:
+        given = " ".join(f"{name}={value}" for name, value in values.items())
+        raise ConfigError(f"--vary {given}: {error}" if given else str(error)) from None
+    return Setting(values, configs.changed_by(config, {"seed": 0}))
+
+
+def _parts(values: dict[str, str]) -> list[str]:
+    """The flags that choose task, policy and algorithm: which others there are depends on them."""
+    return [_word(name, value) for name, value in values.items() if name in ("task", "policy", "algorithm")]
+
+
+def _word(name: str, value: str) -> str:
+    """A setting's flag with its value."""
+    flag = name.replace("_", "-")
+    if value.lower() in ("true", "false"):
+        return f"--{flag}" if value.lower() == "true" else f"--no-{flag}"
+    return f"--{flag}={value}"
+
+
+def _check_begins(chosen: Sweep) -> None:
+    """See that every setting's task can be begun: better now than hours later.
+
+    Raises:
+      ConfigError: one cannot; says which.
+    """
+    begun: list[Any] = []
+    for setting in chosen.settings:
+        try:
+            found = problem(setting.config)
+            check_size(found)
+            if (task := (setting.config.task, setting.config.task_config)) not in begun:
+                found.runner().close()
+                begun.append(task)
+        except ConfigError as error:
+            raise ConfigError(f"{setting.label}: {error}") from None
+
+
+def _print(chosen: Sweep, table: Sequence[dict[str, Any]]) -> None:
+    """A line a setting: mean and standard deviation over the seeds."""
+    shown = compact()
+    judged = any(row["robust_success_rate"] is not None for row in table)
+    robust = ("robust success", "robust_success_rate") if judged else ("robust return", "robust_return")
+    for name in (*chosen.vary, "runs", "untrained", "return", robust[0], "minutes"):
+        shown.add_column(name, justify="left" if name in chosen.vary else "right", no_wrap=True)
+    count = len(chosen.seeds)
+    for i, setting in enumerate(chosen.settings):
+        mine = table[i * count : (i + 1) * count]
+        finished = sum(row["state"] == "finished" for row in mine)
+        columns = ("first_mean_policy_return", "mean_policy_return", robust[1])
+        cells = [_spread(outcomes.spread(mine, column), percent=column == "robust_success_rate") for column in columns]
+        minutes = sum(row["seconds"] or 0.0 for row in mine) / 60
+        shown.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")
+    wide().print(shown)
+    _say(f"mean ± standard deviation over seeds; untrained: the mean policy before learning; {chosen.path}/table.csv")
+
+
+def _spread(found: tuple[float, float] | None, *, percent: bool) -> str:
+    if found is None:
+        return ""
+    return f"{found[0]:.0%} ± {found[1]:.0%}" if percent else f"{found[0]:.3f} ± {found[1]:.3f}"
+
+
+def _draw(chosen: Sweep) -> None:
+    """The figure, where there is matplotlib and anything to draw.
+
+    Raises:
+      RunError: it cannot be written.
+    """
+    if not figure.available():
+        _say(f"no figure: {figure.INSTALL}")
+        return
+    if found := outcomes.curves(chosen):
+        path = chosen.path / "figure.svg"
+        try:
+            figure.draw(found, path)
+        except OSError as error:
+            raise RunError(f"cannot write {path}: {error.strerror}") from None
+        _say(f"figure {path}")
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

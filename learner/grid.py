@@ -1,0 +1,207 @@
+"""Settings x seeds: the runs of a sweep, and the folder that they are in.
+
+    sweep.json                 what is varied, the seeds, and each setting's configuration
+    SETTING-sSEED/             a run's folder each
+    table.csv, figure.svg      what came out
+
+Seeds may be added to a sweep later; nothing else of it may change.
+"""
+
+import itertools
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from farm.errors import ConfigError
+from farm.net import keys
+from farm.seeds import SEEDS
+from learner import config as configs
+from learner.config import RunConfig
+
+MOST: Final = 10_000
+"""Runs of a sweep."""
+
+_VERSION: Final = 1
+_LONGEST: Final = 90  # characters of a setting's part of a run's name
+_RANGE: Final = re.compile(r"(\d+)(?:-(\d+))?")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One configuration of a sweep, for all seeds."""
+
+    values: Mapping[str, str]
+    """What is varied, by the flag's name with underscores: as it was given."""
+    config: RunConfig
+    """Of seed 0."""
+
+    @property
+    def label(self) -> str:
+        """In tables and legends."""
+        return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as given"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep and its folder."""
+
+    path: Path
+    settings: tuple[Setting, ...]
+    seeds: tuple[int, ...]
+
+    @property
+    def vary(self) -> dict[str, list[str]]:
+        """What is varied, and its values."""
+        names = self.settings[0].values
+        return {name: list(dict.fromkeys(setting.values[name] for setting in self.settings)) for name in names}
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The settings' parts of run names: what they vary, or their number where that makes no name of its own."""
+        plain = [_plain(setting.values) for setting in self.settings]
+        count = Counter(plain)
+        return tuple(
+            name if count[name] == 1 and len(name) <= _LONGEST else f"setting-{i}" for i, name in enumerate(plain)
+        )
+
+    def folder(self, setting: int, seed: int) -> Path:
+        """A run's folder."""
+        return self.path / "-".join([*([self.names[setting]] if self.names[setting] else []), f"s{seed}"])
+
+    @property
+    def runs(self) -> dict[Path, RunConfig]:
+        """Configurations by folder, seed by seed: a first picture comes early."""
+        return {
+            self.folder(i, seed): replace(setting.config, seed=seed)
+            for seed in self.seeds
+            for i, setting in enumerate(self.settings)
+        }
+
+    def prepare(self) -> None:
+        """Make the folder, or go on with it; seeds may be added.
+
+        Raises:
+          ConfigError: it is another sweep's, or something else's.
+        """
+        file = self.path / "sweep.json"
+        try:
+            if file.exists():
+                self._check_same(json.loads(file.read_text("utf-8")), file)
+            elif self.path.exists() and any(self.path.iterdir()):
+                raise ConfigError(f"{self.path} holds something else and no sweep.json: give another --out")
+            self.path.mkdir(parents=True, exist_ok=True)
+            aside = file.with_name(file.name + ".new")
+            aside.write_text(json.dumps(self._told(), indent=2) + "\n", "utf-8")
+            aside.replace(file)
+        except OSError as error:
+            raise ConfigError(f"cannot write to {self.path}: {error.strerror}") from None
+        except ValueError as error:
+            raise ConfigError(f"{file} is not JSON: {error}") from None
+
+    def _told(self) -> dict[str, Any]:
+        """As it stands in sweep.json."""
+        made = [configs.to_dict(setting.config) for setting in self.settings]
+        return {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": made}
+
+    def _check_same(self, told: Any, file: Path) -> None:  # noqa: ANN401  parsed JSON
+        """See that what is there is this sweep, perhaps with fewer seeds."""
+        lists = isinstance(told, dict) and all(isinstance(told.get(name), list) for name in ("seeds", "settings"))
+        if not lists or told.get("version") != _VERSION:
+            raise ConfigError(f"{file} is not of version {_VERSION}")
+        if told.get("vary") != self.vary:
+            there, here = _words(told.get("vary")), _words(self.vary)
+            raise ConfigError(f"{self.path} varies {there}; here it is {here}: give the same, or another --out")
+        if missing := [str(seed) for seed in told["seeds"] if seed not in self.seeds]:
+            raise ConfigError(f"{self.path} has seeds {', '.join(missing)} as well: give them too, or another --out")
+        for setting, kept in zip(self.settings, told["settings"], strict=False):
+            for name, old, new in configs.changes(configs.from_dict(kept, str(file)), setting.config):
+                raise ConfigError(
+                    f"{self.path} was begun with --{name} {old}; here it is {new}: give the same, or another --out"
+                )
+
+
+def _plain(values: Mapping[str, str]) -> str:
+    """Varied values as a part of a name; of a file only its own name."""
+    parts = [f"{name}-{value.rpartition('/')[2]}" for name, value in values.items()]
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", "-".join(parts))
+
+
+def _words(vary: object) -> str:
+    """What is varied, as it is given."""
+    if not isinstance(vary, dict) or not vary:
+        return "nothing"
+    return " and ".join(f"{name}={','.join(map(str, values))}" for name, values in vary.items())
+
+
+def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
+    """NAME=V1,V2,... each, as values by name with underscores.
+
+    Raises:
+      ConfigError: one has another form, or a name or value comes twice.
+    """
+    out: dict[str, list[str]] = {}
+    for word in given:
+        name, equals, listed = word.partition("=")
+        name, values = name.strip().lstrip("-").replace("-", "_"), [value.strip() for value in listed.split(",")]
+        if not equals or not name or "" in values:
+            raise ConfigError(f"--vary {word!r} is not of the form NAME=VALUE,VALUE, for example initial_sigma=0.1,0.2")
+        if name == "seed":
+            raise ConfigError("--vary seed: give --seeds, for example --seeds 0-4")
+        if name in out:
+            raise ConfigError(f"--vary {name} is given twice: give all of its values at once")
+        if len(set(values)) < len(values):
+            raise ConfigError(f"--vary {word}: a value comes twice")
+        out[name] = values
+    return out
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """A-B or A,B,C, or both, as seeds in that order.
+
+    Raises:
+      ConfigError: it has another form, or a seed is too large or comes twice.
+    """
+    out: list[int] = []
+    for part in text.split(","):
+        found = _RANGE.fullmatch(part.strip())
+        first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+        if first > last:
+            raise ConfigError(f"--seeds {text!r} is not of the form A-B or A,B,C, for example 0-4")
+        if last >= SEEDS or last - first >= MOST:
+            raise ConfigError(f"--seeds {text!r}: expected at most {MOST} seeds below 2^32")
+        out += range(first, last + 1)
+    if len(set(out)) < len(out):
+        raise ConfigError(f"--seeds {text!r}: a seed comes twice")
+    return tuple(out)
+
+
+def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str, str]]:
+    """Every combination of values, the last name's changing fastest.
+
+    Raises:
+      ConfigError: that is too many runs.
+    """
+    found = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
+    if len(found) * seeds > MOST:
+        raise ConfigError(f"{len(found)} settings x {seeds} seeds are {len(found) * seeds} runs; expected up to {MOST}")
+    return found
+
+
+def check(sweep: Sweep) -> None:
+    """See that no two settings are the same runs.
+
+    Raises:
+      ConfigError: two are, or a run's name cannot be used.
+    """
+    seen: dict[str, Setting] = {}
+    for setting in sweep.settings:
+        other = seen.setdefault(json.dumps(configs.to_dict(setting.config)), setting)
+        if other is not setting:
+            raise ConfigError(f"--vary: {other.label} and {setting.label} are the same configuration")
+    for path in sweep.runs:
+        keys.checked("run", path.name)

@@ -1,0 +1,119 @@
+"""What the runs of a sweep gave: a row each, means over the seeds, and curves."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import RunError
+from farm.tasks.loop import RETURN_FLOOR
+from learner.grid import Sweep
+from learner.run_folder import RunFolder
+
+COLUMNS: Final = (
+    "seed", "state", "generations", "rollouts", "first_mean_policy_return", "mean_policy_return",
+    "mean_policy_success", "robust_success_rate", "robust_return", "seconds", "parameters_sha256",
+)  # fmt: skip
+"""Of table.csv, behind what is varied; names of summary.json, and the return of the mean policy before learning."""
+
+
+def rows(sweep: Sweep) -> list[dict[str, Any]]:
+    """A row a run, setting by setting; what is not known is None."""
+    return [
+        {**setting.values, **_row(sweep.folder(i, seed), seed)}
+        for i, setting in enumerate(sweep.settings)
+        for seed in sweep.seeds
+    ]
+
+
+def _row(path: Path, seed: int) -> dict[str, Any]:
+    folder = RunFolder(path)
+    summary, progress = folder.read_summary() or {}, folder.progress()
+    row: dict[str, Any] = {name: summary.get(name) for name in COLUMNS} | {"seed": seed}
+    if progress:
+        last = progress[-1]
+        row |= {"generations": last.generation, "rollouts": last.rollouts, "seconds": last.seconds}
+        row["first_mean_policy_return"] = progress[0].mean_policy_return
+    row["state"] = summary.get("state") or ("unfinished" if progress else "not begun")
+    return row
+
+
+def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
+    """Write table.csv, as a whole or not at all.
+
+    Raises:
+      RunError: it cannot be written.
+    """
+    text, aside = io.StringIO(), path.with_name(path.name + ".new")
+    writer = csv.DictWriter(text, [*sweep.vary, *COLUMNS], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    try:
+        aside.write_text(text.getvalue(), "utf-8")
+        aside.replace(path)
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}") from None
+
+
+def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:
+    """Mean and standard deviation of a column over its runs, where it is known; None where it never is."""
+    known = [float(row[column]) for row in table if row[column] is not None]
+    return (float(np.mean(known)), float(np.std(known))) if known else None
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The mean policy's return over rollouts, of a setting's runs."""
+
+    label: str
+    rollouts: FloatArray
+    """Exploring rollouts that the policy had behind it, (G,)"""
+    returns: FloatArray
+    """(runs, G), nan behind a run's end and where the physics blew up"""
+
+    @property
+    def mean(self) -> FloatArray:
+        """Over the runs that are there, (G,)."""
+        return np.asarray(np.nanmean(self.returns, axis=0))
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Their standard deviation, (G,)."""
+        return np.asarray(np.nanstd(self.returns, axis=0))
+
+
+def curves(sweep: Sweep) -> list[Curve]:
+    """A curve a setting; without those none of whose runs has begun."""
+    found = []
+    for i, setting in enumerate(sweep.settings):
+        runs = [run for seed in sweep.seeds if len((run := _curve(sweep.folder(i, seed)))[0])]
+        if runs:
+            found.append(_joined(setting.label, runs))
+    return found
+
+
+def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Rollouts behind each mean policy of a run, and its return; the first line is of the policy before learning."""
+    folder = RunFolder(path)
+    progress, summary = folder.progress(), folder.read_summary() or {}
+    rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
+    returns = [p.mean_policy_return for p in progress]
+    if progress and summary.get("state") == "finished":  # the evaluation's: after the last update
+        rollouts, returns = [*rollouts, progress[-1].rollouts], [*returns, summary["mean_policy_return"]]
+    values = np.array(returns, dtype=float)
+    return np.array(rollouts, dtype=float), np.where(values <= RETURN_FLOOR, np.nan, values)
+
+
+def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
+    """Runs of one setting, whose generations have the same rollouts, side by side; those that ended earlier as nan."""
+    longest = max((rollouts for rollouts, _ in runs), key=len)
+    returns = np.full((len(runs), len(longest)), np.nan)
+    for row, (_, values) in zip(returns, runs, strict=True):
+        row[: len(values)] = values
+    known = ~np.isnan(returns).all(axis=0)
+    return Curve(label, longest[known], returns[:, known])
