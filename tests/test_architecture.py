@@ -36,7 +36,7 @@ DOORS = {
     "gymnasium": ("farm/tasks/gymnasium.py", "farm/tasks/finger_gait/env.py"),
     "rerun": ("learner/recording/",),
     "rerun_cli": ("learner/recording/",),
-    "matplotlib": ("learner/commands/sweep.py", "learner/figure.py"),
+    "matplotlib": ("learner/figure.py",),
     "rich": ("farm/commands/", "learner/commands/"),
     "cryptography": ("farm/commands/certificates.py",),
     "PIL": ("farm/sim/video.py", "learner/commands/check.py"),
@@ -127,5 +127,4 @@ def test_nothing_outside_the_finger_gait_knows_fingers() -> None:
 
 def test_the_lists_above_name_what_exists() -> None:
     for name in (*PURE, *FLOORS, *HAND, *(door for doors in DOORS.values() for door in doors)):
-        if name not in ("learner/figure.py", "learner/commands/sweep.py"):
-            assert (ROOT / name).exists(), name
+        assert (ROOT / name).exists(), name
