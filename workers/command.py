@@ -51,8 +51,7 @@ def _flags(command: WorkerCommand) -> list[str]:
     flags += ["--farm", config.farm, "--name", config.name, "--backend", config.backend]
     if config.tls is not None:
         flags += ["--tls", str(config.tls)]
-    if config.allow_gym:
-        flags.append("--allow-gym")
+    flags += [word for path in config.allow_file for word in ("--allow-file", str(path))]
     if config.timeout is not None:
         flags += ["--timeout", str(config.timeout)]
     return [*flags, "--log-level", command.log_level.upper()]
