@@ -7,7 +7,7 @@ from typing import Any
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
-from learner.config import RunConfig, changes, preset_of, settings
+from learner.config import RunConfig, changes, flat, preset_of
 from learner.run_folder import RunFolder
 
 
@@ -67,11 +67,7 @@ def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     differing = dict.fromkeys(name for run in runs[1:] for name, _, _ in changes(first, run.config))
     yield "preset", *(preset_of(run.config) for run in runs)
     for name in differing:
-        values = []
-        for run in runs:
-            changed = {key: value for key, _, value in changes(first, run.config)}
-            values.append(changed[name] if name in changed else settings(first)[name])
-        yield name, *(str(value) for value in values)
+        yield name, *(str(flat(run.config).get(name, "-")) for run in runs)
 
 
 def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
