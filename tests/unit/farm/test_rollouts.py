@@ -1,365 +1,293 @@
-"""Jobs to results: signs, origins, rates, traces and trajectories; and specifications that make no sense."""
+"""Jobs to results on a made-up task: signs, origins, rates, traces; and which specifications are served."""
 
-import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from farm.errors import ConfigError
+from farm import plugins
+from farm import rollouts as rolling
+from farm.errors import ConfigError, UnservedError
 from farm.net import codec
-from farm.net.work import Job
 from farm.net.messages import Spec
-from farm.net.work import Result, Results, WireTrajectory
-from farm.policies.fourier import Features, PolicyConfig
-from farm.tasks import TASKS
-from farm.tasks.finger_gait import touch as tactile
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import CAPACITY, Stepper
-from farm.tasks.finger_gait.task import TIMESTEP, Perturbation, TaskConfig
-from workers.backends import BACKENDS
+from farm.net.work import Jobs, Results, Simulated
+from farm.policies.fourier import Direct, FeaturesConfig
+from farm.rollouts import SIMULATION, Runner, backend, served
+from farm.settings import setting
+from farm.sim.channels import Channel
+from farm.tasks.base import Task, TaskConfig
 from workers.backends.cpu import CpuBackend
-from workers.jobs import parameters
-from workers.tasks import SIMULATES
 
-P = 64
-
-
-def make_spec(task=None, policy=None, seed=0, **changes):
-    config = TaskConfig(**(task or {}))
-    controller = PolicyConfig(**({"features": 50} | (policy or {})))
-    drawn = Features.draw(controller, STATES[config.state].size, np.random.default_rng(seed))
-    values = {
-        "run": "run-1",
-        "task": "finger-gait",
-        "task_config": dataclasses.asdict(config),
-        "policy_config": dataclasses.asdict(controller),
-        "frequencies": drawn.frequencies,
-        "phases": drawn.phases,
-    }
-    return Spec(**(values | changes))
+XML = """<mujoco><option timestep="0.01"/><worldbody>
+  <body><joint name="hinge" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.02"/></body>
+  </worldbody><actuator><motor joint="hinge"/></actuator></mujoco>"""
 
 
-@pytest.fixture(scope="module")
-def backend():
-    return CpuBackend(codec.decode(codec.encode(make_spec()), Spec))
+class Pole(Task):
+    """A pole that falls from any angle, if it is given a seed."""
 
+    @dataclass(frozen=True, kw_only=True)
+    class Config(TaskConfig):
+        """Its own settings."""
 
-RNG = np.random.default_rng(1)
-MU = RNG.normal(1.0, 1.0, P)
+        width: float = setting(3.0, above=0.0)
+        """Angle at which it has fallen [rad]."""
 
-
-def job(index=0, **changes):
-    values = {
-        "index": index,
-        "origin": "mu",
-        "signs": (1, -1),
-        "perturbation": None,
-        "rate": "none",
-        "eps": np.random.default_rng([5, index]).normal(0.0, 2.0, P),
-    }
-    return Job(**(values | changes))
-
-
-MEAN = {"signs": (1,), "eps": np.zeros(0)}
-
-
-def arrays(result):
-    return {
-        f.name: getattr(result, f.name) for f in dataclasses.fields(Result) if f.name not in ("index", "trajectory")
-    }
-
-
-def assert_rows_equal(one, row, two, other_row):
-    for name, values in arrays(one).items():
-        assert values[row].tobytes() == arrays(two)[name][other_row].tobytes(), name
-
-
-# ---------------------------------------------------------------- figures
-
-
-def test_backends_by_name(backend):
-    assert BACKENDS == {"cpu": CpuBackend}
-    assert backend.capacity == CAPACITY
-    assert backend.parameters == P
-    backend.close()
-
-
-def test_results_answer_the_jobs_in_their_order(backend):
-    jobs = [
-        job(7),
-        job(2, rate="physics", **MEAN),
-        job(5, signs=(1,)),
-        job(0, rate="control"),
-        job(1, perturbation=(3, 0, 0, 0)),
-    ]
-    results = backend.run(MU, jobs)
-    assert [result.index for result in results] == [7, 2, 5, 0, 1]
-    for asked, result in zip(jobs, results, strict=True):
-        assert len(result.returns) == len(asked.signs)
-        assert result.traces.shape == (len(asked.signs), 15, 54)
-        assert (result.trajectory is None) == (asked.rate == "none")
-        dtypes = {name: values.dtype.str for name, values in arrays(result).items()}
-        assert dtypes == {
-            "returns": "<f8",
-            "success": "|b1",
-            "dropped": "|b1",
-            "failed": "|b1",
-            "clamped": "|b1",
-            "traces": "<f4",
-        }
-
-
-def travelled(*results):
-    """Results as the learner sees them."""
-    sent = Results.of(results, run="r", incarnation="i", round=0, worker="w/0", traces="extremes")
-    return codec.decode(codec.encode(sent), Results)
-
-
-@pytest.mark.parametrize("perturbation", [None, (1, 2, 3, 4)])
-def test_a_pair_is_two_single_jobs(backend, perturbation):
-    pairs = [job(i, perturbation=perturbation) for i in range(6)]
-    for asked, pair in zip(pairs, backend.run(MU, pairs), strict=True):
-        for row, sign in enumerate((1, -1)):
-            (single,) = backend.run(MU, [dataclasses.replace(asked, signs=(sign,))])
-            assert_rows_equal(pair, row, single, 0)
-            away = MU + sign * asked.eps
-            (absolute,) = backend.run(MU, [dataclasses.replace(asked, signs=(1,), origin="zero", eps=away)])
-            assert_rows_equal(pair, row, absolute, 0)
-        (swapped,) = backend.run(MU, [dataclasses.replace(asked, signs=(-1, 1))])
-        assert_rows_equal(pair, 0, swapped, 1)
-        assert pair.returns[0] != pair.returns[1]
-
-
-def test_jobs_do_not_know_of_each_other(backend):
-    jobs = [
-        job(i, perturbation=None if i % 3 else (9, i, 0, 0), rate=("none", "control", "physics")[i % 3 if i < 6 else 0])
-        for i in range(CAPACITY // 2 + 4)
-    ]
-    together = backend.run(MU, jobs)
-    for asked, result in zip(jobs, together, strict=True):
-        (alone,) = backend.run(MU, [asked])
-        for row in range(2):
-            assert_rows_equal(result, row, alone, row)
-    backwards = backend.run(MU, jobs[::-1])[::-1]
-    for one, two in zip(together, backwards, strict=True):
-        for row in range(2):
-            assert_rows_equal(one, row, two, row)
-        assert codec.encode(one) == codec.encode(two)
-
-
-def test_another_backend_gives_the_same(backend):
-    jobs = [job(0), job(1, perturbation=(4, 0, 0, 0)), job(2, rate="physics", **MEAN)]
-    other = CpuBackend(make_spec())
-    other.run(-MU, [job(8, perturbation=(5, 0, 0, 0))])
-    assert [codec.encode(r) for r in other.run(MU, jobs)] == [codec.encode(r) for r in backend.run(MU, jobs)]
-
-
-def test_without_eps_it_is_the_mean(backend):
-    results = backend.run(
-        MU, [job(0, **MEAN), job(1, signs=(1,), eps=np.zeros(P)), job(2, signs=(1, -1), eps=np.zeros(0))]
+    xml = XML
+    steps, substeps = 5, 2
+    channels = (
+        Channel(name="angle", kind="scalars", shape=(1,), trace=True),
+        Channel(name="turned", kind="flags", shape=(1,)),
     )
-    assert_rows_equal(results[0], 0, results[1], 0)
-    for row in (0, 1):
-        assert_rows_equal(results[0], 0, results[2], row)
 
+    def reset(self, sim, row, rng):
+        """Turn it."""
+        sim.qpos[row, 0] = 0.1 if rng is None else rng.uniform(-1.0, 1.0)
 
-def test_parameters_of_a_job():
-    asked = job(0, eps=np.arange(3.0))
-    mu = np.array([10.0, 20.0, 30.0])
-    np.testing.assert_array_equal(parameters(mu, asked), [[10, 21, 32], [10, 19, 28]])
-    np.testing.assert_array_equal(parameters(mu, dataclasses.replace(asked, origin="zero")), [[0, 1, 2], [0, -1, -2]])
-    np.testing.assert_array_equal(parameters(mu, dataclasses.replace(asked, **MEAN)), [mu])
-    np.testing.assert_array_equal(parameters(mu, dataclasses.replace(asked, origin="zero", **MEAN)), [[0, 0, 0]])
-    assert mu.tolist() == [10, 20, 30]
+    def reward(self, sim, action):  # noqa: ARG002  whatever was done
+        """Upright."""
+        return np.cos(sim.qpos[:, 0])
 
+    def ended(self, sim):
+        """It fell."""
+        return np.abs(sim.qpos[:, 0]) > self.config.width
 
-def test_the_seed_of_a_perturbation_is_all_there_is_to_it(backend):
-    seeds = [(1, 5, 0, 0), (1, 5, 0, 0), (2, 5, 0, 0), (1, 6, 0, 0)]
-    results = backend.run(MU, [job(i, perturbation=seed, **MEAN) for i, seed in enumerate(seeds)])
-    assert_rows_equal(results[0], 0, results[1], 0)
-    assert len({result.returns[0] for result in results}) == 3
-    drawn = Perturbation.draw(np.random.default_rng((2, 5, 0, 0)), 15)
-    rollouts = backend._task._simulation.run(MU[None], [drawn])
-    assert rollouts.outcome.returns[0] == results[2].returns[0]
+    def success(self, sim):
+        """To the right."""
+        return sim.qpos[:, 0] > 0.0
 
-
-@pytest.mark.parametrize("rate", ["none", "control", "physics"])
-def test_the_rate_changes_no_figure(backend, rate):
-    for perturbation in (None, (3, 0, 0, 0)):
-        asked = job(2, perturbation=perturbation)
-        one, two = backend.run(MU, [dataclasses.replace(asked, index=i, rate=r) for i, r in enumerate(("none", rate))])
-        for row in range(2):
-            assert_rows_equal(one, row, two, row)
-
-
-# ---------------------------------------------------------------- trajectories
-
-
-def seen(backend, rate, eps=None, **changes):
-    """Return a rollout's result and its trajectory."""
-    eps = np.zeros(0) if eps is None else eps
-    (result,) = backend.run(MU, [job(0, signs=(1,), eps=eps, rate=rate, **changes)])
-    return result, result.trajectory.trajectory()
-
-
-def steps_of(result):
-    """Return after how many control steps a rollout ended, of which there is a frame each."""
-    return len(result.trajectory.times) - 1
+    def measure(self, sim):
+        """Its angle."""
+        return {"angle": sim.qpos, "turned": (sim.qpos > 0.0).astype(float)}
 
 
 @pytest.fixture(scope="module")
-def dropping(backend):
-    """Parameters with which the object is dropped after some steps."""
-    for seed in range(100):
-        eps = np.random.default_rng(seed).normal(0.0, 2.0, P)
-        (result,) = backend.run(MU, [job(0, signs=(1,), eps=eps, rate="control")])
-        if 2 < steps_of(result) < 15:
-            assert result.dropped[0]
-            return eps
-    pytest.fail("nothing was dropped")
+def runner():
+    task = Pole()
+    spec, config = task.spec(), FeaturesConfig(features=10)
+    return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
 
 
-@pytest.mark.parametrize("ending", ["lasting", "dropping"])
-@pytest.mark.parametrize(("rate", "parts"), [("control", 1), ("physics", 10)])
-def test_a_trajectory_is_the_rollout_frame_by_frame(backend, dropping, rate, parts, ending):
-    eps = dropping if ending == "dropping" else np.zeros(0)
-    result, shown = seen(backend, rate, eps, perturbation=(6, 0, 0, 0))
-    steps = steps_of(backend.run(MU, [job(0, signs=(1,), eps=eps, rate="control", perturbation=(6, 0, 0, 0))])[0])
-    assert (steps < 15) == (ending == "dropping")
-    frames = steps * parts + 1
-    for name in ("times", "bodies", "joints", "targets", "images", "points", "terms"):
-        assert len(getattr(shown, name)) == frames, name
-    np.testing.assert_allclose(shown.times, np.arange(frames) * 0.1 / parts, atol=1e-12)
-    assert shown.value == result.returns[0]
-    assert shown.success == result.success[0]
-    for t in range(steps):
-        image = shown.images[(t + 1) * parts].reshape(54).astype("f4")
-        assert image.tobytes() == result.traces[0, t].tobytes()
-    assert not result.traces[0, steps:].any()
-    np.testing.assert_array_equal(shown.terms[0], 0.0)
-    held = shown.terms[1:].reshape(steps, parts, 5)  # the terms of a control step, at each of its frames
-    assert (held == held[:, :1]).all()
-    rewards = held[:, 0].sum(axis=1)
-    assert 0.1 * np.sum(0.95 ** np.arange(steps) * rewards) == pytest.approx(shown.value, rel=1e-5)
-    np.testing.assert_array_equal(shown.targets[0], backend._task._simulation.task.commands.astype("f4"))
-    points = tactile.contact_points(shown.images)
-    np.testing.assert_allclose(shown.points, points, atol=1e-5)
+P = 10
+MU = np.random.default_rng(1).normal(0.0, 1.0, P)
+EPS = np.random.default_rng(2).normal(0.0, 2.0, (4, P))
+SEEDS = [(1, 2, 3, i) for i in range(4)]
 
 
-@pytest.mark.parametrize("ending", ["lasting", "dropping"])
-def test_physics_rate_passes_through_the_frames_of_control_rate(backend, dropping, ending):
-    eps = dropping if ending == "dropping" else None
-    (_, coarse), (_, fine) = seen(backend, "control", eps), seen(backend, "physics", eps)
-    for name in ("bodies", "joints", "targets", "images", "points", "terms"):
-        np.testing.assert_array_equal(getattr(fine, name)[::10], getattr(coarse, name), err_msg=name)
-    np.testing.assert_allclose(fine.times[::10], coarse.times, atol=1e-12)
-    assert np.diff(fine.times) == pytest.approx(TIMESTEP)
+def same(one: Simulated, rows, other: Simulated, at) -> None:
+    assert one.returns[rows].tobytes() == other.returns[at].tobytes()
+    assert one.flags[rows].tobytes() == other.flags[at].tobytes()
 
 
-def test_targets_hold_for_a_control_step(backend):
-    _, fine = seen(backend, "physics")
-    held = fine.targets[1:].reshape(15, 10, 8)
-    assert (held == held[:, :1]).all()
-    assert (np.diff(held[:, 0], axis=0) != 0).any()
+# ---------------------------------------------------------------- jobs
 
 
-def test_bodies_stand_where_the_joints_put_them(backend):
-    _, shown = seen(backend, "control")
-    scene = backend._task._simulation.scene
-    assert shown.bodies.shape == (16, len(scene.bodies), 7)
-    qpos = np.concatenate([shown.joints, shown.bodies[:, scene.bodies.index("object")]], axis=1)
-    np.testing.assert_allclose(scene.poses(qpos), shown.bodies, atol=1e-6)
+@pytest.mark.parametrize("seeds", [None, SEEDS])
+def test_a_pair_is_two_single_rollouts_from_the_same_start(runner, seeds):
+    pairs = runner.run(MU, Jobs.exploring(EPS, (1, -1), seeds))
+    assert len(set(pairs.returns.tolist())) == 8
+    for column, sign in enumerate((1, -1)):
+        same(pairs, slice(column, None, 2), runner.run(MU, Jobs.exploring(EPS, (sign,), seeds)), slice(None))
+    alone = Jobs.single(MU - EPS[2], "none", seeds[2] if seeds else None)
+    same(pairs, [5], runner.run(9.0 * MU, alone), [0])
 
 
-def test_a_pair_shows_its_first_rollout(backend):
-    (pair,) = backend.run(MU, [job(0, rate="control")])
-    assert pair.trajectory.value == pair.returns[0]
+def test_jobs_do_not_know_of_each_other_and_their_rate_changes_no_figure(runner):
+    jobs = Jobs.joined(
+        [
+            Jobs.exploring(EPS[:2], (1, -1), SEEDS[:2]),
+            Jobs.mean("control", [None, SEEDS[3]]),
+            Jobs.single(MU, "physics", None),
+            Jobs.mean("physics", [SEEDS[3]]),
+            Jobs.mean("none", [None, SEEDS[3]]),
+        ]
+    )
+    together = runner.run(MU, jobs, "all")
+    for row in (5, 7):  # the mean at control rate, at physics rate, and unseen
+        same(together, [row], together, [9])
+    for row in (4, 6):
+        same(together, [row], together, [8])
+    starts = np.cumsum(jobs.rollouts) - jobs.rollouts
+    shown = iter(together.trajectories)
+    for at in range(len(jobs)):
+        alone = runner.run(MU, jobs.take([at]), "all")
+        same(alone, slice(None), together, slice(starts[at], starts[at] + jobs.rollouts[at]))
+        if jobs.seen[at]:
+            [own] = alone.trajectories
+            assert codec.encode(next(shown)) == codec.encode(own)
+    frames = [len(trajectory.times) for trajectory in together.trajectories]
+    assert frames == [6, 6, 11, 11]
+    assert [t.value for t in together.trajectories] == together.returns[4:8].tolist()
 
 
-def test_a_failed_rollout_can_be_shown_and_sent(monkeypatch):
-    backend = CpuBackend(make_spec())
-    blown_up = Stepper.blown_up
-    calls = []
+def test_what_is_sent_is_what_the_receiver_expects(runner):
+    jobs = Jobs.joined([Jobs.mean("control", [None]), Jobs.exploring(EPS, (1, -1), SEEDS)])
+    head = {"run": "r", "incarnation": "i", "round": 0, "worker": "w/0"}
+    for traces, count in (("none", 0), ("extremes", 2), ("all", 8)):
+        sent = Results.carrying(runner.run(MU, jobs, traces), jobs, **head)
+        back = codec.decode(codec.encode(sent), Results)
+        assert back.traces.shape[1:] == (5, 1)
+        assert len(back.traces) == count
+        assert back.trajectories[0].fits(runner.spec.shapes(len(runner.scene.bodies)))
+    best, worst = int(back.returns[1:].argmax()), int(back.returns[1:].argmin())
+    two = runner.run(MU, jobs, "extremes").traces
+    assert two.tobytes() == back.traces[sorted((best, worst))].tobytes()
 
-    def after_three(self, ids):
-        calls.append(ids)
-        return blown_up(self, ids) | (len(calls) == 4)
 
-    monkeypatch.setattr(Stepper, "blown_up", after_three)
-    (result,) = backend.run(MU, [job(0, rate="physics", **MEAN)])
-    assert result.failed[0]
-    assert not result.dropped[0]
-    shown = travelled(result).trajectories[0].trajectory()
-    assert len(shown.times) == 41
-    np.testing.assert_array_equal(shown.terms[-1], [0, 0, 0, 0, -400])
+def test_an_end_and_its_trace(runner):
+    fallen = Runner(Pole(Pole.Config(width=0.5)), runner.policy)
+    given = fallen.run(MU, Jobs.exploring(EPS, (1,), SEEDS), "all")
+    assert 0 < given.flags[:, 1].sum() < 4
+    for row in range(4):
+        last = np.flatnonzero(given.traces[row, :, 0])[-1]
+        assert (last < 4 or abs(given.traces[row, last, 0]) > 0.5) == given.flags[row, 1]
+        assert given.flags[row, 0] == (given.traces[row, last, 0] > 0)
+    fallen.close()
 
 
 @pytest.mark.parametrize("size", [1e200, 1e308])
-@pytest.mark.parametrize("clip", [True, False])
-def test_absurd_parameters_are_answered(clip, size):
-    backend = CpuBackend(make_spec(policy={"controller": "direct", "clip": clip}))
-    eps = np.where(np.arange(backend.parameters) % 2, 1.0, -1.0) * size
-    results = backend.run(np.zeros(backend.parameters), [job(0, eps=eps, rate="control")])
-    back = travelled(*results)
-    clamped = back.flags[:, 3]
-    assert clamped.all()
-    assert (back.returns == -1e12).all()
-    assert isinstance(back.trajectories[0], WireTrajectory)
+def test_absurd_parameters_are_answered(runner, size):
+    theta = np.where(np.arange(P) % 2, 1.0, -1.0) * size
+    given = runner.run(MU, Jobs.single(theta, "control", None))
+    assert np.isfinite(given.returns).all()
+    codec.decode(codec.encode(given.trajectories[0]), type(given.trajectories[0]))
+
+
+def test_the_seed_is_all_there_is_to_a_start(runner):
+    given = runner.run(MU, Jobs.mean("none", [SEEDS[0], SEEDS[0], SEEDS[1], None]))
+    assert given.returns[0] == given.returns[1]
+    assert len(set(given.returns.tolist())) == 3
 
 
 # ---------------------------------------------------------------- specifications
 
+POLE = """
+import numpy as np
+import farm
 
-def test_both_sides_know_the_same_tasks():
-    assert list(TASKS) == list(SIMULATES)
+class Pole(farm.Task):
+    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody>
+      <actuator><motor joint="j"/></actuator></mujoco>'''
+    steps = 3
+
+    def reward(self, sim, action):
+        return sim.qpos[:, 0]
+"""
 
 
-def test_an_unknown_task_names_the_known_ones():
-    with pytest.raises(ConfigError, match="unknown task 'juggling'; known are finger-gait"):
-        CpuBackend(dataclasses.replace(make_spec(), task="juggling"))
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "pole.py"
+    path.write_text(POLE)
+    return path
+
+
+@pytest.fixture
+def spec(file: Path) -> Spec:
+    """What a learner says of a task in that file."""
+    task, policy = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", "direct")
+    code = {"task": task.digest(), "policy": policy.digest(), "simulation": plugins.code_digest(SIMULATION)}
+    constants = Direct.draw(FeaturesConfig(features=4), task.target().spec(), np.random.default_rng(0))
+    said = Spec(
+        run="r", task=task.wire, task_config={"steps": 2}, policy="direct", policy_config={"features": 4}, code=code,
+        files={"model.xml": task.target.xml}, constants=constants,
+    )  # fmt: skip
+    return codec.decode(codec.encode(said), Spec)
+
+
+def test_it_is_built_as_it_is_specified(spec, file):
+    task, policy = served(spec, (file,))
+    assert spec.task == "pole.py:Pole", "a file is named without its folder"
+    assert (task.steps, policy.size) == (2, 4)
+    heavier = task.sources["model.xml"].replace('mass="1"', 'mass="5"')
+    other, _ = served(replace(spec, files={"model.xml": heavier}), (file,))
+    assert (task.model.body_mass[1], other.model.body_mass[1]) == (1.0, 5.0), "the run's texts count"
+    made = [Runner(*served(spec, (file,))).run(np.ones(4), Jobs.mean("none", [None])) for _ in range(2)]
+    assert made[0].returns.tobytes() == made[1].returns.tobytes()
+
+
+def test_a_file_is_served_by_permission_only_and_only_if_it_is_the_same(spec, file, tmp_path):
+    with pytest.raises(UnservedError, match=r"pole\.py is a file on the learner's machine: .* --allow-file pole\.py"):
+        served(spec)
+    other = tmp_path / "other.py"
+    other.write_text(POLE)
+    with pytest.raises(UnservedError, match="--allow-file pole.py"):
+        served(spec, (other,))
+    changed = tmp_path / "changed" / "pole.py"
+    changed.parent.mkdir()
+    changed.write_text(POLE + "\nraise RuntimeError('it was imported')\n")
+    with pytest.raises(UnservedError, match=r"pole\.py differs from the learner's pole\.py: copy the learner's"):
+        served(spec, (changed,))
+    with pytest.raises(UnservedError, match="has no class 'Hole'; it has Pole"):
+        served(replace(spec, task="pole.py:Hole"), (file,))
 
 
 @pytest.mark.parametrize(
-    ("part", "change", "message"),
+    ("name", "words"),
     [
-        ("task_config", {"colour": "red"}, "does not understand.*colour"),
-        ("task_config", {"object": "spoon"}, "unknown object 'spoon'"),
-        ("task_config", {"object": ["bar"]}, "unknown object"),
-        ("task_config", {"start_grip": ["index"]}, "does not understand|unknown grip"),
-        ("task_config", {"goal_grip": "none"}, "unknown grip 'none'"),
-        ("task_config", {"steps": 2}, "steps is 2"),
-        ("task_config", {"steps": "15"}, "does not understand|steps"),
-        ("task_config", {"steps": 15.5}, "does not understand|steps"),
-        ("task_config", {"steps": np.array([15, 15])}, "does not understand|steps"),
-        ("task_config", {"gamma": None}, "does not understand"),
-        ("policy_config", {"controller": "magic"}, "unknown controller 'magic'"),
-        ("policy_config", {"controller": {}}, "does not understand|unknown controller"),
-        ("policy_config", {"bandwidth": "wide"}, "does not understand"),
-        ("policy_config", {"bandwidth": np.ones(2)}, "does not understand"),
-        ("policy_config", {"depth": 3}, "does not understand.*depth"),
-        ("policy_config", {b"features": 50}, "does not understand"),
+        ("task", "pole.py differs from the learner's"),
+        ("policy", "its code of 'direct' differs from the learner's: install the learner's release on both sides"),
+        ("simulation", r"its simulation's code differs from the learner's \(farm/\)"),
+    ],
+)
+@pytest.mark.parametrize("digest", ["0" * 64, None])
+def test_other_code_is_refused_and_named(spec, file, name, words, digest):
+    code = {key: value for key, value in spec.code.items() if key != name}
+    with pytest.raises(UnservedError, match=words):
+        served(replace(spec, code=code if digest is None else code | {name: digest}), (file,))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"task": "juggling"}, r"unknown task 'juggling'; known are finger-gait, gym, or FILE\.py:CLASS"),
+        ({"policy": "pid"}, "unknown policy 'pid'; known are direct"),
+        ({"policy_release": "mine 2"}, "the run has direct of mine 2, here is the farm's"),
+        ({"task": "finger-gait", "release": "theirs 1"}, "the run has finger-gait of theirs 1, here is the farm's"),
+        ({"task_release": "gymnasium 9"}, "the run has pole.py:Pole of gymnasium 9, here is "),
+        ({"task_config": {"colour": "red"}}, "pole.py:Pole: unknown setting colour; known are steps"),
+        ({"task_config": {"steps": "15"}}, "steps is '15'; expected int"),
+        ({"task_config": {"steps": np.array([15, 15])}}, "steps is .*; expected int"),
+        ({"task_config": {"gamma": None}}, "gamma is None; expected float"),
+        ({"policy_config": {"bandwidth": np.ones(2)}}, "bandwidth is .*; expected float"),
+        ({"policy_config": {"depth": 3}}, "direct: unknown setting depth"),
+        ({"policy_config": {b"features": 50}}, "direct: unknown setting b'features'"),
+        ({"constants": {}}, "constant 'frequencies' of the policy is missing"),
+        ({"constants": {b"frequencies": np.zeros((4, 2)), "phases": np.zeros(4)}}, "'frequencies' .* is missing"),
+        ({"files": {}}, "has no model"),
+        ({"files": {"model.xml": "<mujoco>"}}, "MuJoCo refuses the model"),
     ],
     ids=str,
 )
-def test_a_specification_that_makes_no_sense_is_a_clear_error(part, change, message):
-    spec = make_spec()
-    with pytest.raises(ConfigError, match=message):
-        CpuBackend(dataclasses.replace(spec, **{part: getattr(spec, part) | change}))
+def test_a_specification_that_makes_no_sense_is_a_clear_error(spec, file, change, words):
+    with pytest.raises(UnservedError, match=words) as caught:
+        served(replace(spec, **change), (file,))
+    assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    ("frequencies", "phases"), [((50, 17), 50), ((50, 8), 49), ((0, 8), 50), ((8, 50), 50), ((1, 8), 50)], ids=str
-)
-def test_features_of_another_size_are_a_clear_error(frequencies, phases):
-    with pytest.raises(ConfigError, match=r"features of shape \(\d+, \d+\) for 8 state components"):
-        CpuBackend(dataclasses.replace(make_spec(), frequencies=np.zeros(frequencies), phases=np.zeros(phases)))
+def test_a_file_that_changes_meanwhile_is_what_it_is_now(spec, file):
+    """A worker goes on from run to run; the file that it may serve is edited on both sides."""
+    served(spec, (file,))
+    file.write_text(POLE.replace("steps = 3", "steps = 7"))
+    with pytest.raises(UnservedError, match="differs from the learner's"):
+        served(spec, (file,))
+    code = spec.code | {"task": plugins.find("tasks", f"{file}:Pole").digest()}
+    task, _ = served(replace(spec, code=code, task_config={}), (file,))
+    assert task.steps == 7
 
 
-@pytest.mark.parametrize("controller", ["direct", "projected", "cosine", "kernel"])
-@pytest.mark.parametrize("state", list(STATES))
-def test_parameter_counts(controller, state):
-    backend = CpuBackend(make_spec({"state": state}, {"controller": controller}))
-    expected = 8 * (50 if controller in ("direct", "cosine") else STATES[state].size)
-    assert backend.parameters == expected
-    (result,) = backend.run(np.ones(expected), [job(0, **MEAN)])
-    assert np.isfinite(result.returns).all()
+def test_what_is_no_task_is_no_task(spec, tmp_path):
+    """A file that may be served still gives no class of another kind."""
+    path = tmp_path / "pole.py"
+    path.write_text("class Pole:\n    pass\n")
+    code = spec.code | {"task": plugins.find("tasks", f"{path}:Pole").digest()}
+    with pytest.raises(UnservedError, match="pole.py:Pole is no Task"):
+        served(replace(spec, code=code), (path,))
+
+
+def test_backends_by_name():
+    assert isinstance(backend("cpu"), CpuBackend)
+    with pytest.raises(ConfigError, match="unknown backend 'gpu'; known are cpu"):
+        backend("gpu")
+    assert rolling.SIMULATION == "farm.tasks.loop"
