@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 _WHERE: Final = {
     "learn": "learner.run", "load": "learner.replay", "RunConfig": "learner.config", "configure": "learner.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
-    "Channel": "farm.sim.channels", "Camera": "farm.sim.channels", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
+    "Channel": "farm.sim.channels", "Camera": "farm.sim.channels",
+    "Record": "farm.tasks.base", "Score": "farm.tasks.base",
     "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",
     "Algorithm": "learner.algorithms", "SearchState": "learner.algorithms",
     "Backend": "farm.sim.sim", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",
@@ -39,7 +40,7 @@ _WHERE: Final = {
     "RunError": "farm.errors", "TaskError": "farm.errors",
 }  # fmt: skip
 
-__all__ = ["__version__", *_WHERE]  # noqa: PLE0604  strings
+__all__ = ["__version__", *_WHERE]
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401  whatever it is

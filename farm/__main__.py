@@ -1,9 +1,9 @@
 """The front door: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
 
-import os
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 from farm import __version__, plugins
@@ -69,7 +69,7 @@ def _overview() -> str:
 
 def _without_here() -> None:
     """`python -m farm` puts the current folder first in the path: nothing is imported from there."""
-    if not sys.flags.safe_path and sys.path and sys.path[0] in ("", os.getcwd()):
+    if not sys.flags.safe_path and sys.path and sys.path[0] in ("", str(Path.cwd())):
         del sys.path[0]
 
 

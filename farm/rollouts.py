@@ -1,4 +1,4 @@
-"""What a run simulates, built from its specification: jobs in, results out. For workers, and for a learner's own use."""
+"""What a run simulates, built from its specification: jobs in, results out. For workers and learners alike."""
 
 from collections.abc import Mapping
 from pathlib import Path

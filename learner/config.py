@@ -35,11 +35,11 @@ class RunConfig(Settings):
     """The controller: a name (farm tasks lists them), or FILE.py:CLASS."""
     algorithm: str = ""
     """The learning rule: a name (farm tasks lists them), or FILE.py:CLASS."""
-    task_config: TaskConfig = cast("TaskConfig", None)  # noqa: RUF009  filled in below
+    task_config: TaskConfig = cast("TaskConfig", None)  # filled in below
     """Settings of the task."""
-    policy_config: PolicyConfig = cast("PolicyConfig", None)  # noqa: RUF009
+    policy_config: PolicyConfig = cast("PolicyConfig", None)
     """Settings of the policy."""
-    algorithm_config: Algorithm[Any] = cast("Algorithm[Any]", None)  # noqa: RUF009
+    algorithm_config: Algorithm[Any] = cast("Algorithm[Any]", None)
     """Settings of the algorithm."""
     seed: int = setting(0, least=0, most=SEEDS - 1)
     """Seed of everything random in the run."""
@@ -117,6 +117,11 @@ def _part(kind: str, name: str, given: Mapping[str, Any]) -> Any:  # noqa: ANN40
     config = settings_class(kind, name)
     known = {each: value for each, value in given.items() if each in _fields(config)}
     return settings.from_dict(config, known, name)
+
+
+def plugin_path(kind: str, name: str) -> str:
+    """A plug-in's name as config.json has it: a file's with its whole path."""
+    return plugins.find(kind, name).name
 
 
 def presets(task: str) -> dict[str, Mapping[str, Any]]:

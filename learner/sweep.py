@@ -3,6 +3,9 @@
 A generation of 15 pairs cannot keep many workers busy, four learners' generations can. Each learner is a process
 of its own, `farm learner` as a person would start it, at one router; their numbers are those of runs one after
 another, because a run's numbers depend on nobody else.
+
+`run` takes run folders and their configurations, wherever they come from: settings x seeds (`learner.grid`), or an
+experiment. Runs that have ended are not repeated, others go on from their checkpoints.
 """
 
 import json
@@ -15,34 +18,38 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from benchmarks.thesis.folder import ExperimentFolder
+from farm import plugins
 from farm.errors import RunError
 from farm.net import session
 from farm.net.session import free_endpoint
 from farm.processes import Pool
 from learner import config as configs
+from learner.config import RunConfig
 from learner.run_folder import RunFolder
 
 log = logging.getLogger(__name__)
 
 _LOOK: Final = 0.1  # [s] between two looks at the learners
 _GRACE: Final = 20.0  # [s] that learners have to save and leave
+_OVER: Final = ("finished", "diverged")  # states that running again would not change
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sharing:
-    """Where experiments run; no number depends on it."""
+    """Where runs are done; no number depends on it."""
 
     parallel: int = 4
     """Learners at a time."""
     workers: int = 2
     """Local worker processes."""
+    backend: str = "cpu"
+    """What they simulate with."""
     connect: tuple[str, ...] = ()
     """Routers of a farm to dial, instead of one of our own."""
     tls: Path | None = None
@@ -73,15 +80,29 @@ class Shown(Protocol):
 class _Learner:
     """A learner's process, and what it said last."""
 
-    run: str
     path: Path
     process: "subprocess.Popen[str]"
     reader: threading.Thread = field(init=False)
     said: deque[str] = field(default_factory=lambda: deque(maxlen=5))
 
+    @property
+    def run(self) -> str:
+        """The run's name."""
+        return self.path.name
 
-def run(folder: ExperimentFolder, sharing: Sharing, shown: Shown, stopped: Callable[[], bool]) -> bool:
-    """Do the runs of an experiment that are not over.
+
+def over(folder: RunFolder) -> bool:
+    """Whether a run has ended in a way that running it again would not change."""
+    return (folder.read_summary() or {}).get("state") in _OVER
+
+
+def todo(runs: Iterable[Path]) -> list[Path]:
+    """Those of these run folders whose runs are not over, in their order."""
+    return [path for path in runs if not over(RunFolder(path))]
+
+
+def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: Shown, stopped: Callable[[], bool]) -> bool:
+    """Do those runs that are not over, in their order, each in its folder.
 
     Returns:
       whether all are over now; not, if it was stopped or runs failed.
@@ -89,24 +110,20 @@ def run(folder: ExperimentFolder, sharing: Sharing, shown: Shown, stopped: Calla
     Raises:
       RunError: no local worker keeps running.
     """
-    todo = deque(folder.todo())
-    if not todo:
+    waiting = deque(todo(runs))
+    if not waiting:
         return True
     with ExitStack() as stack:
-        endpoints, pool = sharing.connect, None
-        if not endpoints:
-            endpoints = (free_endpoint(),)
-            stack.enter_context(session.listen(endpoints[0], sharing.farm, None))
-        flags = [word for endpoint in endpoints for word in ("--connect", endpoint)]
-        flags += ["--farm", sharing.farm, *(["--tls", str(sharing.tls)] if sharing.tls else [])]
-        if sharing.workers:
-            pool = stack.enter_context(Pool(sharing.workers, [*flags, "--log-level", "ERROR"], dict(os.environ)))
+        flags = _router(sharing, stack)
+        pool = _workers(sharing, flags, runs.values(), stack)
+        flags += ["--record" if sharing.record else "--no-record"]
         plans = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         running: list[_Learner] = []
         stack.callback(_end, running)
-        while (todo or running) and not stopped():
-            while todo and len(running) < sharing.parallel:
-                running.append(_start(folder, *todo.popleft(), plans, [*flags, *_RECORD[sharing.record]], shown))
+        while (waiting or running) and not stopped():
+            while waiting and len(running) < sharing.parallel:
+                path = waiting.popleft()
+                running.append(_start(path, runs[path], plans, flags, shown))
             for learner in [one for one in running if one.process.poll() is not None]:
                 running.remove(learner)
                 _conclude(learner, shown)
@@ -117,21 +134,36 @@ def run(folder: ExperimentFolder, sharing: Sharing, shown: Shown, stopped: Calla
         for learner in running:
             _conclude(learner, shown)
         running.clear()
-    return not folder.todo()
+    return not todo(runs)
 
 
-_RECORD: Final = {True: ("--record",), False: ("--no-record",)}
+def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
+    """Flags by which learners and workers find each other; a router of our own where none is given."""
+    endpoints = sharing.connect
+    if not endpoints:
+        endpoints = (free_endpoint(),)
+        stack.enter_context(session.listen(endpoints[0], sharing.farm, None))
+    flags = [word for endpoint in endpoints for word in ("--connect", endpoint)]
+    return [*flags, "--farm", sharing.farm, *(["--tls", str(sharing.tls)] if sharing.tls else [])]
 
 
-def _start(
-    folder: ExperimentFolder, setup: str, number: int, plans: Path, flags: Sequence[str], shown: Shown
-) -> _Learner:
-    target = folder.run(setup, number)
-    plan = plans / f"{target.name}.json"
-    plan.write_text(json.dumps(configs.to_dict(folder.config(setup, number))), "utf-8")
+def _workers(sharing: Sharing, flags: Sequence[str], configs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
+    """Local workers, which may serve the files that these runs come from."""
+    if not sharing.workers:
+        return None
+    chosen = {("tasks", config.task) for config in configs} | {("policies", config.policy) for config in configs}
+    files = sorted({str(file) for kind, name in chosen if (file := plugins.find(kind, name).file)})
+    own = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
+    own += [word for file in files for word in ("--allow-file", file)]
+    return stack.enter_context(Pool(sharing.workers, own, dict(os.environ)))
+
+
+def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], shown: Shown) -> _Learner:
+    plan = plans / f"{path.name}.json"
+    plan.write_text(json.dumps(configs.to_dict(config)), "utf-8")
     command = [
-        sys.executable, "-m", "learner.sweep", "--config", str(plan), "--out", str(target.path.parent),
-        "--name", target.name, "--resume-existing", "--json", "--log-level", "WARNING", *flags,
+        sys.executable, "-P", "-m", "learner.sweep", "--config", str(plan), "--out", str(path.parent),
+        "--name", path.name, "--resume-existing", "--json", "--log-level", "WARNING", *flags,
     ]  # fmt: skip
     # Standard input is a pipe that nobody writes to: it closes when this process ends, however it ends.
     # A session of its own keeps the terminal's Ctrl-C away: this process ends its learners.
@@ -140,7 +172,7 @@ def _start(
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONIOENCODING": "utf-8"},
         encoding="utf-8", errors="replace",
     )  # fmt: skip
-    learner = _Learner(target.name, target.path, process)
+    learner = _Learner(path, process)
     learner.reader = threading.Thread(target=_listen, args=(learner, shown), daemon=True)
     learner.reader.start()
     return learner
@@ -180,13 +212,13 @@ def _conclude(learner: _Learner, shown: Shown) -> None:
         state = "failed"
     said = " ".join(learner.said)
     if state == "finished":
-        success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
-        said = f"mean policy returns {summary['mean_policy_return']:.3f} and {success}"
+        judged = {True: " and succeeds", False: " and does not succeed", None: ""}[summary["mean_policy_success"]]
+        said = f"mean policy returns {summary['mean_policy_return']:.3f}{judged}"
     shown.ended(learner.run, state, said)
 
 
 def _end(learners: list[_Learner]) -> None:
-    """Have them save and leave; who has not in time is killed."""
+    """Have them save and leave; one that takes too long is killed."""
     for learner in learners:
         learner.process.terminate()
     until = time.monotonic() + _GRACE

@@ -19,7 +19,7 @@ class WorkerCommand:
     worker: WorkerConfig = field(default_factory=WorkerConfig)
     """Where they work."""
     processes: int | None = None
-    """Worker processes; None: one a core."""
+    """Worker processes; None: one per core."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -51,7 +51,7 @@ def _flags(command: WorkerCommand) -> list[str]:
     flags += ["--farm", config.farm, "--name", config.name, "--backend", config.backend]
     if config.tls is not None:
         flags += ["--tls", str(config.tls)]
-    flags += [word for path in config.allow_file for word in ("--allow-file", str(path))]
+    flags += [word for path in config.allow_file for word in ("--allow-file", str(path.resolve()))]
     if config.timeout is not None:
         flags += ["--timeout", str(config.timeout)]
     return [*flags, "--log-level", command.log_level.upper()]

@@ -18,7 +18,8 @@ from farm.rollouts import Runner
 from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
 
-_POLICIES: Final = {"direct": {"features": 300}, "projected": {"features": 300}, "kernel": {}, "cosine": {"features": 9}}
+_FEATURES: Final = {"features": 300}
+_POLICIES: Final = {"direct": _FEATURES, "projected": _FEATURES, "kernel": {}, "cosine": _FEATURES}
 
 
 class Canary(Task):

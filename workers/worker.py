@@ -59,7 +59,7 @@ class WorkerConfig:
     backend: str = "cpu"
     """What simulates: a name, or FILE.py:CLASS."""
     allow_file: tuple[Path, ...] = ()
-    """Serve runs whose task or policy is a class in this file, repeatable; it must be the same file as the learner's."""
+    """Serve runs whose task or policy is a class in this file, repeatable; the learner's must be the same file."""
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""

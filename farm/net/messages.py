@@ -1,7 +1,7 @@
 """Who takes part and what is simulated, as learner and workers tell each other. Pure; bytes by `farm.net.codec`.
 
-Everything on the wire is soft state: any message may be lost, doubled or late. Whatever belongs to work (`farm.net.work`,
-`farm.net.work`) carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
+Everything on the wire is soft state: any message may be lost, doubled or late. Whatever belongs to work
+(`farm.net.work`) carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
 """
 
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What learners tell people who look on: how a run is doing, and what was recorded of it. Pure, as `farm.net.messages`."""
+"""What learners tell observers: how a run is doing, and what was recorded of it. Pure, as `farm.net.messages`."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -155,4 +155,3 @@ _STATE_FIELDS = frozenset(
         "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata",
     )
 )  # fmt: skip
-

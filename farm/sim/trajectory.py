@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,9 +41,7 @@ class Trajectory:
 def joined(rollouts: Sequence[Trajectory]) -> Trajectory:
     """The frames of at least one rollout after another; return and success are the last one's."""
     last = rollouts[-1]
-    frames = {name: np.concatenate([getattr(r, name) for r in rollouts]) for name in ("times", *_OWN)}
+    own = ("times", "bodies", "actions", "terms")
+    frames: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in rollouts]) for name in own}
     channels = {name: np.concatenate([r.channels[name] for r in rollouts]) for name in last.channels}
     return replace(last, **frames, channels=channels)
-
-
-_OWN = ("bodies", "actions", "terms")

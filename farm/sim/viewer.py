@@ -72,14 +72,23 @@ def _look(viewer: mujoco.viewer.Handle, camera: Camera | None) -> None:
         return
     with viewer.lock():
         viewer.cam.lookat[:] = camera.lookat
-        viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = camera.distance, camera.azimuth, camera.elevation
+        viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = (
+            camera.distance,
+            camera.azimuth,
+            camera.elevation,
+        )
 
 
 class _Clock:
     """Steps the physics at the speed that is wanted, with the mouse's pushes."""
 
     def __init__(
-        self, viewer: mujoco.viewer.Handle, data: mujoco.MjData, wait: Callable[[float], bool], speed: float, step: float
+        self,
+        viewer: mujoco.viewer.Handle,
+        data: mujoco.MjData,
+        wait: Callable[[float], bool],
+        speed: float,
+        step: float,
     ) -> None:
         self._viewer, self._data, self._wait = viewer, data, wait
         self._period = step / speed

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 STEPS_LIMIT: Final = 10_000
 """Control steps of a rollout, at most."""
 
+
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig(Settings):
     """Settings that every task has; a task's own `Config` adds to them."""
@@ -122,7 +123,9 @@ class Task:
     takes: ClassVar[str] = ""
     """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
 
-    def __init__(self, config: TaskConfig | None = None, variant: str = "", files: Mapping[str, str] | None = None):
+    def __init__(
+        self, config: TaskConfig | None = None, variant: str = "", files: Mapping[str, str] | None = None
+    ) -> None:
         """Take settings, the name behind the colon, and the texts that a run carries (without: this machine's)."""
         self.config: Any = self.Config() if config is None else config
         self.variant = variant
@@ -177,7 +180,7 @@ class Task:
         """What the policy sees, (B, d); qpos and qvel unless overridden."""
         return np.concatenate([sim.qpos, sim.qvel], axis=1)
 
-    def act(self, sim: "Sim", action: FloatArray) -> FloatArray:
+    def act(self, sim: "Sim", action: FloatArray) -> FloatArray:  # noqa: ARG002
         """Controls of raw actions (B, A); -1 to 1 rescaled to the actuators' ranges unless overridden."""
         low, high = self.limits
         return rescaled(action, low, high)
@@ -186,21 +189,21 @@ class Task:
         """Reward of the control step that just ended, (B,); or named terms that add up to it."""
         raise NotImplementedError
 
-    def ended(self, sim: "Sim") -> BoolArray | None:
+    def ended(self, sim: "Sim") -> BoolArray | None:  # noqa: ARG002
         """Which rollouts end here, (B,); None: none before its last step."""
         return None
 
-    def success(self, sim: "Sim") -> BoolArray | None:
+    def success(self, sim: "Sim") -> BoolArray | None:  # noqa: ARG002
         """Which rollouts, ending here, succeeded, (B,); None where there is no success."""
         return None
 
-    def measure(self, sim: "Sim") -> dict[str, FloatArray]:
+    def measure(self, sim: "Sim") -> dict[str, FloatArray]:  # noqa: ARG002
         """What is kept of every frame, (B, ...) each: values of channels, or what `score` and `show` need."""
         return {}
 
     # Whole rollouts
 
-    def score(self, record: Record) -> Score | None:
+    def score(self, record: Record) -> Score | None:  # noqa: ARG002
         """Score whole rollouts at once instead of by `reward` and `success`; None: do not."""
         return None
 

@@ -15,8 +15,7 @@ from farm.arrays import FloatArray
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, FarmError, RunError, TaskError
 from farm.tasks.base import TaskConfig
-from learner.commands.options import plugin_path
-from learner.config import RunConfig
+from learner.config import RunConfig, plugin_path
 
 ROWS = 8
 """Rollouts that are compared."""
@@ -75,13 +74,15 @@ def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
     low, high = found.task.limits
     yield f"observation {spec.observation}, actions {spec.action}, controls {model.nu} from {low} to {high}"
     yield f"{spec.steps} control steps of {spec.period:g} s; reward of {', '.join(spec.terms)}"
-    yield f"success: {'yes' if spec.success else 'none'}; channels: {', '.join(c.name for c in spec.channels) or 'none'}"
+    channels = ", ".join(channel.name for channel in spec.channels)
+    yield f"success: {'yes' if spec.success else 'none'}; channels: {channels or 'none'}"
     yield f"policy {config.policy} with {found.policy.size} parameters"
     runner = found.runner()
     theta = np.random.default_rng(0).normal(0.0, 0.5, (ROWS, found.policy.size))
     drawn = [None if i == 0 else seeds.trial(0, i // 2) for i in range(ROWS)]
     together = runner.rollouts(theta, drawn)
-    yield f"returns {together.returns.min():.4g} to {together.returns.max():.4g}, {int(together.ended.sum())} ended early"
+    least, most = together.returns.min(), together.returns.max()
+    yield f"returns {least:.4g} to {most:.4g}, {int(together.ended.sum())} ended early"
     if together.failed.any():
         yield f"warning: the physics of {int(together.failed.sum())} of {ROWS} rollouts blew up"
     order = np.random.default_rng(1).permutation(ROWS)
@@ -116,8 +117,8 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
         if values.tobytes() != np.ascontiguousarray(second[name]).tobytes():
             most = np.abs(np.asarray(values, float) - np.asarray(second[name], float)).max()
             raise TaskError(
-                f"{name} differs (by up to {most:.3g}) when the same rollouts run {how}: rows of a batch must not depend "
-                "on each other, and the task object must not remember anything of a rollout"
+                f"{name} differs (by up to {most:.3g}) when the same rollouts run {how}: rows of a batch must not "
+                "depend on each other, and the task object must not remember anything of a rollout"
             )
 
 

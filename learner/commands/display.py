@@ -176,7 +176,7 @@ class LiveDisplay:
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:
-            said = f"of the rollouts; {p.dropped} dropped, {p.failed} failed"
+            said = f"of the rollouts; {p.ended} ended early, {p.failed} failed"
             table.add_row("success", f"{p.success_rate:.0%}", said)
         table.add_row("sigma", f"{p.sigma_mean:.3f}", f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}")
         return table

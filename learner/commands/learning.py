@@ -17,7 +17,9 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM, as of a shell."""
 
 
-def learn(chosen: LearnerOptions, config: RunConfig, place: Placement, resumed: RunFolder | None, begin: RunConfig) -> int:
+def learn(
+    chosen: LearnerOptions, config: RunConfig, place: Placement, resumed: RunFolder | None, begin: RunConfig
+) -> int:
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up("WARNING" if chosen.quiet and chosen.log_level == "INFO" else chosen.log_level)
     place = replace(place, connect=chosen.connect, farm=chosen.farm, record=chosen.record)

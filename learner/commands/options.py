@@ -11,7 +11,7 @@ from farm.net import keys
 from farm.net.session import check_endpoint
 from learner import config as configs
 from learner.commands.display import Style
-from learner.config import RunConfig, changes
+from learner.config import RunConfig, changes, plugin_path
 from learner.run_folder import RunFolder
 
 
@@ -149,19 +149,12 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
     return keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
 
 
-def parse(
-    kind: type[settings.C], words: Sequence[str], program: str
-) -> tuple[settings.C, RunFolder | None, RunConfig]:
+def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[settings.C, RunFolder | None, RunConfig]:
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
     words = _with_names(words)
     begin, resumed = origin(words)
     default = replace(kind(), run=begin)  # type: ignore[type-var]
     return settings.parse(kind, words, program, default), resumed, begin
-
-
-def plugin_path(kind: str, name: str) -> str:
-    """A plug-in's name as config.json has it: a file's with its whole path."""
-    return plugins.find(kind, name).name
 
 
 def _with_names(words: Sequence[str]) -> list[str]:

@@ -47,7 +47,7 @@ class RecordCommand:
     name: str = ""
     """Which viewer's, where the folder holds several."""
     allow_file: tuple[Path, ...] = ()
-    """Use the task or policy in this file, repeatable, where the run's is a class in a file on the learner's machine."""
+    """Use the task or policy in this file, repeatable, where the run's is in a file on the learner's machine."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -106,7 +106,12 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
             shown = problem(config, files=files)
             remote = kept.enter_context(
                 open_remote(
-                    path, name=name, config=config, serve=command.address, spec=shown.spec, scene=shown.scene,
+                    path,
+                    name=name,
+                    config=config,
+                    serve=command.address,
+                    spec=shown.spec,
+                    scene=shown.scene,
                     camera=shown.task.camera,
                 )  # fmt: skip
             )

@@ -113,4 +113,3 @@ def _film(policy: "LoadedPolicy", shown: "Replay", path: Path, speed: float) -> 
     )  # fmt: skip
     drawn = dict(zip(moments, pictures, strict=True))
     video.write(path, [drawn[moment] for moment in chosen])
-

@@ -38,7 +38,7 @@ def main(words: Sequence[str]) -> int:
         for name, origin in plugins.names(kind).items():
             table.add_row(flag, name, origin, _about(kind, name))
     wide().print(table)
-    sys.stdout.write("\nfarm tasks NAME shows settings; a class of your own: FILE.py:CLASS (farm new-task writes one)\n")
+    sys.stdout.write("\nfarm tasks NAME shows its settings; farm new-task writes a task of your own, FILE.py:CLASS\n")
     return 0
 
 

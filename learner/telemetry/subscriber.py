@@ -153,7 +153,6 @@ class Subscriber:
             log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
         self._incarnation = page.incarnation
 
-
     def _read(self, page: RunHistory) -> RunConfig:
         """The run's configuration; classes in files are those of this machine's files of the same names."""
         return configs.from_dict(localised(page.config, self._files), f"run {self._run}")

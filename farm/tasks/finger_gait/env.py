@@ -42,7 +42,7 @@ _SIZE: Final = (480, 640)  # height and width of a picture
 class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
     """One rollout an episode; settings are those of `farm run`.
 
-    The observation is the state base's x, (d,). The discounted sum of an episode's rewards is the farm's return.
+    The observation is the state base's x, (d,); at a drop, which ends an episode, it is that of the step before. The discounted sum of an episode's rewards is the farm's return.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / CONTROL_PERIOD)}
@@ -85,7 +85,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
             drawn = tuple(self.np_random.integers(0, 2**32, 4).tolist())
         self._batch = Batch(self._task, self._sim, [drawn])
         self._x = self._look()
-        return self._x, _info(np.zeros(len(TERMS)), success=False)
+        return self._x.copy(), _info(np.zeros(len(TERMS)), success=False)
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Move for one control step of 0.1 s."""
@@ -98,7 +98,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         assert score.success is not None
         terms = score.terms[0, t]
         info = _info(terms, success=bool(over and score.success[0]))
-        return self._x, self._task.return_scale * float(terms.sum()), ended, over and not ended, info
+        return self._x.copy(), self._task.return_scale * float(terms.sum()), ended, over and not ended, info
 
     def render(self) -> AnyArray | None:  # type: ignore[override]  (Gymnasium's may be a list as well)
         """A picture of 480 x 640 pixels, None without a render mode."""

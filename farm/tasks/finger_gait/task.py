@@ -205,6 +205,8 @@ class FingerGait(Task):
         Raises:
           ConfigError: the fingers cannot reach the object, or a grip does not hold it.
         """
+        sim.begin(1)
+        self.measure(sim)  # asked for before the search for the grip, which would begin again otherwise
         grasping = Grasping(self.hand)
         self._waiting = grasping.command(())
         self.start_commands = grasping.command(GRIPS[self.config.start_grip])
@@ -324,7 +326,11 @@ class FingerGait(Task):
         bodies = tuple(self.model.body(int(tip.bodyid[0])).name for tip in tips)
         places = np.stack([tip.pos + touch.positions() for tip in tips])
         fingers: dict[str, Any] = {"labels": FINGERS, "colours": _COLOURS, "unit": "N"}
-        joints = {"labels": tuple(n.replace("_", " ") for n in JOINTS), "colours": _joint_colours(), "unit": "rad"}
+        joints: dict[str, Any] = {
+            "labels": tuple(n.replace("_", " ") for n in JOINTS),
+            "colours": _joint_colours(),
+            "unit": "rad",
+        }
         return (
             Channel(
                 name="tactile", kind="images", shape=(len(FINGERS), *touch.SHAPE), top=2.0, bodies=bodies,
@@ -334,10 +340,10 @@ class FingerGait(Task):
                 name="contacts/force", kind="scalars", shape=(len(FINGERS),), top=3.0,
                 geoms=tuple(tip.name for tip in tips), **fingers,
             ),
-            Channel(name="contacts/state", kind="flags", shape=(len(FINGERS),), **{**fingers, "unit": ""}),
+            Channel(name="contacts/state", kind="flags", shape=(len(FINGERS),), labels=FINGERS, colours=_COLOURS),
             Channel(
                 name="contacts/push", kind="arrows", shape=(len(FINGERS), 6), bodies=bodies, length=0.009,
-                longest=0.075, **{**fingers, "colours": ()},
+                longest=0.075, labels=FINGERS, unit="N",
             ),
             Channel(name="joints/position", kind="scalars", shape=(len(JOINTS),), **joints),
             Channel(name="joints/target", kind="scalars", shape=(len(JOINTS),), **joints),
@@ -358,7 +364,6 @@ class FingerGait(Task):
             "joints/position": frames["qpos"][..., : len(JOINTS)],
             "joints/target": frames["target"],
         }
-
 
     def exported(self) -> dict[str, Any]:
         """Everything that `observe`, `act` and `score` use."""
@@ -416,8 +421,6 @@ def _joint_colours() -> tuple[tuple[int, int, int], ...]:
     out = []
     for name in JOINTS:
         finger, number = name.split("_")
-        red, green, blue = (
-            min(255, round(c * _SHADES[int(number) - 1])) for c in _COLOURS[FINGERS.index(finger)]
-        )
+        red, green, blue = (min(255, round(c * _SHADES[int(number) - 1])) for c in _COLOURS[FINGERS.index(finger)])
         out.append((red, green, blue))
     return tuple(out)

@@ -1,6 +1,6 @@
-"""Rollouts in Gymnasium's environments against a plain loop, bit for bit."""
+"""Gymnasium's environments as tasks: against a plain loop, bit for bit; which names are taken; clear errors."""
 
-import dataclasses
+import subprocess
 import sys
 from functools import cache
 
@@ -8,161 +8,150 @@ import gymnasium
 import numpy as np
 import pytest
 
-from farm import seeds as randomness
-from farm import tasks
+from farm import plugins, seeds
 from farm.errors import ConfigError
-from farm.net import codec
-from farm.net.work import Job
-from farm.net.messages import Spec
-from farm.net.work import Result, Results
-from farm.policies.fourier import Features, Policy, PolicyConfig
-from farm.tasks.finger_gait.rewards import RETURN_FLOOR
-from farm.tasks.finger_gait.task import TaskConfig
-from farm.tasks.gymnasium import NOMINAL, Environment, reset_seed
-from workers.backends.cpu import CpuBackend
+from farm.net.work import Jobs
+from farm.policies.fourier import Direct, FeaturesConfig
+from farm.rollouts import Runner
+from farm.tasks.base import TaskConfig
+from farm.tasks.gymnasium import NOMINAL, Environment, make, reset_seed
+from farm.tasks.loop import RETURN_FLOOR
 
-CONTROLLER = PolicyConfig(controller="direct", features=20)
-SEED = randomness.training(0, 3, 4)
-
-
-def policy_of(config: TaskConfig) -> Policy:
-    sizes = tasks.sizes(config)
-    features = Features.draw(CONTROLLER, sizes.observation, np.random.default_rng(0))
-    return Policy(CONTROLLER, sizes.observation, features, (sizes.lower, sizes.upper))
+SEED = seeds.training(0, 3, 4)
 
 
 @cache
-def episodes(task: str, **settings) -> Environment:
-    config = TaskConfig(task=task, **settings)
-    return Environment(config, policy_of(config))
+def runner(name: str, **settings) -> Runner:
+    task = Environment(TaskConfig(**settings), name)
+    spec, config = task.spec(), FeaturesConfig(features=20)
+    return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
 
 
-def theta_of(task: str, scale: float = 0.5, number: int = 0):
-    return np.random.default_rng(number).normal(0.0, scale, episodes(task).policy.size)
+def theta_of(made: Runner, count: int = 1, scale: float = 0.5) -> np.ndarray:
+    return np.random.default_rng(0).normal(0.0, scale, (count, made.policy.size))
 
 
-def job(index: int, eps, **changes) -> Job:
-    values = {"index": index, "origin": "zero", "signs": (1, -1), "perturbation": SEED, "rate": "none", "eps": eps}
-    return Job(**(values | changes))
-
-
-@pytest.mark.parametrize("name", ["Pusher-v5", "Hopper-v5", "InvertedPendulum-v5", "Reacher-v5"])
-@pytest.mark.parametrize("perturbation", [None, SEED])
-def test_an_episode_is_a_plain_loops(name, perturbation):
-    task, gamma = f"gym:{name}", TaskConfig().gamma
-    theta = theta_of(task)
-    episode = episodes(task).episode(theta, perturbation)
-    policy, env = policy_of(TaskConfig(task=task)), gymnasium.make(name)
-    x, _ = env.reset(seed=reset_seed(perturbation))
-    weights, rewards, over = policy.weights(theta[None]), [], False
+@pytest.mark.parametrize("name", ["Pusher-v5", "Hopper-v5", "InvertedPendulum-v5"])
+@pytest.mark.parametrize("seed", [None, SEED])
+def test_a_rollout_is_a_plain_loops(name, seed):
+    made, gamma = runner(name, gamma=0.95), 0.95
+    theta = theta_of(made)
+    found = made.rollouts(theta, [seed])
+    env = gymnasium.make(name)
+    x, _ = env.reset(seed=reset_seed(None if seed is None else np.random.default_rng(seed)))
+    prepared, rewards, over = made.policy.prepare(theta), [], False
     while not over:
-        raw = np.clip(policy.actions(weights, x[None])[0], -1.0, 1.0)
+        raw = np.clip(made.policy.act(prepared, x[None])[0], -1.0, 1.0)
         action = env.action_space.low + (env.action_space.high - env.action_space.low) * (raw + 1.0) / 2.0
         x, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
         rewards.append(reward)
         over = terminated or truncated
-    assert episode.rewards.tolist() == rewards
-    assert episode.qpos[-1].tolist() == env.unwrapped.data.qpos.tolist()
-    assert episode.value == sum(gamma**t * reward for t, reward in enumerate(rewards))
-    assert not episode.failed
-    if name == "Hopper-v5":
-        assert len(rewards) < 1000, "it fell, and that ended it"
+    assert found.terms[0, : len(rewards), 0].tolist() == rewards
+    assert found.frames["qpos"][0, len(rewards) - 1].tolist() == env.unwrapped.data.qpos.tolist()
+    assert found.returns[0] == sum(gamma**t * reward for t, reward in enumerate(rewards))
+    assert (found.steps[0], found.ended[0], found.failed[0]) == (len(rewards), terminated, False)
 
 
-def test_both_rollouts_of_a_pair_start_alike():
-    runner = episodes("gym:Reacher-v5")
-    theta = theta_of("gym:Reacher-v5")
-    first, second = runner.episode(theta, SEED), runner.episode(-theta, SEED)
-    assert first.qpos[0].tolist() == second.qpos[0].tolist()
-    assert first.value != second.value
-    other = runner.episode(theta, randomness.training(0, 3, 5))
-    assert first.qpos[0].tolist() != other.qpos[0].tolist()
-    nominal = [runner.episode(theta, None).value for _ in range(2)]
-    assert nominal[0] == nominal[1]
+def test_rollouts_do_not_depend_on_their_batch():
+    made = runner("Hopper-v5")
+    seeded = [SEED, None, SEED, (3, 1, 2, 0), None]
+    theta = theta_of(made, 5)
+    together = made.rollouts(theta, seeded)
+    assert len(set(together.steps.tolist())) > 1, "some fall sooner"
+    for row in range(5):
+        alone = made.rollouts(theta[row : row + 1], [seeded[row]])
+        assert alone.returns[0] == together.returns[row]
+        assert alone.frames["qpos"].tobytes() == together.frames["qpos"][row].tobytes()
+
+
+def test_a_pair_starts_alike_and_seeds_differ():
+    made = runner("Reacher-v5")
+    theta = np.repeat(theta_of(made), 3, axis=0)
+    start = made.rollouts(theta, [SEED, SEED, seeds.training(0, 3, 5)]).start["qpos"]
+    assert start[0].tolist() == start[1].tolist() != start[2].tolist()
     assert reset_seed(None) == NOMINAL
-    assert len({reset_seed(randomness.training(0, 0, i)) for i in range(100)}) == 100
+    drawn = {reset_seed(np.random.default_rng(seeds.training(0, 0, i))) for i in range(100)}
+    assert len(drawn) == 100
 
 
-def sent(result: Result) -> bytes:
-    return codec.encode(Results.of([result], run="r", incarnation="i", round=1, worker="w/1", traces="none"))
-
-
-def test_jobs_do_not_know_of_each_other():
-    runner, mu = episodes("gym:Hopper-v5"), theta_of("gym:Hopper-v5")
-    jobs = [
-        job(4, theta_of("gym:Hopper-v5", number=1), origin="mu"),
-        job(2, np.empty(0), origin="mu", signs=(1,), perturbation=None, rate="control"),
-        job(9, theta_of("gym:Hopper-v5", number=2), perturbation=(3, 1, 2, 0)),
-    ]
-    together = runner.run(mu, jobs)
-    alone = [runner.run(mu, [one])[0] for one in reversed(jobs)][::-1]
-    assert [result.index for result in together] == [4, 2, 9]
-    for one, other in zip(together, alone, strict=True):
-        assert sent(one) == sent(other)
-
-
-@pytest.mark.parametrize("rate", ["control", "physics"])
-def test_a_trajectory_shows_the_scene(rate):
-    config = TaskConfig(task="gym:Pusher-v5", steps=5)
-    runner, scene, sizes = Environment(config, policy_of(config)), tasks.scene(config), tasks.sizes(config)
-    theta = theta_of("gym:Pusher-v5")
-    [result] = runner.run(theta, [job(0, theta, signs=(1,), rate=rate)])
-    episode = runner.episode(theta, SEED)
-    shown = result.trajectory.trajectory()
-    assert result.trajectory.fits(sizes.shapes(len(scene.bodies)))
+def test_a_trajectory_shows_the_scene_at_control_rate():
+    made = runner("Pusher-v5", steps=5)
+    given = made.run(theta_of(made)[0], Jobs.single(theta_of(made)[0], "physics", SEED))
+    [shown] = given.trajectories
+    assert shown.fits(made.spec.shapes(len(made.scene.bodies)))
     np.testing.assert_allclose(shown.times, np.arange(6) * 0.05)
-    np.testing.assert_allclose(shown.bodies, scene.poses(episode.qpos), atol=1e-6)
-    np.testing.assert_allclose(shown.targets[1:], episode.actions, atol=1e-6)
-    np.testing.assert_allclose(shown.terms[1:, 0], episode.rewards, rtol=1e-6)
-    assert (shown.value, shown.success) == (episode.value, None)
-    assert result.traces.shape == (1, 0, 54)
-    assert not result.success.any()
+    rollouts = made.rollouts(theta_of(made), [SEED])
+    np.testing.assert_allclose(shown.bodies[1:], made.scene.poses(rollouts.frames["qpos"][0]), atol=1e-6)
+    assert (shown.value, shown.success) == (rollouts.returns[0], None)
+    assert given.traces.size == 0
 
 
 def test_physics_that_blows_up_is_never_good():
-    config = TaskConfig(task="gym:HalfCheetah-v5", steps=50)
-    runner = Environment(config, policy_of(config))
-    runner._env.unwrapped.model.opt.timestep = 0.5
-    theta = theta_of("gym:HalfCheetah-v5", 5.0)
-    [result] = runner.run(theta, [job(0, theta, signs=(1,), rate="control")])
-    assert result.failed.all()
-    assert result.clamped.all()
-    assert (result.returns == RETURN_FLOOR).all()
-    assert len(result.trajectory.times) <= 50
-    codec.encode(result.trajectory)
-    runner._env.unwrapped.model.opt.timestep = 0.01
-    assert runner.episode(theta, None).value == Environment(config, policy_of(config)).episode(theta, None).value
+    made = runner("HalfCheetah-v5", steps=50)
+    theta, own = theta_of(made, scale=5.0), made.sim.engine._envs[0].unwrapped
+    before = made.rollouts(theta, [None]).returns[0]
+    own.model.opt.timestep = 0.5
+    failed = made.rollouts(theta, [None])
+    assert (failed.failed[0], failed.clamped[0], failed.returns[0]) == (True, True, RETURN_FLOOR)
+    own.model.opt.timestep = 0.01
+    assert made.rollouts(theta, [None]).returns[0] == before
 
 
-# ---------------------------------------------------------------- specifications
+def test_the_spec_is_the_environments():
+    spec = runner("Pusher-v5").spec
+    assert (spec.observation, spec.action, spec.steps, spec.period, spec.terms) == (23, 7, 100, 0.05, ("reward",))
+    assert (spec.success, spec.channels, spec.release) == (False, (), f"gymnasium {gymnasium.__version__}")
+    assert runner("Swimmer-v5", steps=7).spec.steps == 7
+    with pytest.raises(ConfigError, match="--steps 1001: task gym:Swimmer-v5 ends after 1000"):
+        runner("Swimmer-v5", steps=1001)
 
 
-def make_spec(**changes) -> Spec:
-    config = TaskConfig(task="gym:Reacher-v5")
-    drawn = Features.draw(CONTROLLER, 10, np.random.default_rng(0))
-    values = {
-        "run": "r", "task": config.task, "task_config": dataclasses.asdict(config),
-        "policy_config": dataclasses.asdict(CONTROLLER), "frequencies": drawn.frequencies, "phases": drawn.phases,
-        "release": gymnasium.__version__,
-    }  # fmt: skip
-    return Spec(**(values | changes))
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("Swimmr-v5", "Did you mean: `Swimmer`"),
+        ("Swimmer-v99", "`v5`"),
+        ("CartPole-v1", "not an environment of MuJoCo"),
+        ("Pusher-v2", "moved"),
+    ],
+)
+def test_what_cannot_be_learnt_is_one_line(name, line):
+    with pytest.raises(ConfigError, match=line) as said:
+        make(name)
+    assert str(said.value).startswith(f"task gym:{name}: ")
+    assert "\n" not in str(said.value)
 
 
-def test_a_backend_is_made_of_a_specification():
-    backend = CpuBackend(codec.decode(codec.encode(make_spec()), Spec))
-    theta = theta_of("gym:Reacher-v5")
-    assert backend.parameters == theta.size == 2 * 20
-    [result] = backend.run(theta, [job(0, theta)])
-    assert result.returns[0] == episodes("gym:Reacher-v5").episode(theta, SEED).value
-
-
-def test_another_release_is_refused():
-    with pytest.raises(ConfigError, match=r"the run has gym:Reacher-v5 of gymnasium 0\.1, here is"):
-        CpuBackend(make_spec(release="0.1"))
-
-
-def test_a_module_that_a_name_asks_for_is_not_imported():
+@pytest.mark.parametrize("name", ["os:Swimmer-v5", "antigravity:Reacher-v5", "Swimmer", "Swimmer-v", "a/b/c-v1", "x-v1\n"])
+def test_names_that_are_none_are_refused_and_nothing_is_imported(name):
+    with pytest.raises(ConfigError, match="gym:NAME-vN"):
+        Environment(TaskConfig(), name)
     assert "antigravity" not in sys.modules
-    with pytest.raises(ConfigError, match="names a module to import, which is refused"):
-        CpuBackend(make_spec(task="gym:antigravity:Reacher-v5"))
-    assert "antigravity" not in sys.modules
+
+
+def test_it_is_chosen_by_name():
+    plugin = plugins.find("tasks", "gym:Swimmer-v5")
+    assert (plugin.target, plugin.variant, plugin.wire) == (Environment, "Swimmer-v5", "gym:Swimmer-v5")
+    with pytest.raises(ConfigError, match="expected gym:NAME"):
+        plugins.find("tasks", "gym")
+
+
+def test_without_gymnasium_it_says_what_to_install():
+    code = (
+        "import sys; sys.modules['gymnasium'] = None\n"
+        "from farm.__main__ import main\n"
+        "sys.exit(main(['run', '--task', 'gym:Swimmer-v5', '--no-record']))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    line = "farm: task gym:Swimmer-v5 needs gymnasium: pip install 'gymnasium[mujoco]'\n"
+    assert (ended.returncode, ended.stderr) == (2, line)
+
+
+@pytest.mark.parametrize("name", ["Humanoid-v5", "Pusher-v5"])
+def test_a_scene_has_names_of_its_own_for_everything(name):
+    scene = runner(name).scene
+    geometries = scene.geometries()
+    assert len({geometry.name for geometry in geometries}) == len(geometries) == scene.model.ngeom
+    assert len(set(scene.bodies)) == len(scene.bodies)
+    poses = scene.poses(scene.model.qpos0[None])
+    np.testing.assert_allclose(np.linalg.norm(poses[..., 3:], axis=-1), 1.0)

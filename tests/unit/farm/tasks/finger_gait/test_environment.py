@@ -11,13 +11,14 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from farm.errors import ConfigError
-from farm.policies.fourier import Features, Policy, PolicyConfig
+from farm.policies.fourier import Kernel, KernelConfig
+from farm.rollouts import Runner
 from farm.tasks.finger_gait.env import FingerGaitEnv
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.physics import Simulation
-from farm.tasks.finger_gait.rewards import RETURN_SCALE, TERMS, WEIGHTS, discounted
-from farm.tasks.finger_gait.task import Perturbation, TaskConfig
+from farm.tasks.finger_gait.rewards import RETURN_SCALE, TERMS, WEIGHTS
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
+from farm.tasks.loop import discounted
 
 ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 
@@ -25,10 +26,10 @@ ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 def episode(env, policy, theta, seed):
     """Drive an environment by a farm's policy: rewards, terms, whether the last step was terminal and successful."""
     x, _ = env.reset(seed=seed)
-    weights = policy.weights(theta[None])
+    prepared = policy.prepare(theta[None])
     rewards, terms, over = [], [], False
     while not over:
-        x, reward, terminated, truncated, info = env.step(policy.actions(weights, x[None])[0])
+        x, reward, terminated, truncated, info = env.step(policy.act(prepared, x[None])[0])
         rewards.append(reward)
         terms.append([info["reward_terms"][name] for name in TERMS])
         over = terminated or truncated
@@ -36,44 +37,44 @@ def episode(env, policy, theta, seed):
 
 
 @pytest.mark.parametrize(
-    ("state", "action"), [*((state, "offset") for state in STATES), ("joints", "absolute"), ("joints", "increment")]
+    ("state", "action"), [("joints", "offset"), ("joints+tactile", "absolute"), ("joints+contacts", "increment")]
 )
 @pytest.mark.parametrize("seed", [None, 5])
 def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, seed):
-    config = TaskConfig(state=state, perturb=seed is not None)
-    kernel, size = PolicyConfig(controller="kernel", action=action, bandwidth=3.0), STATES[state].size
-    policy = Policy(kernel, size, Features.draw(kernel, size, np.random.default_rng(0)))
-    drawn = None if seed is None else Perturbation.draw(np.random.default_rng(seed), config.steps)
+    task = FingerGait(FingerGaitConfig(state=state, perturb=seed is not None, action=action))
+    policy = Kernel(KernelConfig(bandwidth=3.0), task.spec(), {})
+    drawn = None
+    if seed is not None:
+        drawn = tuple(np.random.default_rng(seed).integers(0, 2**32, 4).tolist())
     thetas = np.random.default_rng(1).normal(1.0, 0.8, (4, policy.size))
-    outcome = Simulation(config, policy).run(thetas, [drawn] * len(thetas)).outcome
-    env = FingerGaitEnv(action=action, state=state, perturb=config.perturb)
+    rollouts = Runner(task, policy).rollouts(thetas, [drawn] * len(thetas))
+    env = FingerGaitEnv(action=action, state=state, perturb=task.config.perturb)
     for i, theta in enumerate(thetas):
         rewards, terms, terminated, success = episode(env, policy, theta, seed)
         steps = len(rewards)
-        assert (steps, terminated, success) == (outcome.steps[i], outcome.dropped[i], outcome.success[i])
-        assert terms.tobytes() == np.ascontiguousarray(outcome.terms[i, :steps]).tobytes()
-        returns, _ = discounted(terms[None], config.gamma)
-        assert returns[0] == outcome.returns[i]
-        assert rewards @ config.gamma ** np.arange(steps) == pytest.approx(outcome.returns[i], rel=1e-12)
+        assert (steps, terminated, success) == (rollouts.steps[i], rollouts.ended[i], rollouts.success[i])
+        assert terms.tobytes() == np.ascontiguousarray(rollouts.terms[i, :steps]).tobytes()
+        returns, _ = discounted(terms[None], task.config.gamma, RETURN_SCALE)
+        assert returns[0] == rollouts.returns[i]
+        assert rewards @ task.config.gamma ** np.arange(steps) == pytest.approx(rollouts.returns[i], rel=1e-12)
 
 
 def test_success_is_the_farms():
     """A grip commanded at once succeeds; one that is held does not."""
-    config = TaskConfig()
-    env = FingerGaitEnv(action="absolute")
-    goal = Simulation(TaskConfig(start_grip=config.goal_grip), env._policy).task.commands
-    start = Simulation(config, env._policy).task.commands
+    steps, env = 15, FingerGaitEnv(action="absolute")
+    goal = FingerGaitEnv(start_grip="index+middle+thumb")._task.start_commands
+    start = env._task.start_commands
     for command, expected in ((goal, True), (start, False)):
         env.reset()
-        said = [env.step(command) for _ in range(config.steps)]
-        assert [bool(truncated) for _, _, _, truncated, _ in said] == [False] * (config.steps - 1) + [True]
-        assert [info["is_success"] for *_, info in said] == [False] * (config.steps - 1) + [expected]
+        said = [env.step(command) for _ in range(steps)]
+        assert [bool(truncated) for _, _, _, truncated, _ in said] == [False] * (steps - 1) + [True]
+        assert [info["is_success"] for *_, info in said] == [False] * (steps - 1) + [expected]
 
 
 def test_dropping_ends_an_episode_with_the_penalty():
     env = FingerGaitEnv(action="absolute")
     env.reset()
-    for _ in range(env._simulation.task.config.steps):
+    for _ in range(15):
         _, reward, terminated, truncated, info = env.step(LOWER)
         if terminated:
             break
@@ -87,7 +88,7 @@ def test_dropping_ends_an_episode_with_the_penalty():
 def test_physics_that_fails_ends_an_episode_and_the_next_is_as_ever():
     env = FingerGaitEnv()
     first, _ = env.reset()
-    env._stepper.state[0, 3] = np.inf
+    env._sim.engine.data.qvel[3] = np.inf
     x, reward, terminated, truncated, info = env.step(np.zeros(8))
     assert (terminated, truncated) == (True, False)
     assert np.isfinite(x).all()

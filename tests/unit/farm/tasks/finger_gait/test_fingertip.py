@@ -9,12 +9,14 @@ import pytest
 from rerun.chunk import RrdReader
 
 from farm.arrays import FloatArray
-from farm.sim import scene as scenes
-from farm.sim.scene import HandScene
+from farm.sim.engines import DataEngine
+from farm.sim.scene import Scene
+from farm.sim.sim import Sim
 from farm.sim.trajectory import Trajectory
-from farm.tasks.finger_gait import touch as tactile
+from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGERS, LOWER, TIP_RADIUS, UPPER
-from learner.recording.recorder import record_replay
+from farm.tasks.finger_gait.task import FingerGait
+from learner.recording.replay import record_replay
 
 BALL, DEPTH = 0.004, 0.0005
 """Radius of what presses, and how far into the fingertip it begins [m]."""
@@ -26,25 +28,25 @@ PLACES = [(finger, row, column) for finger in range(3) for row in range(6) for c
 
 
 @pytest.fixture(scope="module")
-def scene() -> HandScene:
-    """The hand with a small ball as its object."""
+def task() -> FingerGait:
+    """The gait with a small ball as its object."""
     box, ball = r'(<geom name="bar" )type="box" size="[^"]*"', rf'\1type="sphere" size="{BALL}"'
-    text = re.sub(box, ball, scenes.text("bar"))
-    return HandScene(model=scenes.compiled(text), object_name="ball")
+    files = model.files("bar")
+    return FingerGait(files={**files, "object.xml": re.sub(box, ball, files["object.xml"])})
 
 
 @pytest.fixture(scope="module")
-def pressed(scene: HandScene) -> Trajectory:
+def pressed(task: FingerGait) -> Trajectory:
     """A frame for each of PLACES, in different poses of the hand."""
     rng, frames = np.random.default_rng(0), []
     for finger, row, column in PLACES:
         joints = LOWER + rng.uniform(0.1, 0.5, 8) * (UPPER - LOWER)
-        frames.append(press(scene, joints, finger, towards(PITCH[row], ACROSS[column])))
-    qpos, images = np.stack([qpos for qpos, _ in frames]), np.stack([image for _, image in frames])
-    times, terms, points = 0.1 * np.arange(len(frames)), np.zeros((len(frames), 5)), tactile.contact_points(images)
+        frames.append(press(task, joints, finger, towards(PITCH[row], ACROSS[column])))
+    shown = {name: np.concatenate([frame[name] for frame in frames]) for name in frames[0]}
+    count, scene = len(frames), Scene(task.model)
     return Trajectory(
-        times=times, bodies=scene.poses(qpos), joints=qpos[:, :8], targets=qpos[:, :8], images=images, points=points,
-        terms=terms, value=0.0, success=False,
+        times=0.1 * np.arange(count), bodies=scene.poses(shown["qpos"]), actions=np.zeros((count, 8)),
+        terms=np.zeros((count, 5)), channels=task.show(shown), value=0.0, success=False,
     )  # fmt: skip
 
 
@@ -53,22 +55,24 @@ def towards(pitch: float, across: float) -> FloatArray:
     return np.array([np.cos(across) * np.sin(pitch), np.sin(across), np.cos(across) * np.cos(pitch)])
 
 
-def press(scene: HandScene, joints: FloatArray, finger: int, way: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Put the ball, held as before a release, onto a fingertip from there: positions, and images (3, 18)."""
-    data = mujoco.MjData(scene.model)
+def press(task: FingerGait, joints: FloatArray, finger: int, way: FloatArray) -> dict[str, FloatArray]:
+    """Put the ball, held as before a release, onto a fingertip from there: what is measured, (1, ...) each."""
+    engine = DataEngine(task.model)
+    sim, data = Sim(engine), engine.data
+    sim.begin(1)
     data.qpos[:8] = data.ctrl[:] = joints
-    mujoco.mj_kinematics(scene.model, data)
+    mujoco.mj_kinematics(task.model, data)
     tip = data.site(f"{FINGERS[finger]}_tip")
     data.qpos[8:11] = tip.xpos + tip.xmat.reshape(3, 3) @ way * (TIP_RADIUS + BALL - DEPTH)
     data.mocap_pos[0] = data.qpos[8:11]
-    mujoco.mj_forward(scene.model, data)
-    now = scene.measure(data)
-    image = tactile.image(now.force, now.place)[0]
-    assert image[finger].sum() == pytest.approx(normal_force(scene, data, finger), rel=1e-9)
-    return data.qpos.copy(), image
+    sim.forward()
+    frame = {"qpos": data.qpos[None].copy(), **{k: np.array(v) for k, v in task.measure(sim).items()}}
+    force = task.show(frame)["contacts/force"][0, finger]
+    assert force == pytest.approx(normal_force(task.hand, data, finger), rel=1e-9)
+    return frame
 
 
-def normal_force(scene: HandScene, data: mujoco.MjData, finger: int) -> float:
+def normal_force(scene: model.Hand, data: mujoco.MjData, finger: int) -> float:
     """Between the ball and a fingertip, from MuJoCo's own list of contacts [N]."""
     total, force = 0.0, np.zeros(6)
     for i, contact in enumerate(data.contact):
@@ -79,31 +83,32 @@ def normal_force(scene: HandScene, data: mujoco.MjData, finger: int) -> float:
 
 
 def test_the_taxel_under_the_ball_feels_most(pressed: Trajectory) -> None:
-    for image, (finger, row, column) in zip(pressed.images, PLACES, strict=True):
-        grid = image[finger].reshape(6, 3)
+    for image, (finger, row, column) in zip(pressed.channels["tactile"], PLACES, strict=True):
+        grid = image[finger]
         assert grid.sum() > 0
         assert np.unravel_index(grid.argmax(), grid.shape) == (row, column)
         assert not np.delete(image, finger, axis=0).any()
 
 
-def test_the_last_rows_lie_where_a_bending_finger_closes(scene: HandScene, pressed: Trajectory) -> None:
-    data = mujoco.MjData(scene.model)
+def test_the_last_rows_lie_where_a_bending_finger_closes(task: FingerGait, pressed: Trajectory) -> None:
+    data = mujoco.MjData(task.model)
     last = {0: 2, 1: 5, 2: 7}  # a finger's last joint
-    for joints, (finger, row, _) in zip(pressed.joints, PLACES, strict=True):
+    for joints, (finger, row, _) in zip(pressed.channels["joints/position"], PLACES, strict=True):
         ends = []
         for bend in (0.0, 1e-4):
             data.qpos[:8] = joints
             data.qpos[last[finger]] += bend
-            mujoco.mj_kinematics(scene.model, data)
+            mujoco.mj_kinematics(task.model, data)
             ends.append(data.site(f"{FINGERS[finger]}_tip").xpos.copy())
         closing = data.site(f"{FINGERS[finger]}_tip").xmat.reshape(3, 3).T @ (ends[1] - ends[0])
         side = towards(PITCH[row], 0.0) @ closing
         assert (side > 0) == (row >= 2)  # the first two rows are on the back
 
 
-def test_the_picture_is_brightest_where_the_ball_presses(scene: HandScene, pressed: Trajectory, tmp_path: Path) -> None:
+def test_the_picture_is_brightest_where_the_ball_presses(task: FingerGait, pressed: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "pressed.rrd"
-    record_replay(path, run="pressed", scene=scene, config="# a ball", rollouts=[("pressed", pressed)])
+    scene, spec = Scene(task.model), task.spec()
+    record_replay(path, run="pressed", scene=scene, spec=spec, config="# a ball", rollouts=[("pressed", pressed)])
     formats, buffers, colours = {}, {}, {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
@@ -112,7 +117,7 @@ def test_the_picture_is_brightest_where_the_ball_presses(scene: HandScene, press
                 formats[chunk.entity_path] = batch.column(name).to_pylist()[0][0]
             if chunk.entity_path.startswith("/tactile/") and name.endswith("DepthImage:buffer"):
                 buffers[chunk.entity_path] = batch.column(name).to_pylist()
-            if chunk.entity_path.endswith("/taxels") and name.endswith("Points3D:colors") and not chunk.is_static:
+            if chunk.entity_path.endswith("_distal/tactile") and name.endswith("Points3D:colors") and not chunk.is_static:
                 colours[chunk.entity_path] = batch.column(name).to_pylist()
     for frame, (finger, row, column) in enumerate(PLACES):
         entity = f"/tactile/{FINGERS[finger]}"
@@ -120,6 +125,6 @@ def test_the_picture_is_brightest_where_the_ball_presses(scene: HandScene, press
         assert (height, width) == (6, 3)  # rows from the top, a row's pixels from the left
         pixels = np.array(buffers[entity][frame][0], np.uint8).view(np.float32).reshape(height, width)
         assert np.unravel_index(pixels.argmax(), pixels.shape) == (row, column)
-        np.testing.assert_array_equal(pixels.ravel(), pressed.images[frame, finger].astype(np.float32))
-        green = np.array(colours[f"/world/{FINGERS[finger]}_distal/taxels"][frame]) >> 16 & 255  # rises with the force
+        np.testing.assert_array_equal(pixels.ravel(), pressed.channels["tactile"][frame, finger].ravel().astype(np.float32))
+        green = np.array(colours[f"/world/{FINGERS[finger]}_distal/tactile"][frame]) >> 16 & 255  # rises with the force
         assert green[3 * row + column] == green.max()

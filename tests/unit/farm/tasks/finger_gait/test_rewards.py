@@ -8,9 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from farm.tasks.finger_gait.hand import LOWER, UPPER
-from farm.tasks.finger_gait.rewards import RETURN_FLOOR, REWARDS, TERMS, WEIGHTS, Demonstration, discounted, end
+from farm.tasks.finger_gait.rewards import RETURN_SCALE, REWARDS, TERMS, WEIGHTS, Demonstration, end
+from farm.tasks.loop import RETURN_FLOOR
+from farm.tasks.loop import discounted as _discounted
 
 STEPS = 15
+
+
+def discounted(terms, gamma, scale=RETURN_SCALE):
+    return _discounted(terms, gamma, scale)
 
 
 # ---------------------------------------------------------------- Table 3.1 and numbers by hand

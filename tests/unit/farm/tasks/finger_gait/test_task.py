@@ -1,7 +1,8 @@
 """The task: what counts as success, what is observed, what is perturbed, and which settings make sense."""
 
-import dataclasses
 import math
+from dataclasses import dataclass, fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from farm.errors import ConfigError
+from farm.tasks.base import Record
 from farm.tasks.finger_gait import touch as tactile
 from farm.tasks.finger_gait.hand import GRIPS, TIP_RADIUS
 from farm.tasks.finger_gait.rewards import Demonstration
@@ -20,15 +22,36 @@ from farm.tasks.finger_gait.task import (
     MAX_TURN,
     PRESSES,
     FingerGait,
-    Frames,
+    FingerGaitConfig,
     Perturbation,
-    TaskConfig,
     moved,
     touching,
 )
+from farm.tasks.loop import discounted
 
 STEPS = 15
 START = np.array([0.08, 0.04, 0.02, 1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass
+class Frames:
+    """Measured moments."""
+
+    qpos: np.ndarray
+    force: np.ndarray
+    place: np.ndarray
+
+    def dict(self) -> dict[str, np.ndarray]:
+        """As the loop has them."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+
+class Touched(FingerGait):
+    """Measures what a test gives it."""
+
+    def measure(self, sim):
+        """The test's own."""
+        return {"force": sim.force, "place": sim.place}
 
 
 def goal():
@@ -37,7 +60,9 @@ def goal():
 
 
 def task(**options):
-    return FingerGait(TaskConfig(**options), goal(), np.linspace(0.3, 1.0, 8))
+    made = Touched(FingerGaitConfig(**options))
+    made.goal, made.start_commands = goal(), np.linspace(0.3, 1.0, 8)
+    return made
 
 
 def frames(count=1, force=1.0, steps=STEPS):
@@ -48,11 +73,21 @@ def frames(count=1, force=1.0, steps=STEPS):
     return Frames(qpos, forces, place)
 
 
+def score(made, frames, actions, start, steps, failed):
+    start = np.concatenate([np.zeros((len(start), 8)), start], axis=1)
+    return made.score(Record(frames.dict(), {"qpos": start}, actions, steps, failed))
+
+
 def judged(frames, steps=STEPS, failed=False, **options):
     count = len(frames.qpos)
-    arrays = np.full(count, steps), np.full(count, failed)
     actions = np.zeros((count, frames.qpos.shape[1], 8))
-    return task(**options).judge(frames, actions, np.tile(START, (count, 1)), *arrays)
+    start = np.tile(START, (count, 1))
+    return score(task(**options), frames, actions, start, np.full(count, steps), np.full(count, failed))
+
+
+def observed(made, some, noise):
+    sim = SimpleNamespace(qpos=some.qpos, force=some.force, place=some.place, t=0, own={"noise": noise[:, None]})
+    return made.observe(sim)
 
 
 def turned(angle, axis=(0.0, 0.0, 1.0)):
@@ -122,8 +157,8 @@ def test_the_pose_is_compared_with_that_at_release():
     held = frames()
     held.qpos[..., 8:11] += 0.1
     held.qpos[..., 11:] = turned(1.0)
-    start = held.pose[:, 0]
-    outcome = task().judge(held, np.zeros((1, STEPS, 8)), start, np.array([STEPS]), np.array([False]))
+    start = held.qpos[:, 0, 8:]
+    outcome = score(task(), held, np.zeros((1, STEPS, 8)), start, np.array([STEPS]), np.array([False]))
     assert outcome.success[0]
     assert not judged(held).success[0]
 
@@ -133,19 +168,14 @@ def test_a_dropped_object_is_no_success(steps):
     held = frames()
     held.force[0, steps - 1] = 0.0
     outcome = judged(held, steps=steps)
-    assert outcome.dropped[0]
-    assert not outcome.failed[0]
     assert not outcome.success[0]
     assert outcome.terms[0, steps - 1, 4] == -400
-    assert outcome.steps[0] == steps
 
 
 @pytest.mark.parametrize("steps", [1, 15])
 @pytest.mark.parametrize("force", [0.0, 1.0])
-def test_a_failed_rollout_is_neither_dropped_nor_a_success(steps, force):
+def test_a_failed_rollout_gives_the_penalty_alone(steps, force):
     outcome = judged(frames(force=force), steps=steps, failed=True)
-    assert outcome.failed[0]
-    assert not outcome.dropped[0]
     assert not outcome.success[0]
     assert outcome.terms[0, steps - 1].tolist() == [0, 0, 0, 0, -400]
 
@@ -153,9 +183,7 @@ def test_a_failed_rollout_is_neither_dropped_nor_a_success(steps, force):
 def test_a_success_on_the_way_that_does_not_last_is_none():
     held = frames()
     held.force[0, 13:, 1] = 0.0
-    outcome = judged(held)
-    assert not outcome.success[0]
-    assert not outcome.dropped[0]
+    assert not judged(held).success[0]
 
 
 def test_success_is_judged_at_the_end_of_longer_rollouts_too():
@@ -172,20 +200,22 @@ def test_rollouts_of_a_batch_are_judged_apart():
     many.place[:] = rng.normal(size=many.place.shape) * TIP_RADIUS
     actions, failed = rng.normal(size=(6, STEPS, 8)), np.array([0, 0, 1, 0, 0, 1], dtype=bool)
     steps, start = np.array([15, 15, 4, 9, 15, 15]), np.tile(START, (6, 1))
-    together = task().judge(many, actions, start, steps, failed)
+    made = task()
+    together = score(made, many, actions, start, steps, failed)
     for i in range(6):
         row = slice(i, i + 1)
         own = Frames(many.qpos[row], many.force[row], many.place[row])
-        alone = task().judge(own, actions[row], start[row], steps[row], failed[row])
-        for field in dataclasses.fields(together):
-            assert getattr(together, field.name)[i].tobytes() == getattr(alone, field.name)[0].tobytes(), field.name
+        alone = score(made, own, actions[row], start[row], steps[row], failed[row])
+        assert together.terms[i].tobytes() == alone.terms[0].tobytes()
+        assert together.success[i] == alone.success[0]
 
 
 @pytest.mark.parametrize("action", [1e10, 1e200, np.inf, -np.inf, np.nan])
 def test_a_return_that_overflows_is_clamped(action):
-    outcome = task().judge(frames(), np.full((1, STEPS, 8), action), START[None], np.array([STEPS]), np.array([False]))
-    assert outcome.clamped[0]
-    assert outcome.returns[0] == -1e12
+    actions = np.full((1, STEPS, 8), action)
+    outcome = score(task(), frames(), actions, START[None], np.array([STEPS]), np.array([False]))
+    returns, clamped = discounted(outcome.terms, 0.95, 0.1)
+    assert (returns[0], clamped[0]) == (-1e12, True)
 
 
 # ---------------------------------------------------------------- touching and moving
@@ -232,21 +262,14 @@ def some_frames(count=4, seed=5):
     return Frames(rng.uniform(0, 1, (count, 15)), force, place)
 
 
-def test_frames_split_joints_and_pose():
-    some = some_frames()
-    assert some.joints.shape == (4, 8)
-    assert some.pose.shape == (4, 7)
-    np.testing.assert_array_equal(np.concatenate([some.joints, some.pose], axis=1), some.qpos)
-
-
 @pytest.mark.parametrize("state", ["joints", "joints+contacts", "tactile", "joints+tactile"])
 def test_observations_are_scaled_part_by_part(state):
     some = some_frames()
     noise = np.random.default_rng(1).normal(size=(4, 8))
-    scaled = task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0).observe(some, noise)
+    scaled = observed(task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0), some, noise)
     images = tactile.image(some.force, some.place)
     parts = {
-        "joints": 2.0 * (some.joints + noise),
+        "joints": 2.0 * (some.qpos[:, :8] + noise),
         "contacts": 3.0 * tactile.contact_points(images).reshape(4, 9),
         "tactile": 5.0 * images.reshape(4, 54),
     }
@@ -258,8 +281,8 @@ def test_noise_is_in_the_joint_readings_only(state):
     some = some_frames()
     before = some.qpos.copy()
     noise = np.random.default_rng(1).normal(size=(4, 8))
-    quiet, noisy = task(state=state).observe(some, None), task(state=state).observe(some, noise)
-    np.testing.assert_array_equal(task(state=state).observe(some, np.zeros((4, 8))), quiet)
+    made = task(state=state)
+    quiet, noisy = observed(made, some, np.zeros((4, 8))), observed(made, some, noise)
     count = 8 if state.startswith("joints") else 0
     np.testing.assert_array_equal(noisy[:, count:], quiet[:, count:])
     np.testing.assert_allclose(noisy[:, :count] - quiet[:, :count], noise[:, :count], atol=1e-15)
@@ -270,10 +293,11 @@ def test_noise_is_in_the_joint_readings_only(state):
 def test_observations_of_a_batch_equal_one_by_one_bit_for_bit(state):
     some = some_frames(32)
     noise = np.random.default_rng(1).normal(size=(32, 8))
-    x = task(state=state, tactile_scale=0.3).observe(some, noise)
+    made = task(state=state, tactile_scale=0.3)
+    x = observed(made, some, noise)
     for i in range(32):
         own = Frames(some.qpos[i : i + 1], some.force[i : i + 1], some.place[i : i + 1])
-        alone = task(state=state, tactile_scale=0.3).observe(own, noise[i : i + 1])
+        alone = observed(made, own, noise[i : i + 1])
         assert alone[0].tobytes() == x[i].tobytes()
 
 
@@ -298,7 +322,7 @@ def test_the_numbers_drawn_for_a_seed_never_change():
 
 def test_the_same_seed_draws_the_same():
     one, two, other = (Perturbation.draw(np.random.default_rng(seed), STEPS) for seed in ([1, 2], [1, 2], [1, 3]))
-    for field in dataclasses.fields(Perturbation):
+    for field in fields(Perturbation):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
         assert np.any(getattr(one, field.name) != getattr(other, field.name))
 
@@ -313,8 +337,8 @@ def test_the_order_of_draws_is_friction_mass_displacement_noise(steps):
         rng.normal(0, 0.01, (steps, 8)),
     )
     drawn = Perturbation.draw(np.random.default_rng(4), steps)
-    for value, wanted in zip(dataclasses.astuple(drawn), expected, strict=True):
-        np.testing.assert_array_equal(value, wanted)
+    for name, wanted in zip(("friction", "mass", "displacement", "noise"), expected, strict=True):
+        np.testing.assert_array_equal(getattr(drawn, name), wanted)
 
 
 def test_draws_fill_their_ranges():
@@ -347,7 +371,7 @@ UNKNOWN = {
 @pytest.mark.parametrize("field", UNKNOWN)
 def test_an_unknown_name_answers_with_the_known_ones(field):
     with pytest.raises(ConfigError, match=f"unknown .*'nothing'; known are {UNKNOWN[field]}"):
-        TaskConfig(**{field: "nothing"})
+        FingerGaitConfig(**{field: "nothing"})
 
 
 @pytest.mark.parametrize(
@@ -361,19 +385,19 @@ def test_an_unknown_name_answers_with_the_known_ones(field):
     ],
 )
 def test_a_number_out_of_range_is_named(field, value):
-    with pytest.raises(ConfigError, match=f"^{field} is {value}; expected"):
-        TaskConfig(**{field: value})
+    with pytest.raises(ConfigError, match=f"^{field.replace('_', '-')} is {value}; expected"):
+        FingerGaitConfig(**{field: value})
 
 
 @pytest.mark.parametrize(("field", "value"), [("steps", 3), ("steps", 1000), ("gamma", 1.0), ("gamma", 1e-9)])
 def test_a_number_at_the_edge_is_taken(field, value):
-    assert getattr(TaskConfig(**{field: value}), field) == value
+    assert getattr(FingerGaitConfig(**{field: value}), field) == value
 
 
 def test_the_defaults_are_those_of_the_thesis():
-    config = TaskConfig()
+    config = FingerGaitConfig()
     assert (config.object, config.start_grip, config.goal_grip) == ("bar", "index+thumb", "index+middle+thumb")
     assert (config.state, config.reward, config.weights) == ("joints", "full", "projected")
-    assert (config.task, config.steps, config.gamma, config.perturb) == ("finger-gait", 15, 0.95, False)
-    assert TaskConfig(steps=0) == config
+    assert (FingerGait(config).steps, config.gamma, config.perturb) == (15, 0.95, False)
+    assert (config.action, config.clip) == ("offset", True)
     assert config.joints_scale == config.contacts_scale == config.tactile_scale == 1.0
