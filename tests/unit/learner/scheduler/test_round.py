@@ -55,7 +55,9 @@ def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: 
         place = round_.place(sent)
         assert place is not None
         if done & set(some):  # what came before stays, whatever this message says
-            sent = replace(sent, returns=np.where(np.isin(place.rows, list(_rows(done, round_))), -7.0, sent.returns))
+            returns = np.where(np.isin(place.rows, list(_rows(done, round_))), -7.0, sent.returns)
+            shown = tuple(replace(t, value=-7.0) if int(t.value) in done else t for t in sent.trajectories)
+            sent = replace(sent, returns=returns, trajectories=shown)
         round_.put(sent, place, np.array([index not in done for index in sent.jobs.tolist()]))
         done.update(some)
     assert round_.returns.tolist() == [*RETURNS, 9.0, 9.0]
