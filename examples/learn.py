@@ -2,30 +2,26 @@
 
     python examples/learn.py [--generations 60] [--out runs/example]
 
-Any setting of `farm run` is a field of RunConfig or of one of its three parts.
+Any setting of `farm run` can be given by its name.
 """
 
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
-from farm.errors import FarmError
-from learner.config import RunConfig
-from learner.run import learn
+import farm
 
 
 def main() -> None:
-    """Learn, and print a line a generation."""
+    """Learn, and print a line per generation."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--generations", type=int, default=60)
     parser.add_argument("--out", type=Path, default=Path("runs/example"))
     arguments = parser.parse_args()
 
-    config = RunConfig(seed=3, generations=arguments.generations)
-    config = replace(config, algorithm=replace(config.algorithm, pairs=20))
-    for report in learn(config, arguments.out, workers=2):
+    config = farm.configure("finger-gait", seed=3, generations=arguments.generations, pairs=20)
+    for report in farm.learn(config, arguments.out, workers=2):
         p = report.progress
         print(f"{p.generation:4d}  mean policy {p.mean_policy_return:8.3f}  success {p.success_rate:4.0%}")
 
@@ -36,5 +32,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except FarmError as error:
+    except farm.FarmError as error:
         sys.exit(f"learn.py: {error}")

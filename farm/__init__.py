@@ -3,7 +3,6 @@
 The public names; each is loaded when it is used.
 """
 
-import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 __version__ = "0.3.0.dev0"
@@ -46,7 +45,9 @@ __all__ = ["__version__", *_WHERE]
 def __getattr__(name: str) -> Any:  # noqa: ANN401  whatever it is
     if name not in _WHERE:
         raise AttributeError(f"module 'farm' has no attribute {name!r}")
-    return getattr(importlib.import_module(_WHERE[name]), name)
+    from farm.plugins import load
+
+    return getattr(load(_WHERE[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -286,9 +286,29 @@ def _release(point: EntryPoint) -> str:
     return f"{point.dist.name} {point.dist.version}" if point.dist else "an installed package"
 
 
+def load(module: str) -> Any:  # noqa: ANN401  a module
+    """Import a module of ours, also where a folder of the user's own is called `learner` or `workers`.
+
+    Raises:
+      ConfigError: a module of that name, which is not ours, has been imported before.
+    """
+    package = module.partition(".")[0]
+    init = Path(__file__).parent.parent / package / "__init__.py"
+    known = sys.modules.get(package)
+    if known is None and package != "farm" and init.exists():
+        spec = importlib.util.spec_from_file_location(package, init, submodule_search_locations=[str(init.parent)])
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[package] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[package])
+    elif init.exists() and Path(str(getattr(known, "__file__", None) or "")) != init:
+        raise ConfigError(f"a module named {package!r} that is not rolloutfarm's is loaded: import farm before it")
+    return importlib.import_module(module)
+
+
 def _import(module: str, kind: str, name: str) -> Any:  # noqa: ANN401  a module
     try:
-        return importlib.import_module(module)
+        return load(module)
     except ImportError as error:
         raise ConfigError(f"{_one(kind)} {name!r} cannot be imported: {error}") from error
 

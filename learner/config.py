@@ -56,6 +56,9 @@ class RunConfig(Settings):
 
     def __post_init__(self) -> None:
         """Fill in what is left out, and check every value."""
+        for part, kind in _PARTS.items():
+            if name := getattr(self, part):
+                object.__setattr__(self, part, plugin_path(kind, name))
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()

@@ -17,7 +17,14 @@ FLOORS = {
     "farm/sim/": ("farm.arrays", "farm.errors", "farm.sim"),
     "farm/net/": ("farm.arrays", "farm.errors", "farm.net", "farm.sim.trajectory"),
     "farm/tasks/base.py": ("farm.arrays", "farm.errors", "farm.settings", "farm.sim", "farm.tasks.loop"),
-    "farm/policies/": ("farm.arrays", "farm.errors", "farm.settings", "farm.elementary", "farm.tasks.base", "farm.policies"),
+    "farm/policies/": (
+        "farm.arrays",
+        "farm.errors",
+        "farm.settings",
+        "farm.elementary",
+        "farm.tasks.base",
+        "farm.policies",
+    ),
 }
 """Parts of farm/ that may import only some of it."""
 
@@ -38,7 +45,14 @@ DOORS = {
 """The only modules that may import a package from outside."""
 
 PURE = (
-    *("farm/arrays.py", "farm/errors.py", "farm/elementary.py", "farm/seeds.py", "farm/net/keys.py", "farm/net/work.py"),
+    *(
+        "farm/arrays.py",
+        "farm/errors.py",
+        "farm/elementary.py",
+        "farm/seeds.py",
+        "farm/net/keys.py",
+        "farm/net/work.py",
+    ),
     *("farm/net/messages.py", "farm/net/stats.py", "farm/sim/channels.py", "farm/sim/trajectory.py", "farm/policies/"),
     *(f"farm/tasks/finger_gait/{name}.py" for name in ("hand", "observations", "rewards", "touch")),
     *("learner/algorithms/", "learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
@@ -107,7 +121,7 @@ def test_nothing_outside_the_finger_gait_knows_fingers() -> None:
             continue
         names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-        for name in names:
+        for name in names - {"RIGHT_HAND_Z_UP"}:  # Rerun's
             assert not FINGERS.search(name.replace("_", " ")), f"{module}: {name}"
 
 

@@ -1,137 +1,128 @@
-"""What docs/extending.md tells to add, added to a copy of the project, and learnt with."""
+"""The examples of docs/extending.md, run from a folder of their own as a reader would."""
 
 import json
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from learner.commands import new_task
+
 ROOT = Path(__file__).parent.parent
-SECTIONS = {
-    part.partition("\n")[0]: part
-    for part in re.split(r"^## ", (ROOT / "docs/extending.md").read_text("utf-8"), flags=re.M)
-}
-_PLACE = re.compile(r"^(New file|Add to) `(.+?)`:$")
-_BLOCK = re.compile(r"^```(python|diff)$")
+PAGE = (ROOT / "docs/extending.md").read_text("utf-8")
+SECTIONS = {part.partition("\n")[0]: part for part in re.split(r"^## ", PAGE, flags=re.M)}
+_FILE = re.compile(r"`(\w+\.(?:py|toml))`[^`]*?:\n\n```(?:python|toml)\n(.*?)```", re.S)
 
 
-def extended(section: str, folder: Path) -> None:
-    """Copy the project and put a section's blocks into it."""
-    for package in ("farm", "workers", "learner", "assets"):
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    path, lines = folder, iter(SECTIONS[section].splitlines())
-    for line in lines:
-        if place := _PLACE.match(line):
-            path = folder / place[2]
-            assert path.exists() == (place[1] == "Add to"), line
-        elif kind := _BLOCK.match(line):
-            block = [text for text in iter(lines.__next__, "```")]
-            path.write_text(changed(path.read_text("utf-8"), block) if kind[1] == "diff" else "\n".join(block) + "\n")
+def files(section: str) -> dict[str, str]:
+    """The files that a section tells to write."""
+    return dict(_FILE.findall(SECTIONS[section]))
 
 
-def changed(text: str, block: list[str]) -> str:
-    """Replace what a block has without + by what it has without -; it must be there once."""
-    before, after = ("".join(line[1:] + "\n" for line in block if not line.startswith(other)) for other in ("+", "-"))
-    assert text.count("\n" + before) == 1, before
-    return text.replace("\n" + before, "\n" + after)
+def commands(section: str, *names: str) -> list[list[str]]:
+    """Its commands, in order."""
+    lines = re.findall(r"^    (farm .*)$", SECTIONS[section], re.M)
+    return [shlex.split(line)[1:] for line in lines if line.split()[1] in names]
 
 
-class Copy:
-    """An extended copy, and what its commands did."""
+def farm(folder: Path, *words: str, status: int = 0) -> str:
+    command = [sys.executable, "-P", "-m", "farm", *words]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=170, check=False)
+    assert ended.returncode == status, ended.stderr
+    return ended.stdout + ended.stderr
 
-    def __init__(self, section: str, folder: Path) -> None:
-        extended(section, folder)
-        self.folder = folder
-        [command] = re.findall(r"^    (farm run .*)$", SECTIONS[section], re.M)
-        self.words = shlex.split(command)[1:]
-        self.name = self.words[self.words.index("--name") + 1]
 
-    def farm(self, *words: str) -> str:
-        command = [sys.executable, "-m", "farm", *words]  # the folder comes before what is installed
-        ended = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=120, check=False)
+def write(folder: Path, *sections: str) -> None:
+    for section in sections:
+        for name, text in files(section).items():
+            (folder / name).write_text(text)
+
+
+def summary(folder: Path, name: str) -> dict[str, object]:
+    return json.loads((folder / "runs" / name / "summary.json").read_text())
+
+
+TASK = "A task in a file"
+
+
+def test_the_page_shows_the_file_that_new_task_writes() -> None:
+    text = (Path(new_task.__file__).with_name(new_task.TEMPLATE)).read_text("utf-8")
+    assert files(TASK)["pendulum.py"] == text
+    assert len(text.splitlines()) <= 31
+
+
+def test_every_section_has_its_example() -> None:
+    wanted = {"A policy": "linear.py", "An algorithm": "elite.py", "A backend": "threads.py", "A channel": "swing.py"}
+    for section, name in wanted.items():
+        assert list(files(section)) == [name]
+        assert commands(section, "run")
+
+
+@pytest.mark.slow
+def test_a_task_in_a_file(tmp_path: Path) -> None:
+    assert "farm check pendulum.py:Pendulum" in farm(tmp_path, "new-task", "pendulum")
+    said = farm(tmp_path, *commands(TASK, "check")[0])
+    assert "same bits together, in another order, and one by one" in said
+    [learn] = commands(TASK, "run")
+    farm(tmp_path, *learn)
+    learnt = summary(tmp_path, "first")
+    assert learnt["state"] == "finished"
+    assert learnt["mean_policy_return"] > 50, "swung up; hanging is -100"
+    assert (tmp_path / "runs/first/run.rrd").stat().st_size > 50_000
+    farm(tmp_path, "run", "--config", "runs/first/config.json", "--name", "again", "--workers", "1", "--no-record")
+    assert summary(tmp_path, "again")["parameters_sha256"] == learnt["parameters_sha256"]
+    assert f"return {learnt['mean_policy_return']:.3f}" in farm(tmp_path, *commands(TASK, "replay")[0])
+    text = (tmp_path / "pendulum.py").read_text()
+    (tmp_path / "pendulum.py").write_text(text.replace("np.cos(sim.qpos[:, 0])", "2 * np.cos(sim.qpos[:, 0])"))
+    said = farm(tmp_path, "run", "--resume", "runs/first", "--generations", "90", status=2)
+    assert "the code of its task has changed since the run began" in said
+
+
+@pytest.mark.slow
+def test_a_policy_an_algorithm_a_backend_and_a_channel(tmp_path: Path) -> None:
+    write(tmp_path, TASK, "A policy", "An algorithm", "A backend", "A channel")
+    for section in ("A policy", "An algorithm", "A backend", "A channel"):
+        for words in commands(section, "run"):
+            farm(tmp_path, *words, *([] if section == "A channel" else ["--no-record"]))
+    assert summary(tmp_path, "linear")["rollouts"] == 300
+    assert summary(tmp_path, "elite")["generations"] == 8
+    farm(tmp_path, "run", "--task", "pendulum.py:Pendulum", "--generations", "2", "--name", "plain", "--no-record")
+    same = [summary(tmp_path, name)["parameters_sha256"] for name in ("threads", "plain")]
+    assert same[0] == same[1]
+    from recordings import read
+
+    entities = read(tmp_path / "runs/swing/run.rrd")
+    assert {"/energy", "/world/torque", "/traces/best"} <= set(entities)
+
+
+@pytest.mark.slow
+def test_a_task_in_a_package(tmp_path: Path) -> None:
+    write(tmp_path, "A task in a package")
+    (tmp_path / "swings.py").write_text(files(TASK)["pendulum.py"])
+    (tmp_path / "pyproject.toml").write_text((tmp_path / "pyproject.toml").read_text())
+    site = tmp_path / "site"
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, "."]
+    quiet = ["--disable-pip-version-check", "--no-build-isolation"]
+    subprocess.run([*install, *quiet], cwd=tmp_path, check=True, timeout=170)
+    code = (
+        f"import sys; sys.path.insert(0, {str(site)!r}); from farm.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+
+    def call(*words: str) -> str:
+        command = [sys.executable, "-P", "-c", code, *words]
+        environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin"}
+        ended = subprocess.run(
+            command, cwd=elsewhere, capture_output=True, text=True, env=environment, timeout=120, check=False
+        )
         assert ended.returncode == 0, ended.stderr
         return ended.stdout
 
-    def learnt(self) -> dict[str, Any]:
-        """The documented command's summary, after it was repeated by one worker with the same result."""
-        self.farm(*self.words)
-        self.farm(
-            "run", "--config", f"runs/{self.name}/config.json", "--name", "again", "--workers", "1", "--no-record"
-        )
-        first, again = self.summary(self.name), self.summary("again")
-        assert first["state"] == "finished"
-        assert (self.folder / "runs" / self.name / "run.rrd").stat().st_size > 10_000
-        assert first["parameters_sha256"] == again["parameters_sha256"]
-        return first
-
-    def summary(self, run: str) -> dict[str, Any]:
-        return json.loads((self.folder / "runs" / run / "summary.json").read_text())
-
-    def parameters(self) -> int:
-        content = (self.folder / "runs" / self.name / "parameters").read_bytes()
-        return json.loads(content.partition(b"\n")[0])["parameters"]
-
-
-@pytest.fixture
-def copy(request: pytest.FixtureRequest, tmp_path: Path) -> Copy:
-    return Copy(request.param, tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("copy", ["A state base"], indirect=True)
-def test_state_base(copy: Copy) -> None:
-    copy.learnt()
-    assert copy.parameters() == 8 * 11
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("copy", ["A reward"], indirect=True)
-def test_reward(copy: Copy) -> None:
-    firm = copy.learnt()
-    copy.farm("run", "--config", "runs/firm/config.json", "--reward", "full", "--name", "full", "--no-record")
-    assert firm["best_return"] < copy.summary("full")["best_return"], "it takes something off"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("copy", ["An algorithm"], indirect=True)
-def test_algorithm(copy: Copy) -> None:
-    summary = copy.learnt()
-    assert summary["rollouts"] == 3 * 12
-    config = json.loads((copy.folder / "runs/elite/config.json").read_text())
-    assert config["algorithm"] == {
-        "name": "cross-entropy", "rollouts": 12, "elite": 4, "initial_mu": 1.75, "initial_sigma": 0.8,
-        "sigma_floor": 0.05,
-    }  # fmt: skip
-    assert "--elite INT" in copy.farm("run", "--algorithm", "cross-entropy", "--help")
-    copy.farm("run", "--resume", "runs/elite", "--generations", "4", "--quiet")
-    copy.farm("run", "--config", "runs/elite/config.json", "--name", "whole", "--no-record")
-    assert copy.summary("elite")["parameters_sha256"] == copy.summary("whole")["parameters_sha256"]
-    copy.farm("run", "--generations", "1", "--pairs", "6", "--name", "other", "--no-record")
-    copy.farm("compare", "runs/elite", "runs/other")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("copy", ["A task"], indirect=True)
-def test_task(copy: Copy) -> None:
-    summary = copy.learnt()
-    lines = (copy.folder / "runs/upright/progress.jsonl").read_text().splitlines()
-    first = json.loads(lines[0])["mean_policy_return"]
-    assert first < 5, "it falls and hangs"
-    assert summary["mean_policy_return"] > 15, "of 19 for 3 s upright"
-    assert summary["mean_policy_success"] is None
-    assert f"return {summary['mean_policy_return']:.3f}" in copy.farm("replay", "runs/upright")
-    copy.farm("evaluate", "runs/upright", "--rollouts", "5")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("copy", ["A worker backend"], indirect=True)
-def test_backend(copy: Copy) -> None:
-    summary = copy.learnt()  # repeated by the backend cpu
-    assert summary["workers"] == 2
-    log = (copy.folder / "runs/plain/log.txt").read_text()
-    assert "failed" not in log
+    assert re.search(r"--task +pendulum +swings 1\.0", call("tasks"))
+    [learn] = commands("A task in a package", "run")
+    call(*learn, "--no-record", "--name", "packaged")
+    assert summary(elsewhere, "packaged")["state"] == "finished"

@@ -1,13 +1,10 @@
-"""Learning algorithms: pure ask and tell on frozen states, by name.
-
-A new one is a module beside `pgpe` and one line in ALGORITHMS (docs/extending.md has one).
-"""
+"""Learning algorithms: pure ask and tell on frozen states."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import Field
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -15,7 +12,7 @@ from farm.arrays import FloatArray
 from learner.algorithms.pgpe import PGPE, PGPEState
 from learner.algorithms.state import Diverged, SearchState, StateValue
 
-__all__ = ["ALGORITHMS", "PGPE", "Algorithm", "Diverged", "PGPEState", "SearchState", "name_of"]
+__all__ = ["PGPE", "Algorithm", "Diverged", "PGPEState", "SearchState"]
 
 State = TypeVar("State", bound=SearchState)
 
@@ -49,14 +46,3 @@ class Algorithm(Protocol[State]):
     def tell(self, state: State, eps: FloatArray, returns: FloatArray) -> State:
         """Return the state after one update, from returns (rows, signs); Diverged when it would not be finite."""
         ...
-
-
-ALGORITHMS: Final[dict[str, type[Algorithm[Any]]]] = {
-    "pgpe": PGPE,
-}
-"""Algorithms by the name that --algorithm and config.json give them."""
-
-
-def name_of(algorithm: Algorithm[Any]) -> str:
-    """The name of an algorithm that is in ALGORITHMS."""
-    return next(name for name, kind in ALGORITHMS.items() if type(algorithm) is kind)

@@ -71,14 +71,14 @@ def main(words: Sequence[str]) -> int:
     task.setup(Sim(DataEngine(task.model)))
     with stop_flag("ending") as stop:
         played = watch(
-            copy.copy(task.model), _rollout(policy), stop.wait, _say, camera=task.camera, speed=command.speed,
+            copy.copy(task.model), rollout(policy), stop.wait, _say, camera=task.camera, speed=command.speed,
             hold=command.hold,
         )  # fmt: skip
     _say(f"{played} control steps played")
     return INTERRUPTED if stop.is_set() else 0
 
 
-def _rollout(policy: "LoadedPolicy") -> Callable[[Sim], int]:
+def rollout(policy: "LoadedPolicy") -> Callable[[Sim], int]:
     """One nominal rollout in a simulation that is shown; control steps that it lasted."""
     found = policy.problem
     prepared = found.policy.prepare(policy.mu[None])

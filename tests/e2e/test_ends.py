@@ -13,6 +13,8 @@ from processes import SMALL, Farm, children
 
 from learner.run import free_endpoint
 
+pytestmark = pytest.mark.slow
+
 SOON = 10.0
 """Generous, for a machine that has other things to do [s]; 2 is what is wanted."""
 
@@ -99,7 +101,7 @@ def test_workers_do_not_outlive_a_run_that_is_killed(farm: Farm) -> None:
 
 
 def test_a_run_that_diverges(farm: Farm) -> None:
-    rate = ("--controller", "direct", "--features", "5", "--learning-rate-mu", "1e308")
+    rate = ("--policy", "direct", "--features", "5", "--learning-rate-mu", "1e308")
     said = farm.call("run", "--name", "r", "--generations", "50", *rate, *SMALL, status=1)
     (line,) = [line for line in said.splitlines() if line.startswith("farm: ")]
     assert line.startswith("farm: the run diverged: the update after generation ")

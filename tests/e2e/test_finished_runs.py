@@ -19,15 +19,16 @@ from processes import Farm
 from recordings import read
 from rerun.chunk import RrdReader
 
-import assets
+from farm.__main__ import main
 from farm.errors import ConfigError
-from farm.policies.fourier import CONTROLLERS
 from farm.sim import video
-from farm.sim.rendering import lit
-from farm.sim.viewer import Player
+from farm.sim.engines import DataEngine
+from farm.sim.sim import Sim
+from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.observations import STATES
 from learner import export
-from learner.replay import Conditions, again, stored
+from learner.commands.play import rollout
+from learner.replay import LoadedPolicy, Replay, load
 from learner.run_folder import RunFolder
 
 GENERATIONS = 6
@@ -49,42 +50,44 @@ def folder(farm: Farm, name: str = "a") -> RunFolder:
     return RunFolder.open(farm.folder / "runs" / name)
 
 
+def stored(farm: Farm, name: str = "a", generation: int | None = None, **changed: object) -> LoadedPolicy:
+    return load(folder(farm, name).path, generation, **changed)
+
+
+def again(farm: Farm, name: str = "a", generation: int | None = None, **changed: object) -> Replay:
+    return stored(farm, name, generation, **changed).rollout()
+
+
 # ---------------------------------------------------------------- replay
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_the_last_policy_gives_the_runs_own_return(done: Farm, name: str) -> None:
-    assert again(folder(done, name)).trajectory.value == done.summary(name)["mean_policy_return"]
+    assert again(done, name).trajectory.value == done.summary(name)["mean_policy_return"]
 
 
 def test_earlier_policies_give_what_their_generation_said(done: Farm) -> None:
     # A line of progress.jsonl has the return of the mean that was explored around: that of the generation before.
     for line in done.progress("a"):
-        shown = again(folder(done), generation=line["generation"] - 1)
+        shown = again(done, generation=line["generation"] - 1)
         assert shown.trajectory.value == line["mean_policy_return"]
         assert shown.trajectory.success == line["mean_policy_success"]
 
 
 def test_friction_changes_the_rollout_and_a_factor_of_one_does_not(done: Farm) -> None:
-    nominal = again(folder(done))
-    assert again(folder(done), Conditions(friction=1.0)).trajectory.value == nominal.trajectory.value
-    slippery = again(folder(done), Conditions(friction=0.05))
-    assert slippery.trajectory.value != nominal.trajectory.value
+    nominal = again(done)
+    assert again(done, friction=1.0).trajectory.value == nominal.trajectory.value
+    assert again(done, friction=0.05).trajectory.value != nominal.trajectory.value
 
 
-def test_another_object(done: Farm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = assets.path("objects/bar.xml").read_text()
+def test_another_object(done: Farm, tmp_path: Path) -> None:
+    text = (model.folder() / "objects/bar.xml").read_text()
     (tmp_path / "thick.xml").write_text(text.replace('size="0.011 0.06 0.011"', 'size="0.015 0.045 0.015"'))
     (tmp_path / "cannonball.xml").write_text(text.replace('mass="0.05"', 'mass="50"'))
-    real, known = assets.path, assets.objects()
-    own = {f"objects/{name}.xml": tmp_path / f"{name}.xml" for name in ("thick", "cannonball")}
-    monkeypatch.setattr(assets, "objects", lambda: [*known, "thick", "cannonball"])
-    monkeypatch.setattr(assets, "path", lambda name: own.get(name) or real(name))
-    shown = again(folder(done), Conditions(object="thick"))
-    assert shown.stored.simulation.scene.object_name == "thick"
-    assert shown.trajectory.value != again(folder(done)).trajectory.value
-    with pytest.raises(ConfigError, match="grip 'index\\+thumb' does not hold object 'cannonball'"):
-        again(folder(done), Conditions(object="cannonball"))
+    shown = again(done, object=str(tmp_path / "thick.xml"))
+    assert shown.trajectory.value != again(done).trajectory.value
+    with pytest.raises(ConfigError, match=r"grip 'index\+thumb' does not hold object '.*cannonball.xml'"):
+        again(done, object=str(tmp_path / "cannonball.xml"))
 
 
 def test_a_policy_that_is_not_stored(done: Farm, tmp_path: Path) -> None:
@@ -98,8 +101,8 @@ def test_a_policy_that_is_not_stored(done: Farm, tmp_path: Path) -> None:
     assert "generation 3 is not stored" in said
     assert "2 from 2 to 4 are, the nearest is 2" in said
     assert len(said.splitlines()) == 1
-    assert stored(RunFolder.open(copy), 6).generation == 6  # the checkpoint's is always there
-    assert np.array_equal(stored(RunFolder.open(copy), 4).mu, stored(folder(done), 4).mu)
+    assert load(copy, 6).generation == 6  # the checkpoint's is always there
+    assert np.array_equal(load(copy, 4).mu, stored(done, generation=4).mu)
 
 
 def test_a_replay_says_what_it_shows(done: Farm, tmp_path: Path) -> None:
@@ -107,7 +110,7 @@ def test_a_replay_says_what_it_shows(done: Farm, tmp_path: Path) -> None:
     done.call("replay", "runs/a", "--generation", "2", "--friction", "0.5", "--to", str(path))
     (batch,) = read(path)["/rollout"]
     (name,) = [n for n in batch.schema.names if n.endswith(":text")]
-    assert "mean policy after generation 2, friction times 0.5" in batch.column(name).to_pylist()[0][0]
+    assert "mean policy after generation 2, friction 0.5" in batch.column(name).to_pylist()[0][0]
 
 
 # ---------------------------------------------------------------- video
@@ -129,6 +132,7 @@ def test_moments_last_as_long_as_they_should() -> None:
 
 
 @needs_drawing
+@pytest.mark.slow
 def test_a_gif(done: Farm, tmp_path: Path) -> None:
     from PIL import Image
 
@@ -160,6 +164,7 @@ def test_nothing_to_draw_with(done: Farm, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @needs_drawing
+@pytest.mark.slow
 def test_an_mp4(done: Farm, tmp_path: Path) -> None:
     import imageio_ffmpeg
 
@@ -188,11 +193,11 @@ def test_a_comparison_holds_each_runs_numbers(done: Farm) -> None:
         assert batch.column("generation").cast("int64").to_pylist() == [p["generation"] for p in lines]
         assert batch.column("rollouts").cast("int64").to_pylist() == [p["rollouts"] for p in lines]
         frames = sum(b.num_rows for b in entities[f"/runs/{name}/world/object"] if "sim_time" in b.schema.names)
-        assert frames == len(again(folder(done, name)).trajectory.times)
+        assert frames == len(again(done, name).trajectory.times)
     (batch,) = entities["/table"]
     (column,) = [n for n in batch.schema.names if n.endswith(":text")]
     table = batch.column(column).to_pylist()[0][0]
-    assert "| controller | kernel | projected |" in table
+    assert "| policy | kernel | projected |" in table
     assert "| seed | 0 | 5 |" in table
     assert (
         f"| hash | {done.summary('a')['parameters_sha256'][:8]} | {done.summary('b')['parameters_sha256'][:8]}" in table
@@ -208,7 +213,7 @@ def test_a_recording_has_its_runs_properties(done: Farm) -> None:
                     found[f"{entity.rpartition('/')[2]} {name.rpartition(':')[2]}"] = batch.column(name).to_pylist()[0]
     summary = done.summary("a")
     assert found["run seed"] == [0]
-    assert found["run controller"] == ["kernel"]
+    assert found["run policy"] == ["kernel"]
     assert found["run preset"] == ["own"]
     assert found["result return"] == [summary["mean_policy_return"]]
     assert found["result success"] == [summary["mean_policy_success"]]
@@ -259,7 +264,7 @@ def bare(farm: Farm, path: Path) -> str:
     """What the example says in an interpreter where importing any of this project raises."""
     code = (
         "import runpy, sys\n"
-        "for package in ('farm', 'learner', 'workers', 'assets'): sys.modules[package] = None\n"
+        "for package in ('farm', 'learner', 'workers'): sys.modules[package] = None\n"
         f"sys.path.append({str(Path(mujoco.__file__).parents[1])!r})\n"
         f"sys.argv = ['play_policy.py', {str(path)!r}]\n"
         f"runpy.run_path({str(PLAY_POLICY)!r}, run_name='__main__')\n"
@@ -280,16 +285,17 @@ def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, na
     said = done.call("export", f"runs/{name}", str(path))
     assert f"written to {path}" in said
     with np.load(path, allow_pickle=False) as file:
-        assert file["mu"].tobytes() == stored(folder(done, name)).mu.tobytes()
+        assert file["mu"].tobytes() == stored(done, name).mu.tobytes()
         assert "file=" not in str(file["mjcf"])
     assert returned(bare(done, path)) == done.summary(name)["mean_policy_return"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("controller", CONTROLLERS)
-def test_every_controller_and_state_can_be_exported(farm: Farm, controller: str, state: str) -> None:
-    settings = ("--controller", controller, "--state", state, "--features", "40", "--initial-sigma", "0.3")
+@pytest.mark.parametrize("policy", ["direct", "projected", "kernel", "cosine"])
+def test_every_policy_and_state_can_be_exported(farm: Farm, policy: str, state: str) -> None:
+    settings = ("--policy", policy, "--state", state, "--initial-sigma", "0.3")
+    settings += () if policy == "kernel" else ("--features", "40")
     farm.call("run", "--name", "r", "--pairs", "3", "--generations", "2", "--no-record", *settings)
     farm.call("export", "runs/r", "p.npz")
     assert returned(bare(farm, farm.folder / "p.npz")) == farm.summary("r")["mean_policy_return"]
@@ -302,8 +308,8 @@ def test_every_controller_and_state_can_be_exported(farm: Farm, controller: str,
         ("--action", "increment", "--no-clip"),
         ("--action", "absolute", "--reward", "basic"),
         ("--state", "joints+contacts", "--contacts-scale", "0.5", "--joints-scale", "2", "--weights", "direct"),
-        ("--controller", "direct", "--features", "20", "--initial-mu", "3", "--initial-sigma", "0.1"),  # drops it
-        ("--controller", "direct", "--features", "20", "--reward", "limited", "--return-scale", "0.3"),
+        ("--policy", "direct", "--features", "20", "--initial-mu", "3", "--initial-sigma", "0.1"),  # drops it
+        ("--policy", "direct", "--features", "20", "--reward", "limited", "--return-scale", "0.3"),
     ],
     ids=" ".join,
 )
@@ -330,29 +336,22 @@ def test_an_exported_policy_in_an_environment_of_its_own(done: Farm, tmp_path: P
 # ---------------------------------------------------------------- play
 
 
-def player(farm: Farm) -> Player:
-    policy = stored(folder(farm))
-    simulation = policy.simulation
-    start = simulation.start
-    return Player(lit("bar"), simulation.task, simulation.policy, policy.mu, start.rows[0], start.frames.at([0]))
-
-
 def test_what_is_played_is_the_replay_bit_for_bit(done: Farm) -> None:
-    shown, playing = again(folder(done)), player(done)
-    data = mujoco.MjData(playing.scene.model)
-    seen = [playing.start]
+    policy, shown = stored(done), again(done)
+    task, seen = policy.problem.task, [shown.frames["qpos"][0]]
+    engine = DataEngine(task.model)
+    task.setup(Sim(engine))
 
     def step() -> bool:
-        mujoco.mj_step(playing.scene.model, data)
-        seen.append(playing.scene.measure(data))
+        mujoco.mj_step(task.model, engine.data)
+        seen.append(engine.data.qpos.copy())
         return True
 
+    engine.pace = step
     for _ in range(2):  # nothing of one rollout is left in the next
         del seen[1:]
-        assert playing.rollout(data, step) == shown.rollouts.outcome.steps[0]
-        for name in ("qpos", "force", "place"):
-            rows = np.concatenate([getattr(frames, name) for frames in seen])
-            assert rows.tobytes() == getattr(shown.frames, name).tobytes(), name
+        assert rollout(policy)(Sim(engine)) == shown.rollouts.steps[0]
+        assert np.stack(seen).tobytes() == shown.frames["qpos"].tobytes()
 
 
 @pytest.fixture
@@ -377,7 +376,7 @@ def test_play_on_a_display(done: Farm, screen: str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("DISPLAY", screen)
     process = done.start("play", "runs/a", "--speed", "10", "--hold", "0")
     assert process.stdout is not None
-    assert "double-click the object" in process.stdout.readline()
+    assert "double-click a body" in process.stdout.readline()
     assert "the first rollout is over" in process.stdout.readline()
     process.send_signal(number)
     said, _ = process.communicate(timeout=30)
@@ -387,11 +386,12 @@ def test_play_on_a_display(done: Farm, screen: str, monkeypatch: pytest.MonkeyPa
     assert "X Error" not in said
 
 
+@pytest.mark.slow
 def test_play_needs_a_display(done: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     said = done.call("play", "runs/a", status=2)
-    assert "no display to open a window on: farm replay runs/a --video gait.gif draws without one" in said
+    assert "no display to open a window on: farm replay runs/a --video rollout.gif draws without one" in said
     monkeypatch.setenv("DISPLAY", ":987")
     assert "cannot open a window" in done.call("play", "runs/a", status=1)
 
@@ -403,7 +403,7 @@ MISTAKES = [
     (("replay", "runs/a", "--generation", "-1"), 2, "generation is -1; expected 0 or more"),
     (("replay", "runs/a", "--object", "cat"), 2, "unknown object 'cat'; known are bar"),
     (("replay", "runs/a", "--friction", "0"), 2, "friction is 0.0; expected a positive number"),
-    (("replay", "runs/a", "--friction", "nan"), 2, "friction is nan; expected a positive number"),
+    (("replay", "runs/a", "--friction", "nan"), 2, "friction is nan; expected a finite number"),
     (("replay", "runs/a", "--speed", "0"), 2, "speed is 0.0; expected 0.01 to 10"),
     (("replay", "runs/a", "--video", "a.avi"), 2, "--video a.avi: expected a name that ends in .gif or .mp4"),
     (("replay", "runs/a", "--video", "none/a.gif"), 2, "cannot write none/a.gif: there is no folder none"),
@@ -430,12 +430,18 @@ MISTAKES = [
 @pytest.mark.parametrize(
     ("words", "status", "line"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
 )
-def test_mistakes(done: Farm, words: tuple[str, ...], status: int, line: str) -> None:
-    said = done.call(*words, status=status, timeout=60)
+def test_mistakes(
+    done: Farm, words: tuple[str, ...], status: int, line: str, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(done.folder)
+    assert main(words) == status
+    said = "".join(capfd.readouterr())
     assert line in said
     assert len(said.strip().splitlines()) == 1, said
 
 
+@pytest.mark.slow
 def test_a_summary_that_is_not_there_yet(done: Farm, tmp_path: Path) -> None:
     shutil.copytree(folder(done).path, tmp_path / "a")
     (tmp_path / "a" / "summary.json").unlink()
@@ -447,6 +453,6 @@ def test_a_summary_that_is_not_there_yet(done: Farm, tmp_path: Path) -> None:
 
 
 def test_the_exported_numbers_are_plain(done: Farm) -> None:
-    values = export.contents(stored(folder(done)))
+    values = export.contents(stored(done))
     assert json.dumps(sorted(values))
     assert all(np.asarray(value).dtype.kind in "fiU" for value in values.values())

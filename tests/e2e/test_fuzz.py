@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from processes import Farm, children
 
 from farm.net import codec, session
-from farm.net.work import RoundHeader
 from farm.net.messages import Refusal, WorkRequest
-from farm.net.work import Failure
+from farm.net.work import Failure, RoundHeader
 from learner.run import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
@@ -45,7 +44,7 @@ VALUES = st.recursive(
 
 
 HONEST = (
-    WorkRequest(worker="w/1", credits=1, idle=("r",), version="0", assets="a", canary="c", host="h", cores=2),
+    WorkRequest(worker="w/1", credits=1, idle=("r",), version="0", canary="c", host="h", cores=2),
     Failure(run="r", incarnation="i", round=1, worker="w/1", index=0, error="e"),
     RoundHeader(run="r", incarnation="i", round=1, generation=0, spec="s", traces="all", mu=np.zeros(2)),
     Refusal(run="r", reason="so"),

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,9 @@ import pytest
 from processes import Farm, children
 from recordings import content, generations, read, rows
 
-from learner.config import PRESETS
-from learner.run import Place, free_endpoint, open_run
+from farm.net.session import free_endpoint
+from learner.config import configure
+from learner.run import Placement, open_run
 from learner.scheduler.scheduler import SchedulerConfig
 
 pytestmark = pytest.mark.slow
@@ -42,12 +42,9 @@ def test_one_worker_learns_the_same(farm: Farm, learnt: Farm) -> None:
 
 @pytest.mark.parametrize("seconds", [1e-6, 10.0])
 def test_any_size_of_chunk_learns_the_same(tmp_path: Path, learnt: Farm, seconds: float) -> None:
-    gym = PRESETS["gym"]
-    config = replace(
-        gym, task=replace(gym.task, task="gym:Pusher-v5", steps=20), algorithm=replace(gym.algorithm, pairs=6),
-        generations=6,
-    )  # fmt: skip
-    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=SchedulerConfig(chunk_seconds=seconds))
+    config = configure("gym:Pusher-v5", steps=20, pairs=6, generations=6)
+    chunks = SchedulerConfig(chunk_seconds=seconds)
+    place = Placement(workers=2, listen=free_endpoint(), record=False, scheduler=chunks)
     with open_run(config, tmp_path / "r", place) as run:
         for _ in run.learn():
             pass
@@ -74,7 +71,7 @@ def test_success_is_empty_everywhere(learnt: Farm) -> None:
     [row] = json.loads(learnt.call("runs", "--json"))
     assert row["mean_policy_success"] is None
     assert "success" not in learnt.call("run", "--name", "said", "--no-record", *TASK, "--generations", "1")
-    assert "succeed" not in learnt.call("replay", "runs/r", "--to", "gait.rrd")
+    assert "succeed" not in learnt.call("replay", "runs/r", "--to", "again.rrd")
     assert learnt.call("runs")
 
 
@@ -106,28 +103,11 @@ def test_the_recording_shows_the_scene(learnt: Farm) -> None:
     assert "/world/object" in replays
 
 
-def test_a_worker_serves_it_only_if_allowed(farm: Farm, learnt: Farm) -> None:
-    """Others are told, and the run goes on with those that may."""
-    endpoint, log = free_endpoint(), farm.folder / "runs/r/log.txt"
-    learner = farm.start("learner", "--listen", endpoint, "--name", "r", "--no-record", *SMALL)
-    others = farm.start("worker", "--connect", endpoint, "--processes", "3", "--name", "other")
-    declined = "does not serve this run: this worker serves no gym:Pusher-v5: start it with --allow-gym"
-    farm.wait_for(lambda: log.exists() and log.read_text().count(declined) == 3)
-    farm.start("worker", "--connect", endpoint, "--processes", "1", "--allow-gym")
-    said, _ = learner.communicate(timeout=120)
-    assert learner.returncode == 0, said
-    assert f"workers join with: farm worker --connect {endpoint} --allow-gym" in said
-    assert said.count(declined) == 3, "once each"
-    same(farm.summary("r"), learnt)
-    others.send_signal(signal.SIGTERM)
-    assert others.wait(10) == 0
-
-
-def test_allowed_workers_and_a_recorder_elsewhere(farm: Farm, learnt: Farm) -> None:
+def test_workers_and_a_recorder_elsewhere(farm: Farm, learnt: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, "--name", "r", *SMALL)
     recorder = farm.start("record", "--connect", endpoint, "--run", "r")
-    farm.start("worker", "--connect", endpoint, "--processes", "1", "--allow-gym")
+    farm.start("worker", "--connect", endpoint, "--processes", "1")
     for process in (learner, recorder):
         said, _ = process.communicate(timeout=120)
         assert process.returncode == 0, said

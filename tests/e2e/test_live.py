@@ -12,6 +12,8 @@ from recordings import generations
 
 from learner.run import free_endpoint
 
+pytestmark = pytest.mark.slow
+
 COUNT = 150
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 

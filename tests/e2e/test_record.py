@@ -21,6 +21,8 @@ from learner.commands.record import RecordCommand, record
 from learner.run import free_endpoint
 from learner.run_folder import RunFolder
 
+pytestmark = pytest.mark.slow
+
 FILE = Path("recordings/r/run.rrd")
 Process = subprocess.Popen[str]
 
@@ -83,7 +85,7 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     own, other = farm.folder / "runs/r", farm.folder / "recordings/r"
     assert content(own / "run.rrd") == content(other / "run.rrd")
     names = {entity for entity, *_ in content(other / "run.rrd")}
-    assert {"/learning/return", "/joints/position", "/tactile/trace/best", "/tactile/traces", "/log"} <= names
+    assert {"/learning/return", "/joints/position", "/traces/best", "/log"} <= names
     assert kept(farm) == ["replay.rrd", "run.rrd"]
     captions = [
         [str(chunk.to_record_batch()) for chunk in RrdReader(folder / "replay.rrd").stream() if "rollout" in str(chunk)]

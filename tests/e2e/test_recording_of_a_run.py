@@ -13,11 +13,12 @@ from processes import Farm, children
 from recordings import generations, read, rows
 from rerun.chunk import RrdReader
 
-from farm import seeds as randomness
-from farm.net.work import Job
+from farm import seeds
+from farm.net.work import Jobs
 from learner.run_folder import RunFolder
-from learner.setup import specification, start
-from workers.backends.cpu import CpuBackend
+from learner.setup import start
+
+pytestmark = pytest.mark.slow
 
 GENERATIONS = 4
 SMALL = ("--name", "r", "--pairs", "3", "--generations", str(GENERATIONS))
@@ -34,31 +35,20 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
 
 def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
     folder = RunFolder.open(recorded.folder / "runs" / "r")
-    kept = rows(read(folder.recording)["/tactile/traces"], "data")
+    kept = rows(read(folder.recording)["/traces/all"], "data")
     assert sorted(kept) == list(range(1, GENERATIONS + 1))
 
     config = folder.read_config()
-    at = start(config, "r")
-    backend = CpuBackend(specification(config, at))
-    state = config.algorithm.restore(at.state)
+    problem, at = start(config, "r")
+    runner, algorithm = problem.runner(), config.algorithm_config
+    state = algorithm.restore(at.state)
     for generation in range(GENERATIONS):
-        eps = config.algorithm.ask(state, randomness.exploration(config.seed, generation))
-        jobs = [
-            Job(
-                index=i,
-                origin="mu",
-                signs=(1, -1),
-                rate="none",
-                eps=row,
-                perturbation=randomness.training(config.seed, generation, i),
-            )  # fmt: skip
-            for i, row in enumerate(eps)
-        ]
-        results = backend.run(state.mu, jobs)
-        expected = np.concatenate([result.traces for result in results])
+        eps = algorithm.ask(state, seeds.exploration(config.seed, generation))
+        drawn = [seeds.training(config.seed, generation, i) for i in range(len(eps))]
+        given = runner.run(state.mu, Jobs.exploring(eps, (1, -1), drawn), "all")
         (tensor,) = kept[generation + 1]
-        assert tensor_of(tensor).tobytes() == expected.tobytes()
-        state = config.algorithm.tell(state, eps, np.stack([result.returns for result in results]))
+        assert tensor_of(tensor).tobytes() == given.traces.tobytes()
+        state = algorithm.tell(state, eps, given.returns.reshape(-1, 2))
     assert state.mu.tobytes() == folder.parameters()["mu"][-1].tobytes()
 
 

@@ -3,18 +3,20 @@
 import os
 import platform
 import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from processes import SMALL, Farm, children
 
-from learner.config import RunConfig
-from learner.run import Place, free_endpoint, learn, open_run
+from farm.net.session import free_endpoint
+from learner.config import configure
+from learner.run import Placement, learn, open_run
 from learner.scheduler.scheduler import SchedulerConfig
 
-CONFIG = RunConfig(generations=10, algorithm=replace(RunConfig().algorithm, pairs=6))
+pytestmark = pytest.mark.slow
+
+CONFIG = configure(generations=10, pairs=6)
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -26,7 +28,8 @@ def test_any_number_of_workers(farm: Farm, reference: dict[str, Any], workers: i
 
 @pytest.mark.parametrize("seconds", [1e-6, 10.0])
 def test_any_size_of_chunk(tmp_path: Path, reference: dict[str, Any], seconds: float) -> None:
-    place = Place(workers=2, listen=free_endpoint(), record=False, ledger=SchedulerConfig(chunk_seconds=seconds))
+    chunks = SchedulerConfig(chunk_seconds=seconds)
+    place = Placement(workers=2, listen=free_endpoint(), record=False, scheduler=chunks)
     with open_run(CONFIG, tmp_path / "r", place) as run:
         for _ in run.learn():
             pass
@@ -149,8 +152,8 @@ PROCESSORS = {
     "settings",
     [
         ("--generations", "6"),
-        ("--generations", "3", "--controller", "projected", "--features", "500", "--state", "joints+tactile"),
-        ("--generations", "3", "--controller", "cosine", "--features", "100", "--optimiser", "adam", "--perturb"),
+        ("--generations", "3", "--policy", "projected", "--features", "500", "--state", "joints+tactile"),
+        ("--generations", "3", "--policy", "cosine", "--features", "100", "--optimiser", "adam", "--perturb"),
     ],
     ids=["kernel", "projected", "cosine"],
 )

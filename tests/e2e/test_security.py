@@ -16,12 +16,12 @@ from farm.commands import certificates
 from farm.errors import ConfigError, FarmError
 from farm.net import codec, keys, session
 from farm.net.messages import WorkRequest
-from farm.net.work import Result, Results
 from farm.net.session import Session
 from farm.net.tls import Bundle, find
+from farm.net.work import Jobs, Results, Simulated
 from learner.run import free_endpoint
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
 
 @pytest.fixture(scope="module")
@@ -59,21 +59,11 @@ def intruder(endpoint: str, bundle: Bundle) -> Iterator[Session]:
 
 def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Results:
     """Splendid returns for every pair."""
-    two = np.ones(2, dtype=bool)
-    results = tuple(
-        Result(
-            index=index,
-            trajectory=None,
-            returns=np.full(2, 1000.0),
-            success=two,
-            dropped=~two,
-            failed=~two,
-            clamped=~two,
-            traces=np.zeros((2, 15, 54), dtype="<f4"),
-        )
-        for index in range(count)
-    )
-    return Results.of(results, run=run, incarnation=incarnation, round=round_, worker=worker, traces="extremes")
+    eps = np.zeros((count, 1))
+    flags = np.tile([True, False, False, False], (2 * count, 1))
+    given = Simulated(np.full(2 * count, 1000.0), flags, np.zeros((2, 15, 54), dtype="<f4"), ())
+    jobs = Jobs.exploring(eps, (1, -1), None)
+    return Results.carrying(given, jobs, run=run, incarnation=incarnation, round=round_, worker=worker)
 
 
 def test_intruders_do_nothing_and_honest_workers_do_not_notice(
@@ -89,9 +79,7 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
         w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
         for posing in (w2, eva):
             posing.token(keys.worker_token("farm", "w1/1-abc"))
-            want = WorkRequest(
-                worker="w1/1-abc", credits=100, idle=("r",), version="0", assets="a", canary="c", host="h", cores=2
-            )
+            want = WorkRequest(worker="w1/1-abc", credits=100, idle=("r",), version="0", canary="c", host="h", cores=2)
             posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))
         farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "2")
         seen = []

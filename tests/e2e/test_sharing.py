@@ -4,14 +4,17 @@ import os
 import time
 from pathlib import Path
 
+import pytest
 from processes import SMALL, Farm, children
 
 from farm.commands.status import ask
 from farm.net.session import connect
 from learner.run import free_endpoint
 
+pytestmark = pytest.mark.slow
+
 GENERATIONS = 30
-RUNS = {"first": ("--seed", "1"), "second": ("--seed", "2", "--controller", "projected", "--features", "50")}
+RUNS = {"first": ("--seed", "1"), "second": ("--seed", "2", "--policy", "projected", "--features", "50")}
 
 
 def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:

@@ -12,6 +12,8 @@ from farm.net.session import listen
 from farm.net.telemetry import RunStatus, WorkerStatus
 from learner.run import free_endpoint
 
+pytestmark = pytest.mark.slow
+
 
 def test_runs_and_workers_are_seen(farm: Farm) -> None:
     endpoint = free_endpoint()
@@ -75,18 +77,20 @@ def test_status_fails_when_who_is_named_is_missing(farm: Farm) -> None:
     assert "no worker v is on farm farm" in farm.call(*asked, "--worker", "v", status=1)
 
 
-def test_a_worker_with_other_assets_is_refused_on_both_sides(farm: Farm) -> None:
+def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", "--name", "r", "--generations", "5", "--listen", endpoint, *SMALL)
     code = (
-        "import sys, assets; assets.digest = lambda: 'paw'; from workers.__main__ import main;"
+        "import sys; from farm import plugins; plugins.code_digest = lambda module: 'x';"
+        "from workers.__main__ import main;"
         f"sys.argv = ['worker', '--connect', '{endpoint}']; sys.exit(main())"
     )
     stranger = farm.start_python("-c", code)
     assert stranger.stdout
     lines = iter(stranger.stdout.readline, "")
-    line = next(line for line in lines if "does not take" in line)
-    assert "run r does not take this worker: its hand or objects are others" in line
+    line = next(line for line in lines if "cannot serve" in line)
+    said = "its code of 'finger-gait' differs from the learner's: install the learner's release on both sides"
+    assert f"cannot serve run r: {said}" in line
 
     def refused() -> bool:  # what the worker read in the spec may reach it before its own words reach the learner
         (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
@@ -95,6 +99,6 @@ def test_a_worker_with_other_assets_is_refused_on_both_sides(farm: Farm) -> None
 
     farm.wait_for(refused)
     farm.start("worker", "--connect", endpoint, "--processes", "1")
-    said, _ = learner.communicate(timeout=60)
-    assert learner.returncode == 0, said
-    assert said.count("is refused: its hand or objects are others") == 1
+    told, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, told
+    assert told.count(f"does not serve this run: {said}") == 1

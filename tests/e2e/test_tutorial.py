@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from processes import Farm, children
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs/tutorial.md").read_text("utf-8")
 COMMANDS = [

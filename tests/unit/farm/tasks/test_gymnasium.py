@@ -122,7 +122,9 @@ def test_what_cannot_be_learnt_is_one_line(name, line):
     assert "\n" not in str(said.value)
 
 
-@pytest.mark.parametrize("name", ["os:Swimmer-v5", "antigravity:Reacher-v5", "Swimmer", "Swimmer-v", "a/b/c-v1", "x-v1\n"])
+@pytest.mark.parametrize(
+    "name", ["os:Swimmer-v5", "antigravity:Reacher-v5", "Swimmer", "Swimmer-v", "a/b/c-v1", "x-v1\n"]
+)
 def test_names_that_are_none_are_refused_and_nothing_is_imported(name):
     with pytest.raises(ConfigError, match="gym:NAME-vN"):
         Environment(TaskConfig(), name)

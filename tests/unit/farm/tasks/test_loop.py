@@ -177,7 +177,6 @@ class Fragile(Pole):
 
     def ended(self, sim):
         """Never."""
-        return None
 
 
 def test_a_rollout_that_blows_up_fails_alone():

@@ -117,7 +117,11 @@ def test_the_picture_is_brightest_where_the_ball_presses(task: FingerGait, press
                 formats[chunk.entity_path] = batch.column(name).to_pylist()[0][0]
             if chunk.entity_path.startswith("/tactile/") and name.endswith("DepthImage:buffer"):
                 buffers[chunk.entity_path] = batch.column(name).to_pylist()
-            if chunk.entity_path.endswith("_distal/tactile") and name.endswith("Points3D:colors") and not chunk.is_static:
+            if (
+                chunk.entity_path.endswith("_distal/tactile")
+                and name.endswith("Points3D:colors")
+                and not chunk.is_static
+            ):
                 colours[chunk.entity_path] = batch.column(name).to_pylist()
     for frame, (finger, row, column) in enumerate(PLACES):
         entity = f"/tactile/{FINGERS[finger]}"
@@ -125,6 +129,8 @@ def test_the_picture_is_brightest_where_the_ball_presses(task: FingerGait, press
         assert (height, width) == (6, 3)  # rows from the top, a row's pixels from the left
         pixels = np.array(buffers[entity][frame][0], np.uint8).view(np.float32).reshape(height, width)
         assert np.unravel_index(pixels.argmax(), pixels.shape) == (row, column)
-        np.testing.assert_array_equal(pixels.ravel(), pressed.channels["tactile"][frame, finger].ravel().astype(np.float32))
+        np.testing.assert_array_equal(
+            pixels.ravel(), pressed.channels["tactile"][frame, finger].ravel().astype(np.float32)
+        )
         green = np.array(colours[f"/world/{FINGERS[finger]}_distal/tactile"][frame]) >> 16 & 255  # rises with the force
         assert green[3 * row + column] == green.max()
