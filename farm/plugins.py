@@ -78,6 +78,8 @@ class Plugin:
     """Package and version that it comes from; empty for the farm's own and for files."""
     file: Path | None = None
     """The file that it comes from, if it is from a file."""
+    imported: str = ""
+    """SHA-256 of that file as it was when it was imported."""
 
     @property
     def wire(self) -> str:
@@ -91,9 +93,7 @@ class Plugin:
 
     def digest(self) -> str:
         """SHA-256 of its code: its file, or its module and all that this imports from the same package."""
-        if self.file is not None:
-            return hashlib.sha256(self.file.read_bytes()).hexdigest()
-        return code_digest(self.target.__module__)
+        return self.imported or code_digest(self.target.__module__)
 
 
 def names(kind: str) -> dict[str, str]:
@@ -142,12 +142,25 @@ def _from_package(kind: str, own: str, variant: str) -> Plugin:
 
 
 def _from_file(kind: str, path: Path, inside: str) -> Plugin:
-    module = _file_module(path.resolve(), kind)
+    where = path.resolve()
+    try:
+        source = where.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{_one(kind)} {where}: {_missing(error)}") from None
+    return _of_source(kind, where, source, inside)
+
+
+def _missing(error: OSError) -> str:
+    return "there is no such file" if isinstance(error, FileNotFoundError) else f"it cannot be read: {error.strerror}"
+
+
+def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
+    module = _file_module(path, source)
     target = getattr(module, inside, None)
     if not isinstance(target, type):
         known = [name for name, value in vars(module).items() if _own_class(value, module.__name__)]
         raise ConfigError(f"{path} has no class {inside!r}; it has {', '.join(known) or 'none'}")
-    return Plugin(kind, f"{path.resolve()}:{inside}", target, file=path.resolve())
+    return Plugin(kind, f"{path}:{inside}", target, file=path, imported=hashlib.sha256(source).hexdigest())
 
 
 def _own_class(value: object, module: str) -> bool:
@@ -155,18 +168,15 @@ def _own_class(value: object, module: str) -> bool:
 
 
 @cache
-def _file_module(path: Path, kind: str) -> Any:  # noqa: ANN401  a module
-    """Import a file; the folder it lies in is on no path, so that it can shadow nothing."""
-    if not path.is_file():
-        raise ConfigError(f"{_one(kind)} {path}: there is no such file")
-    name = _MODULES + hashlib.sha256(str(path).encode()).hexdigest()[:12]
+def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
+    """Import a file as it is now; the folder it lies in is on no path, so that it can shadow nothing."""
+    name = _MODULES + hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look for their annotations there
     try:
-        spec.loader.exec_module(module)
+        exec(compile(source, str(path), "exec"), vars(module))
     except Exception as error:  # whatever the file may raise; its own traceback says where
         del sys.modules[name]
         raise ConfigError(f"{path} cannot be imported: {_where(error, path)}") from error
@@ -201,9 +211,13 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
     name, _, inside = wire.rpartition(":")
     for path in files:
         if path.name == name:
-            if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            try:
+                source = path.read_bytes()
+            except OSError as error:
+                raise UnservedError(f"{path}: {_missing(error)}") from None
+            if hashlib.sha256(source).hexdigest() != digest:
                 raise UnservedError(f"{path} differs from the learner's {name}: copy the learner's file there")
-            return _from_file(kind, path, inside)
+            return _of_source(kind, path.resolve(), source, inside)
     raise UnservedError(f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file {name}")
 
 

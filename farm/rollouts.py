@@ -110,9 +110,13 @@ _SAME = "install the learner's release on both sides"
 
 def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]) -> plugins.Plugin:
     """The class that a specification names, if its code is the learner's."""
-    if name.rpartition(":")[0].endswith(".py"):
-        return plugins.allowed(kind, name, digest or "", files)
-    found = plugins.find(kind, name)
+    base = {"tasks": Task, "policies": Policy}[kind]
+    from_file = name.rpartition(":")[0].endswith(".py")
+    found = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
+    if not (isinstance(found.target, type) and issubclass(found.target, base)):
+        raise UnservedError(f"{name} is no {base.__name__}")
+    if from_file:
+        return found
     if found.release != release:
         raise UnservedError(f"the run has {name} of {release or 'the farm'}, here is {found.release or 'the farm'}'s")
     if found.digest() != digest:

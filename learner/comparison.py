@@ -7,7 +7,7 @@ from typing import Any
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
-from learner.config import RunConfig, changes, flat, preset_of
+from learner.config import RunConfig, flat, preset_of
 from learner.run_folder import RunFolder
 
 
@@ -63,15 +63,12 @@ def table(runs: Sequence[Compared]) -> str:
 
 def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     """What differs in the configurations."""
-    first = runs[0].config
-    differing = dict.fromkeys(name for run in runs[1:] for name, _, _ in changes(first, run.config))
     yield "preset", *(preset_of(run.config) for run in runs)
-    for name in differing:
-        values = []
-        for run in runs:
-            changed = {key: value for key, _, value in changes(first, run.config)}
-            values.append(changed[name] if name in changed else flat(first)[name])
-        yield name, *(str(value) for value in values)
+    tables = [flat(run.config) for run in runs]
+    for name in dict.fromkeys(name for table in tables for name in table):
+        values = [table[name] for table in tables if name in table]
+        if any(value != values[0] for value in values):
+            yield name, *(str(table.get(name, "-")) for table in tables)
 
 
 def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:

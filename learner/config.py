@@ -202,6 +202,8 @@ def from_dict(values: object, where: str) -> RunConfig:
         found = values.get("version") if isinstance(values, dict) else None
         raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(found)[:40]!r})")
     made: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *_PARTS)}
+    if unknown := [name for name in (f"{part}_config" for part in _PARTS) if name in made]:
+        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}")
     for part, kind in _PARTS.items():
         table = values.get(part)
         if not isinstance(table, dict) or type(table.get("name")) is not str:

@@ -11,12 +11,11 @@ import atheris
 with atheris.instrument_imports(include=["farm"]):
     from farm.errors import MessageError
     from farm.net import codec
-    from farm.net.work import Chunk, RoundHeader
     from farm.net.messages import Refusal, Spec, WorkRequest
-    from farm.net.work import Failure, Results
-    from farm.net.telemetry import RunStatus
+    from farm.net.telemetry import RunHistory, RunReport, RunStatus
+    from farm.net.work import Chunk, Failure, Results, RoundHeader
 
-KINDS = (Chunk, Failure, RoundHeader, Refusal, Results, RunStatus, Spec, WorkRequest)
+KINDS = (Chunk, Failure, RoundHeader, Refusal, Results, RunHistory, RunReport, RunStatus, Spec, WorkRequest)
 
 
 def one(data: bytes) -> None:

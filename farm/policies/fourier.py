@@ -58,8 +58,8 @@ class Kernel(Policy):
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions in (0, 1]."""
-        difference = np.ascontiguousarray(prepared) - np.ascontiguousarray(x)[:, None, :]
         with np.errstate(over="ignore", invalid="ignore"):
+            difference = np.ascontiguousarray(prepared) - np.ascontiguousarray(x)[:, None, :]
             squares = (difference * difference).sum(axis=-1)
         exponents = squares * (-0.5 / self.config.bandwidth**2)
         # Number by number: of the few that one step has, numpy's calls for `elementary.exp` would take longer.
@@ -98,8 +98,9 @@ class Direct(Policy):
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions; may be huge or not finite."""
+        weights = np.ascontiguousarray(prepared)  # sums of another memory order would round differently
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.stack([(w * self.features(row)).sum(axis=-1) for w, row in zip(prepared, x, strict=True)])
+            return np.stack([(w * self.features(row)).sum(axis=-1) for w, row in zip(weights, x, strict=True)])
 
     def features(self, x: FloatArray) -> FloatArray:
         """z(x) of one observation, (d,) -> (D,)."""

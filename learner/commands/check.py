@@ -23,7 +23,7 @@ ROWS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class CheckCommand:
-    """Checks a task: sizes, bounds, same bits however its rollouts are batched, rollouts per second, a picture."""
+    """Checks a task: sizes, bounds, same bits however batched, rollouts per second, a picture."""
 
     name: tyro.conf.Positional[str]
     """The task: a name, gym:NAME, or FILE.py:CLASS."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayCommand:
-    """Any policy that a run stored again, at physics rate, into a recording; the run's task may have other settings."""
+    """Any policy of a run again, at physics rate, into a recording; its task may have other settings."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""

@@ -11,16 +11,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from farm.errors import CheckpointError
-from farm.net.work import Job
 from learner import checkpoint as checkpoints
 from learner.algorithms import PGPE, PGPEState
-from learner.checkpoint import Checkpoint, load, save
+from learner.checkpoint import BestRollout, Checkpoint, load, save
 from learner.config import RunConfig, to_dict
 
 RNG = np.random.default_rng(3)
 P = 12
 
-BEST = Job(index=0, origin="zero", signs=(1,), perturbation=(3, 0, 1, 2), rate="none", eps=RNG.normal(size=P))
+BEST = BestRollout(seed=(3, 0, 1, 2), theta=RNG.normal(size=P))
 
 EXTREMES = np.array([0.0, -0.0, 5e-324, -1.7e308, np.pi, 1.0 / 3.0] * 2)
 
@@ -32,7 +31,8 @@ def checkpoint(**changed: object) -> Checkpoint:
         "run": "first", "config": to_dict(RunConfig(seed=3)), "state": state.to_dict(), "rollouts": 210, "reissued": 4,
         "seconds": 12.3456789012345678, "solved": 2, "best": BEST, "best_generation": 5, "canary": "c0",
         "replayed": False,
-        "frequencies": RNG.normal(size=(5, 8)), "phases": RNG.uniform(size=5),
+        "code": {"task": "0f" * 32, "policy": "1e" * 32, "simulation": ""}, "files": {"model.xml": "<mujoco/>" * 999},
+        "constants": {"frequencies": RNG.normal(size=(5, 8)), "phases": EXTREMES},
     }  # fmt: skip
     return Checkpoint(**(values | changed))  # type: ignore[arg-type]
 
@@ -43,7 +43,7 @@ def bits(value: object) -> object:
         return value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, dict):
         return {key: bits(item) for key, item in value.items()}
-    if isinstance(value, (Checkpoint, Job)):
+    if isinstance(value, (Checkpoint, BestRollout)):
         return {field.name: bits(getattr(value, field.name)) for field in fields(value)}
     return repr(value)
 
@@ -55,7 +55,15 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.parametrize("changed", [{}, {"best": None, "replayed": True, "frequencies": np.empty((0, 8))}])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {},
+        {"best": None, "replayed": True, "canary": None, "constants": {}, "files": {}, "code": {}},
+        {"best": BestRollout(seed=None, theta=EXTREMES)},
+    ],
+    ids=range(3),
+)
 def test_there_and_back(tmp_path: Path, changed: dict[str, object]) -> None:
     told = checkpoint(**changed)
     save(tmp_path / "checkpoint", told)
@@ -69,13 +77,14 @@ def test_there_and_back(tmp_path: Path, changed: dict[str, object]) -> None:
 
 def test_truncated_anywhere(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "checkpoint"
-    for length in range(len(whole)):
+    lengths = {*range(70), *range(70, len(whole), 101), *range(len(whole) - 40, len(whole))}
+    for length in sorted(lengths):
         path.write_bytes(whole[:length])
         with pytest.raises(CheckpointError, match="truncated or damaged|not a checkpoint|another version"):
             load(path)
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_flipped_bits(tmp_path: Path, whole: bytes, data: st.DataObject) -> None:
     damaged = bytearray(whole)
@@ -96,16 +105,16 @@ def test_something_appended(tmp_path: Path, whole: bytes) -> None:
 
 def test_of_another_version(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "checkpoint"
-    path.write_bytes(whole.replace(b"checkpoint 1\n", b"checkpoint 2\n", 1))
+    path.write_bytes(whole.replace(b"checkpoint 2\n", b"checkpoint 3\n", 1))
     with pytest.raises(CheckpointError, match="of another version; use the release that wrote it"):
         load(path)
 
 
 def test_of_another_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.checkpoint._SCHEMA", 2)
+    monkeypatch.setattr("learner.checkpoint._SCHEMA", 3)
     save(tmp_path / "checkpoint", checkpoint())
     monkeypatch.undo()
-    with pytest.raises(CheckpointError, match="schema version 2"):
+    with pytest.raises(CheckpointError, match="schema version 3"):
         load(tmp_path / "checkpoint")
 
 

@@ -1,4 +1,4 @@
-"""Runs beside each other: names, differences, results; and what tells a configuration from others."""
+"""Runs beside each other: names, differences, results."""
 
 import dataclasses
 from pathlib import Path
@@ -8,10 +8,9 @@ import pytest
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
-from farm.policies.fourier import PolicyConfig
 from learner import comparison
 from learner.comparison import Compared, names, table
-from learner.config import PRESETS, RunConfig, preset_of, properties
+from learner.config import RunConfig, configure
 from learner.run_folder import RunFolder
 
 
@@ -31,28 +30,29 @@ def rows(text: str) -> dict[str, list[str]]:
 
 
 def test_a_table_has_what_differs_and_what_came_out() -> None:
-    other = dataclasses.replace(PRESETS["thesis"], seed=7, policy=PolicyConfig(features=99))
+    other = configure(preset="thesis", seed=7, features=99)
     ended = {"mean_policy_return": -0.0619, "mean_policy_success": True, "robust_success_rate": 0.98}
     runs = [
         compared("a", RunConfig(), [False, False, True, True], **ended, parameters_sha256="0123456789abcdef"),
         compared("b", other, [False, False]),
         compared("c", RunConfig(seed=1), [True]),
+        compared("d", configure(preset="thesis", seed=7, features=50), [False]),
     ]
     found = rows(table(runs))
-    assert found[""] == ["**a**", "**b**", "**c**"]
-    assert found["preset"] == ["default", "own", "default"]
-    assert found["seed"] == ["0", "7", "1"]
-    assert found["features"] == ["8000", "99", "8000"]
-    assert found["controller"] == ["kernel", "projected", "kernel"]
-    assert found["generations done"] == ["4", "2", "1"]
-    assert found["rollouts"] == ["120", "60", "30"]
-    assert found["return of the final policy"] == ["-0.062", "-", "-"]
-    assert found["it succeeds"] == ["yes", "-", "-"]
-    assert found["robust success"] == ["98%", "-", "-"]
-    assert found["first success, generation"] == ["2", "-", "0"]  # a generation shows the policy before its update
-    assert found["hash"] == ["01234567", "-", "-"]
+    assert found[""] == ["**a**", "**b**", "**c**", "**d**"]
+    assert found["preset"] == ["default", "own", "default", "own"]
+    assert found["seed"] == ["0", "7", "1", "7"]
+    assert found["features"] == ["-", "99", "-", "50"], "the kernel has none"
+    assert found["policy"] == ["kernel", "projected", "kernel", "projected"]
+    assert found["generations done"] == ["4", "2", "1", "1"]
+    assert found["rollouts"] == ["120", "60", "30", "30"]
+    assert found["return of the final policy"] == ["-0.062", "-", "-", "-"]
+    assert found["it succeeds"] == ["yes", "-", "-", "-"]
+    assert found["robust success"] == ["98%", "-", "-", "-"]
+    assert found["first success, generation"] == ["2", "-", "0", "-"]  # a generation shows the policy before its update
+    assert found["hash"] == ["01234567", "-", "-", "-"]
     assert "gamma" not in found  # the same everywhere
-    assert {len(row) for row in found.values()} == {3}
+    assert {len(row) for row in found.values()} == {4}
 
 
 def test_names_are_as_short_as_they_can_be() -> None:
@@ -66,16 +66,6 @@ def test_a_run_without_a_generation(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "r", RunConfig())
     with pytest.raises(ConfigError, match="has no generation behind it"):
         comparison.read([folder])
-
-
-def test_presets_are_known_by_what_they_set() -> None:
-    for name, config in PRESETS.items():
-        assert preset_of(dataclasses.replace(config, seed=9, generations=3)) == name
-        changed = dataclasses.replace(config, task=dataclasses.replace(config.task, gamma=0.5))
-        assert preset_of(changed) == "own"
-    assert properties(RunConfig(seed=4)) == {
-        "preset": "default", "controller": "kernel", "state": "joints", "object": "bar", "seed": 4,
-    }  # fmt: skip
 
 
 def test_stored_means(tmp_path: Path) -> None:

@@ -1,93 +1,81 @@
-"""A worker and a learner that follows a script: who says what when, and what is ignored; no physics."""
+"""A worker and a learner that follows a script: who says what when, what is served, and what is ignored."""
 
-import dataclasses
 import hashlib
 import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import ClassVar
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
+from farm import plugins
 from farm.arrays import FloatArray
-from farm.errors import ConfigError
+from farm.errors import ConfigError, UnservedError
 from farm.net import codec, keys
-from farm.net.work import Chunk, RoundHeader, Job, Jobs
-from farm.net.messages import Spec, WorkRequest
-from farm.net.work import Failure, Result, Results
-from farm.net.session import Session, connect, listen
-from farm.tasks.finger_gait.task import TaskConfig
-from learner.run import free_endpoint
+from farm.net.events import Event
+from farm.net.messages import Refusal, Spec, WorkRequest
+from farm.net.session import Session, connect, free_endpoint, listen
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated
+from farm.rollouts import SIMULATION
+from farm.sim.engines import CAPACITY
 from workers import worker as workers
-from workers.backends import BACKENDS
 from workers.worker import Worker, WorkerConfig
 
 FARM, P, WAIT = "try", 3, 20.0
+BEGINNING = Spec(run="", task="made-up", task_config={}, policy="none", policy_config={}, code={})
 
 
-class Backend:
-    """Simulates nothing; a job's return is the sum of its parameters."""
+class Runner:
+    """Simulates nothing; a rollout's return is the sum of its parameters."""
 
-    capacity: ClassVar[int] = 4
     go: ClassVar[threading.Event]
     made: ClassVar[list[str]]
     ran: ClassVar[list[str]]
 
-    def __init__(self, spec: Spec) -> None:
-        self.parameters, self.name = P, spec.run
-        self.made.append(spec.run)
-        if spec.task == "broken":
-            raise RuntimeError("no such\n  machine")
+    def __init__(self, name: str, policy: Any, make: Callable[..., Any]) -> None:
+        self.name, self.policy = name, policy
+        self.made.append(name)
+        assert callable(make)
 
-    def run(self, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
+    def run(self, mu: FloatArray, jobs: Jobs, traces: str) -> Simulated:
         self.ran.append(self.name)
         self.go.wait(WAIT)
-        if any(job.index == 13 for job in jobs):
+        if 13 in jobs.indices:
             raise ArithmeticError("thirteen")
-        return [result(job.index, float((mu + job.eps).sum())) for job in jobs]
+        returns = jobs.theta(mu).sum(axis=1)
+        shown = np.zeros((len(returns) if traces == "all" else 0, 1, 2), "<f4")
+        return Simulated(returns, np.zeros((len(returns), 4), bool), shown, ())
 
     def close(self) -> None:
         pass
 
 
-def result(index: int, value: float) -> Result:
-    no = np.zeros(1, bool)
-    return Result(
-        index=index, trajectory=None, returns=np.array([value]), success=no, dropped=no,
-        failed=no, clamped=no, traces=np.zeros((1, 1, 54), "<f4"),
-    )  # fmt: skip
+def served(spec: Spec, files: tuple[Path, ...]) -> tuple[str, Any]:
+    assert files == ()
+    if spec.task == "broken":
+        raise RuntimeError("no such\n  machine")
+    if spec.task == "unknown":
+        raise UnservedError("not here")
+    return spec.run, SimpleNamespace(size=P)
 
 
 class Learner:
     """One run as a learner shows it; says only what the test says."""
 
-    def __init__(self, session: Session, run: str, task: str = "finger-gait") -> None:
+    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING) -> None:
         self.session, self.run, self.asked = session, run, Counter[str]()
-        self.spec = codec.encode(
-            Spec(
-                run=run,
-                task=task,
-                task_config=dataclasses.asdict(TaskConfig()),
-                policy_config={},
-                frequencies=np.empty((0, 8)),
-                phases=np.empty(0),
-            )  # fmt: skip
-        )
-        digest = hashlib.sha256(self.spec).hexdigest()
+        self.spec = codec.encode(replace(spec, run=run))
         self.header = RoundHeader(
-            run=run,
-            incarnation="first",
-            round=2,
-            generation=0,
-            spec=digest,
-            traces="all",
-            mu=np.ones(P),
-        )
+            run=run, incarnation="first", round=2, generation=0, spec=hashlib.sha256(self.spec).hexdigest(),
+            traces="all", mu=np.ones(P),
+        )  # fmt: skip
         session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
         session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))
         session.answer(keys.generation(FARM, run), lambda: self._say("generation", codec.encode(self.header)))
@@ -101,13 +89,12 @@ class Learner:
         self.session.publish(keys.generation(FARM, self.run), codec.encode(self.header))
 
     def send(self, worker: str, *indices: int, **changed: object) -> None:
+        """Jobs of one rollout each, whose eps are their index."""
         header = self.header
-        jobs = tuple(
-            Job(index=i, origin="mu", signs=(1,), perturbation=None, rate="none", eps=np.full(P, float(i)))
-            for i in indices
-        )
+        jobs = Jobs.exploring(np.array([np.full(len(header.mu), float(i)) for i in indices]), (1,), None)
+        jobs.table[:, 0] = indices
         values = {"run": self.run, "incarnation": header.incarnation, "round": header.round}
-        chunk = Chunk.carrying(Jobs.of(jobs), **(values | changed))  # type: ignore[arg-type]
+        chunk = Chunk.carrying(jobs, **(values | changed))  # type: ignore[arg-type]
         self.session.publish(keys.inbox(FARM, worker), codec.encode(chunk))
 
 
@@ -117,13 +104,15 @@ class Stage:
     def __init__(self, session: Session, endpoint: str) -> None:
         self.session, self._endpoint = session, endpoint
         self._stop, self._open = threading.Event(), ExitStack()
+        self._hired: list[Worker] = []
         session.subscribe("want", keys.want(FARM, "**"))
         session.watch("worker", keys.worker_token(FARM, "**"))
 
-    def hire(self, backend: str = "fake") -> Worker:
-        config = WorkerConfig(connect=(self._endpoint,), farm=FARM, name="w", backend=backend)
+    def hire(self, **changed: Any) -> Worker:
+        config = WorkerConfig(connect=(self._endpoint,), farm=FARM, name="w", **changed)
         session = self._open.enter_context(connect((self._endpoint,), WAIT, lambda: False))
         worker = Worker(config, session)
+        self._hired.append(worker)
         worker.join()
         thread = threading.Thread(target=self._work, args=(worker,))
         thread.start()
@@ -157,25 +146,34 @@ class Stage:
         return said
 
     def let_go(self) -> None:
-        """Ask the worker to leave."""
+        """Ask the worker to leave, and wake it."""
         self._stop.set()
+        for worker in self._hired:
+            worker._session.events.put(Event("refused", "", b""))
 
     def close(self) -> None:
         self.let_go()
-        Backend.go.set()
+        Runner.go.set()
         self._open.close()
 
 
 @pytest.fixture
-def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
-    monkeypatch.setitem(BACKENDS, "fake", Backend)
-    Backend.go, Backend.made, Backend.ran = threading.Event(), [], []
-    Backend.go.set()
+def real() -> Iterator[Stage]:
+    """Whose workers simulate."""
+    Runner.go, Runner.made, Runner.ran = threading.Event(), [], []
+    Runner.go.set()
     endpoint = free_endpoint()
     with listen(endpoint, FARM) as session:
         opened = Stage(session, endpoint)
         yield opened
         opened.close()
+
+
+@pytest.fixture
+def stage(real: Stage, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    monkeypatch.setattr(workers, "served", served)
+    monkeypatch.setattr(workers, "Runner", Runner)
+    return real
 
 
 def until(event: Callable[[], object]) -> None:
@@ -189,7 +187,7 @@ def indices(results: Results) -> list[int]:
     return results.jobs.tolist()
 
 
-@pytest.mark.parametrize("_", range(10))
+@pytest.mark.parametrize("_", range(3))
 def test_whoever_sees_a_worker_can_reach_it(stage: Stage, _: int) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
@@ -205,7 +203,7 @@ def test_it_says_what_it_wants(stage: Stage) -> None:
     worker = stage.hire()
     _, want = stage.next("want")
     assert isinstance(want, WorkRequest)
-    assert (want.worker, want.credits, want.idle) == (worker.id, 2 * Backend.capacity, ())
+    assert (want.worker, want.credits, want.idle) == (worker.id, 2 * CAPACITY, ())
 
 
 def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
@@ -218,7 +216,7 @@ def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
         assert indices(answer) == [first, first + 1]
         assert answer.returns.tolist() == [3.0 + 3 * first, 6.0 + 3 * first]
     assert learner.asked == {"generation": 1, "spec": 1}
-    assert Backend.made == ["r"]
+    assert Runner.made == ["r"]
 
 
 def test_chunks_of_rounds_gone_by_are_dropped(stage: Stage) -> None:
@@ -235,9 +233,9 @@ def at_work(stage: Stage) -> tuple[Learner, Worker]:
     """A worker in the middle of job 0, held up there, with jobs 1 and 2 on their way."""
     learner, worker = Learner(stage.session, "r"), stage.hire()
     stage.next("want")
-    Backend.go.clear()
+    Runner.go.clear()
     learner.send(worker.id, 0)
-    until(lambda: Backend.ran)
+    until(lambda: Runner.ran)
     for index in (1, 2):
         learner.send(worker.id, index)
     return learner, worker
@@ -249,7 +247,7 @@ def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
     learner.announce()
     learner.send(worker.id, 3)
     until(lambda: len(worker._session.events) == 4)
-    Backend.go.set()
+    Runner.go.set()
     assert [(indices(said), said.round) for said in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
 
 
@@ -258,18 +256,18 @@ def test_two_runs_in_turn(stage: Stage) -> None:
     worker = stage.hire()
     for _ in learners:
         stage.next("want")
-    Backend.go.clear()
+    Runner.go.clear()
     learners[0].send(worker.id, 0)
-    until(lambda: Backend.ran)
+    until(lambda: Runner.ran)
     for learner, sent in zip(learners, ((1, 2), (0, 1, 2)), strict=True):
         for index in sent:
             learner.send(worker.id, index)
     until(lambda: len(worker._session.events) == 5)
-    Backend.go.set()
+    Runner.go.set()
     answers = [stage.results("a", "b") for _ in range(6)]
-    assert Backend.ran == ["a", "b", "a", "b", "a", "b"]
+    assert Runner.ran == ["a", "b", "a", "b", "a", "b"]
     assert [indices(said) for said in answers if said.run == "b"] == [[0], [1], [2]]
-    assert Backend.made == ["a", "b"]
+    assert Runner.made == ["a", "b"]
 
 
 def test_a_learner_that_leaves_takes_its_work_along(stage: Stage) -> None:
@@ -296,23 +294,20 @@ def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
     monkeypatch.setattr(workers, "IDLE", 0.05)
     busy, _ = Learner(stage.session, "busy"), Learner(stage.session, "lost")
     worker = stage.hire()
-    idle: set[str] = set()
-    end = time.monotonic() + WAIT
-    while "lost" not in idle:
-        assert time.monotonic() < end
-        busy.send(worker.id, 0)
-        stage.results("busy")
-        while len(stage.session.events):
-            event = stage.session.events.get()
-            if event.topic == "want":
-                idle.update(codec.decode(event.payload, WorkRequest).idle)
+    busy.send(worker.id, 0)
+    while True:
+        _, said = stage.next("result of busy", "want")
+        if isinstance(said, Results):
+            busy.send(worker.id, 0)
+        elif isinstance(said, WorkRequest) and "lost" in said.idle:
+            break
 
 
 def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
     learner, worker = at_work(stage)
     until(lambda: len(worker._session.events) == 2)
     stage.let_go()
-    Backend.go.set()
+    Runner.go.set()
     said: list[object] = []
     while len(said) < 2:
         _, message = stage.next("result of r", "want")
@@ -327,19 +322,20 @@ def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
 
 
 def test_a_task_it_does_not_know(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
-    learner = Learner(stage.session, "r", task="juggling")
-    worker = stage.hire("cpu")
+    learner = Learner(stage.session, "r", replace(BEGINNING, task="unknown"))
+    worker = stage.hire()
     for _ in range(2):
         learner.send(worker.id, 4, 5)
         said = stage.failure()
         assert said.index is None, "it is not the job"
-        assert said.error == "unknown task 'juggling'; known are finger-gait, gym:NAME"
-    assert caplog.messages == ["cannot serve run r: unknown task 'juggling'; known are finger-gait, gym:NAME"]
+        assert said.error == "not here"
+    assert caplog.messages == ["cannot serve run r: not here"]
     assert caplog.records[0].exc_info in (None, False)
+    assert learner.asked["spec"] == 1
 
 
 def test_a_task_it_cannot_build(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
-    learner = Learner(stage.session, "r", task="broken")
+    learner = Learner(stage.session, "r", replace(BEGINNING, task="broken"))
     worker = stage.hire()
     learner.send(worker.id, 0)
     assert stage.failure().error == "RuntimeError: no such machine"
@@ -359,30 +355,6 @@ def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytes
     assert [r.levelno for r in caplog.records] == [logging.ERROR]
 
 
-@pytest.mark.parametrize("wrong", ["index", "rollouts", "count"])
-def test_a_backend_that_answers_something_else(stage: Stage, monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
-    run = Backend.run
-
-    def other(self: Backend, mu: FloatArray, jobs: Sequence[Job]) -> list[Result]:
-        first, *rest = run(self, mu, jobs)
-        if first.index != 12:
-            return [first, *rest]
-        changed = {"index": replace(first, index=99), "rollouts": replace(first, returns=np.zeros(2))}
-        return [changed.get(wrong, first), *(rest if wrong != "count" else [])]
-
-    monkeypatch.setattr(Backend, "run", other)
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
-    learner.send(worker.id, 12, 14)
-    if wrong == "count":  # one by one it is right
-        assert indices(stage.results()) == [12]
-    else:
-        failed = stage.failure()
-        assert failed.index == 12
-        assert "of the backend is not what job 12 asks for" in failed.error
-    assert indices(stage.results()) == [14]
-
-
 def test_messages_it_cannot_read(
     stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -399,9 +371,7 @@ def test_messages_it_cannot_read(
             b"\xc1",
             newer,
             codec.encode(replace(learner.header, run="a//b")),
-            codec.encode(
-                WorkRequest(worker="w", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2)
-            ),
+            codec.encode(Refusal(run="r", reason="none")),
         ):
             stage.session.publish(key, payload)
     learner.announce()
@@ -413,13 +383,13 @@ def test_messages_it_cannot_read(
 def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
-    Backend.go.clear()
+    Runner.go.clear()
     learner.send(worker.id, 1)
-    until(lambda: Backend.ran)
+    until(lambda: Runner.ran)
     learner.send(worker.id, 2)
     learner.header = replace(learner.header, round=learner.header.round - 1)
     learner.announce()
-    Backend.go.set()
+    Runner.go.set()
     assert [indices(stage.results()) for _ in range(2)] == [[1], [2]]
 
 
@@ -459,9 +429,85 @@ def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptur
     assert indices(stage.results()) == [1]
 
 
+def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    learner, worker = Learner(stage.session, "r"), stage.hire()
+    for _ in range(3):
+        refusal = codec.encode(Refusal(run="r", reason="its machine\nrounds"))
+        stage.session.publish(keys.refused(FARM, worker.id), refusal)
+    learner.send(worker.id, 0)
+    stage.results()
+    assert caplog.messages == ["run r does not take this worker: its machine rounds"]
+
+
+def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    learner = Learner(stage.session, "r")
+    learner.spec += b" "
+    worker = stage.hire()
+    learner.send(worker.id, 0)
+    until(lambda: "run r does not tell what it simulates; its jobs wait" in caplog.messages)
+    learner.spec = learner.spec[:-1]
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1]
+    assert Runner.made == ["r"]
+
+
+# ---------------------------------------------------------------- classes in files
+
+POLE = """
+import numpy as np
+import farm
+
+class Pole(farm.Task):
+    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
+    steps = 4
+
+    def reward(self, sim, action):
+        return np.cos(sim.qpos[:, 0])
+"""
+
+
+def pole(file: Path) -> Spec:
+    """What a learner says of the task in that file."""
+    found, policy = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", "kernel")
+    code = {"task": found.digest(), "policy": policy.digest(), "simulation": plugins.code_digest(SIMULATION)}
+    files = {"model.xml": found.target.xml}
+    return replace(BEGINNING, task=found.wire, policy="kernel", code=code, files=files)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "pole.py"
+    path.write_text(POLE)
+    return path
+
+
+def test_a_class_in_a_file_is_served_by_who_was_told_to(real: Stage, file: Path, tmp_path: Path) -> None:
+    learner = Learner(real.session, "r", pole(file))
+    learner.header = replace(learner.header, mu=np.ones(2))
+    here = tmp_path / "elsewhere" / "pole.py"
+    here.parent.mkdir()
+    here.write_text(POLE)
+    worker = real.hire(allow_file=(here,))
+    learner.send(worker.id, 0, 1)
+    returns = real.results().returns
+    assert len(returns) == 2
+    assert (returns > 3.9).all(), "four steps of at most 1"
+
+
+def test_a_class_in_a_file_is_refused_by_who_was_not(real: Stage, file: Path) -> None:
+    learner = Learner(real.session, "r", pole(file))
+    worker = real.hire()
+    learner.send(worker.id, 0)
+    said = real.failure()
+    assert said.index is None
+    assert said.error.startswith("pole.py is a file on the learner's machine: copy it here")
+
+
 def test_settings_that_make_no_sense() -> None:
     for values, words in (
         ({"backend": "gpu"}, "unknown backend 'gpu'; known are cpu"),
+        ({"allow_file": (Path("nowhere.py"),)}, "--allow-file nowhere.py: there is no such file"),
         ({"name": "a/b"}, "worker 'a/b' is not a name"),
         ({"farm": "*"}, r"farm '\*' is not a name"),
         ({"connect": ("tcp/here",)}, "is not of the form tcp/HOST:PORT"),

@@ -4,8 +4,7 @@ import threading
 from collections.abc import Callable
 
 from farm.net import keys
-from farm.net.session import Session, connect, listen
-from learner.run import free_endpoint
+from farm.net.session import Session, connect, free_endpoint, listen
 
 MANY = 600  # more than the 256 that a channel of Zenoh's holds by itself
 

@@ -8,7 +8,7 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from learner.algorithms import ALGORITHMS, PGPE, PGPEState
+from learner.algorithms import PGPE, PGPEState
 
 CHOICES = {name: get_args(hint) for name, hint in get_type_hints(PGPE).items() if get_args(hint)}
 COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
@@ -147,4 +147,3 @@ def test_defaults_are_the_papers_rule():
     assert (config.pairs, config.learning_rate_mu, config.learning_rate_sigma) == (15, 0.1, 0.2)
     assert (state.mu.tolist(), state.sigma.tolist()) == ([1.0] * 3, [2.0] * 3)
     assert (state.best, state.baseline, state.generation) == (None, None, 0)
-    assert ALGORITHMS["pgpe"] is PGPE

@@ -14,49 +14,39 @@ import pytest
 
 from farm.errors import RunError
 from farm.net import codec, keys
-from farm.net.work import Chunk, RoundHeader, Job, Jobs
 from farm.net.messages import Refusal, Spec, WorkRequest
-from farm.net.work import Failure, Result, Results, WireTrajectory
-from farm.net.session import Session, connect, listen
-from learner.run import free_endpoint
-from learner.scheduler import attendance
+from farm.net.session import Session, connect, free_endpoint, listen
+from farm.net.telemetry import RunStatus
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, WireTrajectory, traced
 from learner.scheduler import dispatcher as dispatchers
-from learner.scheduler.admission import Admission
+from learner.scheduler import membership
 from learner.scheduler.dispatcher import Dispatcher, Stopped
+from learner.scheduler.membership import Admission
+from learner.scheduler.round import RoundResults
 from learner.scheduler.scheduler import SchedulerConfig
 
-FARM, RUN, STEPS = "try", "r", 3
-SPEC = Spec(
-    run=RUN, task="none", task_config={"steps": STEPS}, policy_config={}, frequencies=np.empty((0, 8)),
-    phases=np.empty(0),
-)  # fmt: skip
-SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
-NEWER = codec.encode(
-    WorkRequest(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2),
-    codec.SCHEMA + 1,
-)
+FARM, RUN, TRACE = "try", "r", (3, 4)
+SPEC = Spec(run=RUN, task="none", task_config={}, policy="none", policy_config={}, code={})
+SHAPES = {"bodies": (2, 7), "actions": (1,), "terms": (2,), "channels/angle": (1,)}
 PATIENT = SchedulerConfig(straggler_seconds=60.0)
 WAIT = 20.0
 
 
-def jobs(count: int, rate: str = "none") -> list[Job]:
-    return [
-        Job(index=i, origin="mu", signs=(1, -1), perturbation=(3, 0, 4, i), rate=rate, eps=np.zeros(2))
-        for i in range(count)
-    ]
+def request(worker: str, credits: int = 1, *, idle: bool = False, canary: str = "c") -> WorkRequest:
+    runs = (RUN,) if idle else ()
+    return WorkRequest(worker=worker, credits=credits, idle=runs, version="0", canary=canary, host="h", cores=2)
 
 
-def result(index: int, rollouts: int = 2, steps: int = STEPS, value: float | None = None) -> Result:
-    no = np.zeros(rollouts, bool)
-    return Result(
-        index=index, trajectory=None, returns=np.full(rollouts, float(index) if value is None else value), success=no,
-        dropped=no, failed=no, clamped=no,
-        traces=np.zeros((rollouts, steps, 54), "<f4"),
-    )  # fmt: skip
+NEWER = codec.encode(request("a/1"), codec.SCHEMA + 1)
+
+
+def jobs(count: int) -> Jobs:
+    """Pairs whose index is in their seeds."""
+    return Jobs.exploring(np.zeros((count, 2)), (1, -1), [(3, 0, 4, i) for i in range(count)])
 
 
 class Worker:
-    """A worker that does what the test says."""
+    """A worker that does what the test says: a job's returns are its index."""
 
     def __init__(self, session: Session, name: str) -> None:
         self.session, self.name = session, name
@@ -76,27 +66,23 @@ class Worker:
         return codec.decode(self.next("inbox"), Chunk)
 
     def want(self, credits: int, *, idle: bool = False) -> None:
-        self.say(
-            keys.want(FARM, self.name),
-            WorkRequest(
-                worker=self.name,
-                credits=credits,
-                idle=(RUN,) if idle else (),
-                version="0",
-                assets="a",
-                canary="c",
-                host="h",
-                cores=2,
-            ),
-        )
+        self.say(keys.want(FARM, self.name), request(self.name, credits, idle=idle))
 
     def say(self, key: str, message: object) -> None:
         self.session.publish(key, message if isinstance(message, bytes) else codec.encode(message))
 
-    def results(self, chunk: Chunk, *results: Result) -> Results:
-        found = results or tuple(result(index) for index in chunk.indices.tolist())
-        head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.name}
-        return Results.of(found, traces="extremes", **head)
+    def results(self, chunk: Chunk, *indices: int, value: float | None = None) -> Results:
+        """Of all jobs of a chunk, or of these."""
+        chosen = sorted(indices or chunk.indices.tolist())
+        returns = np.repeat(np.array(chosen, dtype=float) if value is None else value, 2)
+        traces = np.zeros((len(traced("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4")
+        return Results(
+            **head(chunk), worker=self.name, jobs=np.array(chosen), returns=returns,
+            flags=np.zeros((len(returns), 4), bool), traces=traces, trajectories=(),
+        )  # fmt: skip
+
+    def failure(self, chunk: Chunk, index: int | None, error: str) -> Failure:
+        return Failure(**head(chunk), worker=self.name, index=index, error=error)
 
     def answer(self, message: object) -> None:
         self.say(keys.result(FARM, RUN, self.name), message)
@@ -111,6 +97,10 @@ class Worker:
         return done
 
 
+def head(chunk: Chunk) -> dict[str, object]:
+    return {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round}
+
+
 class Learner:
     """A dispatcher, its rounds collected on another thread."""
 
@@ -118,15 +108,15 @@ class Learner:
         self.session, self.stop = session, threading.Event()
         self._pool = ThreadPoolExecutor(1)
 
-    def show(self, ledger: SchedulerConfig = PATIENT, stopped: Callable[[], bool] | None = None) -> Dispatcher:
+    def show(self, scheduler: SchedulerConfig = PATIENT, stopped: Callable[[], bool] | None = None) -> Dispatcher:
         join = "farm worker --connect here"
         self.farm = Dispatcher(
-            self.session, FARM, SPEC, 9, join, stopped or self.stop.is_set, Admission("a", None), SHAPES, ledger
+            self.session, FARM, SPEC, 9, join, stopped or self.stop.is_set, Admission(None), (TRACE, SHAPES), scheduler
         )
         return self.farm
 
-    def collect(self, todo: list[Job]) -> "Future[list[Result]]":
-        self.farm.begin(0, np.zeros(2), Jobs.of(todo), "extremes")
+    def collect(self, todo: Jobs) -> "Future[RoundResults]":
+        self.farm.begin(0, np.zeros(2), todo, "extremes")
         return self._pool.submit(self.farm.collect)
 
     def close(self) -> None:
@@ -156,8 +146,9 @@ def hire(endpoint: str, learner: Learner) -> Iterator[Hire]:  # noqa: ARG001  th
         yield lambda name: Worker(stack.enter_context(connect((endpoint,), WAIT, lambda: False)), name)
 
 
-def indices(found: list[Result]) -> list[int]:
-    return [one.index for one in found]
+def done(found: RoundResults) -> list[float]:
+    """The returns of each job's first rollout."""
+    return found.returns[::2].tolist()
 
 
 def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
@@ -168,8 +159,7 @@ def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
         collected = learner.collect(jobs(20))
         worker.work(20)
         found = collected.result(WAIT)
-        assert indices(found) == list(range(20))
-        assert [one.returns[0] for one in found] == list(range(20))
+        assert found.returns.tolist() == [i for i in range(20) for _ in range(2)]
     assert farm.workers == ("a/1",)
     assert farm.reissued == 0
     assert not farm.ignored
@@ -178,7 +168,7 @@ def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
 def test_a_round_is_announced(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
-    farm.begin(7, np.array([1.0, 2.0]), Jobs.of(jobs(1)), "all")
+    farm.begin(7, np.array([1.0, 2.0]), jobs(1), "all")
     said = codec.decode(worker.next("generation"), RoundHeader)
     assert (said.run, said.round, said.generation, said.mu.tolist(), said.traces) == (RUN, 1, 7, [1, 2], "all")
     asked = worker.session.ask(keys.generation(FARM, RUN), WAIT)
@@ -193,15 +183,15 @@ def test_no_more_than_a_worker_wants(learner: Learner, hire: Hire) -> None:
     worker.want(3)
     collected = learner.collect(jobs(30))
     held: list[int] = []
-    done = 0
-    while done < 30:
+    count = 0
+    while count < 30:
         chunk = worker.chunk()
         held += chunk.indices.tolist()
         assert len(held) <= 3
-        while held and (len(held) > 1 or done == 29):
-            worker.answer(worker.results(chunk, result(held.pop(0))))
-            done += 1
-    assert indices(collected.result(WAIT)) == list(range(30))
+        while held and (len(held) > 1 or count == 29):
+            worker.answer(worker.results(chunk, held.pop(0)))
+            count += 1
+    assert done(collected.result(WAIT)) == list(range(30))
 
 
 def test_who_wants_nothing_gets_nothing(learner: Learner, hire: Hire) -> None:
@@ -228,12 +218,7 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     farm = learner.show()
     worker = hire("a/1")
     inbox = keys.want(FARM, worker.name)
-    for nonsense in (
-        b"",
-        b"\xc1",
-        NEWER,
-        WorkRequest(worker="b/1", credits=50, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
-    ):
+    for nonsense in (b"", b"\xc1", NEWER, request("b/1", 50)):
         worker.say(inbox, nonsense)
     worker.want(1)
     collected = learner.collect(jobs(4))
@@ -241,22 +226,20 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     honest = worker.results(first)
     bad = [
         b"", b"no message", b"\x80", b"\0" * 200_000, NEWER,
-        worker.results(first, result(0, rollouts=1)), worker.results(first, result(-1)),
-        worker.results(first, result(0, steps=2)), worker.results(first, result(4)),
+        replace(honest, returns=honest.returns[:1], flags=honest.flags[:1]), worker.results(first, -1),
+        replace(honest, traces=honest.traces[:, 1:]), worker.results(first, 4),
         replace(honest, run="other"), replace(honest, worker="b/1"),
         replace(honest, round=0), replace(honest, incarnation="0" * 16),
-        WorkRequest(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="c", host="h", cores=2),
-        Failure(run=RUN, incarnation=first.incarnation, round=first.round, worker="a/1", index=99, error="no"),
-        Failure(run=RUN, incarnation="gone", round=first.round, worker="a/1", index=0, error="no"),
+        request("a/1"), worker.failure(first, 99, "no"), replace(worker.failure(first, 0, "no"), incarnation="gone"),
     ]  # fmt: skip
     for message in bad:
         worker.answer(message)
     assert farm.workers == ("a/1",), "somebody joined by a message of another"
     worker.answer(honest)
-    worker.answer(worker.results(first, result(0, value=7.0)))
+    worker.answer(worker.results(first, 0, value=7.0))
     worker.work(3)
     found = collected.result(WAIT)
-    assert [one.returns.tolist() for one in found] == [[i, i] for i in range(4)]
+    assert done(found) == list(range(4))
     assert farm.ignored == {"bad": 2 + 8, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
 
 
@@ -269,19 +252,18 @@ def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner
     worker.say(keys.want(FARM, worker.name), NEWER)
     worker.answer(worker.results(first))
     worker.work(1)
-    assert [one.returns.tolist() for one in collected.result(WAIT)] == [[i, i] for i in range(2)]
+    assert done(collected.result(WAIT)) == [0, 1]
     assert farm.ignored == {"version": 1}
 
 
 def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attendance, "_SOON", 0.0)
+    monkeypatch.setattr(membership, "_SOON", 0.0)
     monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
     farm = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(30))
-    nobody = WorkRequest(worker="", credits=9, idle=(), version="0", assets="a", canary="c", host="h", cores=2)
-    for i in range(3000):
-        worker.say(keys.want(FARM, f"nobody/{i}"), replace(nobody, worker=f"nobody/{i}"))
+    for i in range(500):
+        worker.say(keys.want(FARM, f"nobody/{i}"), request(f"nobody/{i}", 9))
     worker.want(10)
     worker.work(30)
     collected.result(WAIT)
@@ -290,7 +272,7 @@ def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pyt
     collected = learner.collect(jobs(1))
     worker.work(1)
     collected.result(WAIT)
-    assert farm.ignored == {"absent": 3000}
+    assert farm.ignored == {"absent": 500}
 
 
 def test_a_worker_whose_token_was_missed(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,17 +292,23 @@ def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
     worker.want(1)
-    collected = learner.collect(jobs(1, rate="control"))
-    arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items()}
-    good = WireTrajectory(value=0.0, success=False, times=np.zeros(1), **arrays)
-    bodies, terms = replace(good, bodies=np.zeros((1, 3, 7), "<f4")), replace(good, terms=np.zeros((1, 1), "<f4"))
-    for shown in (None, bodies, terms):
-        chunk = worker.chunk()
-        worker.answer(worker.results(chunk, replace(result(0), trajectory=shown)))
-        worker.answer(Failure(**_head(chunk), worker="a/1", index=0, error="no camera"))
-    with pytest.raises(RunError, match="no camera"):
-        collected.result(WAIT)
-    assert farm.ignored == {"bad": 3}
+    collected = learner.collect(Jobs.mean("control", [None]))
+    arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items() if "/" not in name}
+    angle = {"angle": np.ones((1, 1), "<f4")}
+    good = WireTrajectory(value=0.5, success=False, times=np.zeros(1), channels=angle, **arrays)
+    wrong = [(), (replace(good, bodies=np.zeros((1, 3, 7), "<f4")),), (replace(good, channels={}),), (good, good)]
+    chunk = worker.chunk()
+    said = Results(
+        **head(chunk), worker="a/1", jobs=np.zeros(1, "<i8"), returns=np.ones(1), flags=np.zeros((1, 4), bool),
+        traces=np.zeros((0, *TRACE), "<f4"), trajectories=(good,),
+    )  # fmt: skip
+    for shown in wrong:
+        worker.answer(replace(said, trajectories=shown))
+    worker.answer(said)
+    found = collected.result(WAIT).trajectory(0)
+    assert found is not None
+    assert (found.value, found.channels["angle"].tolist()) == (0.5, [[1.0]])
+    assert farm.ignored == {"bad": 4}
 
 
 def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
@@ -333,9 +321,9 @@ def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
     collected.result(WAIT)
     collected = learner.collect(jobs(1))
     chunk = worker.chunk()
-    worker.answer(worker.results(first, result(0, value=-9.0)))
+    worker.answer(worker.results(first, 0, value=-9.0))
     worker.answer(worker.results(chunk))
-    assert collected.result(WAIT)[0].returns[0] == 0.0
+    assert collected.result(WAIT).returns[0] == 0.0
     assert farm.ignored == {"stale": 1}
 
 
@@ -365,7 +353,7 @@ def test_a_worker_that_is_gone(endpoint: str, learner: Learner, hire: Hire, capl
     other = hire("b/1")
     other.want(4)
     assert sorted(other.work(8)) == list(range(8))
-    assert indices(collected.result(WAIT)) == list(range(8))
+    assert done(collected.result(WAIT)) == list(range(8))
     assert farm.reissued >= 2
     assert farm.workers == ("b/1",)
     assert any(line.startswith("worker a/1 left; ") for line in caplog.messages)
@@ -380,7 +368,7 @@ def test_a_worker_that_lost_its_jobs(learner: Learner, hire: Hire) -> None:
     forgotten = {index for _ in range(2) for index in worker.chunk().indices.tolist()}
     worker.want(2, idle=True)
     assert forgotten <= set(worker.work(5))
-    assert indices(collected.result(WAIT)) == list(range(5))
+    assert done(collected.result(WAIT)) == list(range(5))
     assert farm.reissued == 2
 
 
@@ -392,7 +380,7 @@ def test_a_slow_worker_is_helped(learner: Learner, hire: Hire) -> None:
     stuck = slow.chunk()
     fast.want(5)
     fast.work(2)
-    assert indices(collected.result(WAIT)) == [0, 1]
+    assert done(collected.result(WAIT)) == [0, 1]
     assert farm.reissued >= 1
     collected = learner.collect(jobs(1))
     slow.answer(slow.results(stuck))
@@ -421,21 +409,17 @@ def test_a_job_that_fails_everywhere(learner: Learner, hire: Hire, workers: int)
                 chunk = codec.decode(event.payload, Chunk)
                 turn.put(None)
                 text = f"OverflowError: too much for {hand.name}"
-                hand.answer(Failure(**_head(chunk), worker=hand.name, index=int(chunk.indices[0]), error=text))
+                hand.answer(hand.failure(chunk, 0, text))
 
     threads = [threading.Thread(target=fail, args=(hand,)) for hand in hands]
     for thread in threads:
         thread.start()
-    words = r"pair 0 of generation 0 \(perturbation seed \(3, 0, 4, 0\)\) failed .*OverflowError: too much"
+    words = r"job 0 of generation 0 \(seed \(3, 0, 4, 0\)\) failed .*OverflowError: too much"
     with pytest.raises(RunError, match=words):
         collected.result(WAIT)
     for thread in threads:
         thread.join()
     assert turn.qsize() == 3
-
-
-def _head(chunk: Chunk) -> dict[str, object]:
-    return {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round}
 
 
 def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:
@@ -445,9 +429,9 @@ def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:
     collected = learner.collect(jobs(1))
     for _ in range(2):
         chunk = worker.chunk()
-        worker.answer(Failure(**_head(chunk), worker="a/1", index=0, error="once"))  # type: ignore[arg-type]
+        worker.answer(worker.failure(chunk, 0, "once"))
     worker.work(1)
-    assert indices(collected.result(WAIT)) == [0]
+    assert done(collected.result(WAIT)) == [0]
 
 
 def test_who_does_not_serve_the_run_gets_none_of_it(
@@ -459,30 +443,23 @@ def test_who_does_not_serve_the_run_gets_none_of_it(
     idle.want(3)
     chunk = idle.chunk()
     for _ in range(2):
-        idle.answer(Failure(**_head(chunk), worker="a/1", index=None, error="not allowed here"))  # type: ignore[arg-type]
+        idle.answer(idle.failure(chunk, None, "not allowed here"))
     idle.want(3, idle=True)
     worker.want(2)
     worker.work(6)
-    assert indices(collected.result(WAIT)) == [0, 1, 2, 3, 4, 5]
+    assert done(collected.result(WAIT)) == [0, 1, 2, 3, 4, 5]
     assert farm.workers == ("b/1",)
     assert [text for text in caplog.messages if "not allowed" in text] == [
         "worker a/1 does not serve this run: not allowed here"
     ]
 
 
-def test_another_release_hears_why_it_gets_nothing(
-    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_release_hears_why_it_gets_nothing(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     other, worker = hire("a/1"), hire("b/1")
     other.session.subscribe("refused", keys.refused(FARM, "a/1"))
     collected = learner.collect(jobs(2))
-    with monkeypatch.context() as newer:
-        newer.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
-        said = codec.encode(
-            WorkRequest(worker="a/1", credits=1, idle=(), version="9", assets="a", canary="c", host="h", cores=2)
-        )
-    other.say(keys.want(FARM, "a/1"), said)
+    other.say(keys.want(FARM, "a/1"), NEWER)
     assert "run the same release on both" in codec.decode(other.next("refused"), Refusal).reason
     worker.want(2)
     worker.work(2)
@@ -495,19 +472,46 @@ def test_numbers_of_a_worker_that_did_nothing_bind_nobody(endpoint: str, learner
     worker = hire("b/1")
     with connect((endpoint,), WAIT, lambda: False) as session:
         odd = Worker(session, "a/1")
-        want = WorkRequest(worker="a/1", credits=1, idle=(), version="0", assets="a", canary="odd", host="h", cores=2)
         collected = learner.collect(jobs(2))
-        odd.say(keys.want(FARM, "a/1"), want)
+        odd.say(keys.want(FARM, "a/1"), request("a/1", canary="odd"))
         odd.chunk()
         assert farm.admission.canary == "odd"
-    worker.want(2)
-    until = time.monotonic() + WAIT
-    while not farm.workers or farm.admission.canary != "c":
-        assert time.monotonic() < until
+    chunks: list[Chunk] = []
+    while not chunks:  # refused, until the learner has seen the other one leave
         worker.want(2)
-        time.sleep(0.05)
-    worker.work(2)
+        came = worker.session.events.waiting(0.05)
+        chunks = [codec.decode(event.payload, Chunk) for event in came if event.topic == "inbox"]
+    for chunk in chunks:
+        worker.answer(worker.results(chunk))
+    worker.work(2 - sum(map(len, chunks)))
     collected.result(WAIT)
+    assert farm.admission.canary == "c"
+
+
+def test_who_asks_hears_how_the_run_is_doing(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
+    learner.show()
+    worker, idle = hire("a/1"), hire("b/1")
+    collected = learner.collect(jobs(3))
+    idle.want(1)
+    idle.answer(idle.failure(idle.chunk(), None, "not allowed here"))
+    worker.want(1)
+    worker.work(2)
+    worker.chunk()
+
+    def status() -> RunStatus:
+        payload = worker.session.ask(keys.status(FARM, RUN), WAIT)
+        assert payload is not None
+        return codec.decode(payload, RunStatus)
+
+    until = time.monotonic() + WAIT
+    while (said := status()).open != 1:
+        assert time.monotonic() < until
+    assert (said.run, said.generation, said.generations, said.refused) == (RUN, 0, 9, 1)
+    assert [(one.worker, one.rollouts, one.canary) for one in said.workers] == [("a/1", 4, "c")]
+    learner.stop.set()
+    with pytest.raises(Stopped):
+        collected.result(WAIT)
 
 
 def test_patterns_are_nobodys_name(learner: Learner, hire: Hire) -> None:
@@ -515,8 +519,7 @@ def test_patterns_are_nobodys_name(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     collected = learner.collect(jobs(1))
     for name in ("**", "*/*", "a/**"):
-        want = WorkRequest(worker=name, credits=1, idle=(), version="0", assets="b", canary="c", host="h", cores=2)
-        worker.say(keys.want(FARM, name), want)
+        worker.say(keys.want(FARM, name), request(name))
     worker.want(1)
     worker.work(1)
     collected.result(WAIT)

@@ -1,65 +1,83 @@
 """A round's results: whichever messages bring them, in whatever order, doubled or not, the same comes out."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from farm.net.work import Job, Jobs
-from farm.net.work import Result, Results, WireTrajectory
+from farm.net.work import Jobs, Results, WireTrajectory, traced
 from learner.scheduler.round import RoundResults
 
-TRACE = (3, 54)
-SHAPES = {"bodies": (2, 7), "joints": (8,), "targets": (8,), "images": (3, 18), "points": (3, 3), "terms": (5,)}
+TRACE = (3, 5)
+SHAPES = {"bodies": (2, 7), "actions": (1,), "terms": (2,), "channels/angle": (1,)}
 PAIRS = 12
-RETURNS = np.random.default_rng(0).integers(0, 4, (PAIRS, 2)).astype(float)  # many are equal
-TRACES = np.random.default_rng(1).exponential(size=(PAIRS, 2, *TRACE)).astype("<f4")
+LAST = PAIRS + 1
+RETURNS = np.random.default_rng(0).integers(0, 4, 2 * PAIRS).astype(float)  # many are equal
+TRACES = np.random.default_rng(1).exponential(size=(2 * PAIRS, *TRACE)).astype("<f4")
+SHOWN = WireTrajectory(
+    value=9.0, success=True, times=np.zeros(1), bodies=np.zeros((1, 2, 7), "<f4"), actions=np.zeros((1, 1), "<f4"),
+    terms=np.zeros((1, 2), "<f4"), channels={"angle": np.zeros((1, 1), "<f4")},
+)  # fmt: skip
+JOBS = Jobs.joined(
+    [
+        Jobs.exploring(np.zeros((PAIRS, 2)), (1, -1), None),
+        Jobs.mean("control", [None]),
+        Jobs.single(np.zeros(2), "physics", None),
+    ]
+)
 
 
-def job(index: int) -> Job:
-    seen = index == PAIRS
-    return Job(
-        index=index, origin="mu", signs=(1,) if seen else (1, -1), perturbation=None,
-        rate="control" if seen else "none", eps=np.zeros(0 if seen else 2),
+def begun(traces: str, trace: tuple[int, int] = TRACE) -> RoundResults:
+    return RoundResults(JOBS, traces, trace, SHAPES)
+
+
+def message(indices: Sequence[int], traces: str) -> Results:
+    """What a worker sends of these jobs."""
+    jobs = sorted(indices)
+    rows = [row for job in jobs for row in ((2 * job, 2 * job + 1) if job < PAIRS else (-1,))]
+    returns = np.array([9.0 if row < 0 else RETURNS[row] for row in rows])
+    wanted = [rows[at] for at in traced(traces, returns, np.array(rows) >= 0)]
+    return Results(
+        run="r", incarnation="i", round=1, worker="w/1", jobs=np.array(jobs), returns=returns,
+        flags=np.array([[row % 2 == 1, False, row < 0, False] for row in rows]), traces=TRACES[wanted],
+        trajectories=tuple(replace(SHOWN, value=float(job)) for job in jobs if job >= PAIRS),
     )  # fmt: skip
 
 
-def result(index: int) -> Result:
-    seen = index == PAIRS
-    no = np.zeros(1 if seen else 2, bool)
-    arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items()}
-    return Result(
-        index=index, trajectory=WireTrajectory(value=9.0, success=True, times=np.zeros(1), **arrays) if seen else None,
-        returns=np.full(1, 9.0) if seen else RETURNS[index], success=no, dropped=no,
-        failed=no, clamped=no, traces=np.zeros((1, *TRACE), "<f4") if seen else TRACES[index],
-    )  # fmt: skip
-
-
-def begun(traces: str) -> RoundResults:
-    return RoundResults(Jobs.of([job(i) for i in range(PAIRS + 1)]), traces, TRACE, SHAPES)
-
-
-def message(indices: list[int], traces: str) -> Results:
-    return Results.of([result(i) for i in indices], run="r", incarnation="i", round=1, worker="w/1", traces=traces)
-
-
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("traces", ["extremes", "all"])
 def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: str, seed: int) -> None:
     rng, done, round_ = np.random.default_rng(seed), set[int](), begun(traces)
-    while len(done) <= PAIRS:
-        some = rng.permutation(PAIRS + 1)[: rng.integers(1, 6)].tolist()
+    while len(done) <= LAST:
+        some = rng.permutation(LAST + 1)[: rng.integers(1, 6)].tolist()
         sent = message(some, traces)
         place = round_.place(sent)
         assert place is not None
+        if done & set(some):  # what came before stays, whatever this message says
+            returns = np.where(np.isin(place.rows, list(_rows(done, round_))), -7.0, sent.returns)
+            shown = tuple(replace(t, value=-7.0) if int(t.value) in done else t for t in sent.trajectories)
+            sent = replace(sent, returns=returns, trajectories=shown)
         round_.put(sent, place, np.array([index not in done for index in sent.jobs.tolist()]))
         done.update(some)
-    assert round_.returns.tolist() == [*RETURNS.reshape(-1), 9.0]
-    flat, kept = TRACES.reshape(-1, *TRACE), round_.traces
+    assert round_.returns.tolist() == [*RETURNS, 9.0, 9.0]
+    assert round_.flags[:, 0].tolist() == [False, True] * PAIRS + [True, True]
+    kept = round_.traces
     chosen = {int(RETURNS.argmax()), int(RETURNS.argmin())} if traces == "extremes" else set(range(2 * PAIRS))
     assert chosen <= set(kept)
-    assert all(kept[row].tobytes() == flat[row].tobytes() for row in kept)
-    assert round_[PAIRS].trajectory is not None
+    assert all(kept[row].tobytes() == TRACES[row].tobytes() for row in kept)
+    shown = [round_.trajectory(job) for job in (0, PAIRS, LAST)]
+    assert [None if one is None else one.value for one in shown] == [None, PAIRS, LAST]
+
+
+def _rows(jobs: set[int], round_: RoundResults) -> set[int]:
+    return {row for job in jobs for row in range(round_.rows(job).start, round_.rows(job).stop)}
+
+
+def test_rows_of_a_job() -> None:
+    round_ = begun("none")
+    assert [round_.rows(job) for job in (0, 3, PAIRS, LAST)] == [slice(0, 2), slice(6, 8), slice(24, 25), slice(25, 26)]
+    assert len(round_) == LAST + 1
 
 
 @pytest.mark.parametrize(("wanted", "sent"), [("extremes", "none"), ("extremes", "all"), ("none", "extremes")])
@@ -68,7 +86,7 @@ def test_other_traces_than_were_wanted_do_not_fit(wanted: str, sent: str) -> Non
 
 
 def test_traces_of_another_length_do_not_fit() -> None:
-    longer = RoundResults(begun("all").jobs, "all", (4, 54), SHAPES)
+    longer = begun("all", (4, 5))
     assert longer.place(message([0], "all")) is None
     assert longer.place(message([PAIRS], "all")) is not None  # it has none
 
@@ -76,7 +94,7 @@ def test_traces_of_another_length_do_not_fit() -> None:
 def test_a_message_with_a_job_of_no_round_does_not_fit() -> None:
     """Its best rollout may be that job's, and a trace that is needed be missing."""
     good = message([0, 3], "extremes")
-    for index in (-1, PAIRS + 1):
+    for index in (-1, LAST + 1, 2**62):
         assert begun("extremes").place(replace(good, jobs=np.sort(np.array([0, index])))) is None
     assert begun("extremes").place(replace(good, jobs=np.array([0, PAIRS]))) is None  # that one is of one rollout
 
@@ -87,10 +105,15 @@ def test_results_of_other_shapes_do_not_fit() -> None:
     assert place is not None
     assert place.rows.tolist() == [0, 1, 6, 7, 2 * PAIRS]
     assert place.shown.tolist() == [PAIRS]
-    assert round_.place(replace(good, trajectories=())) is None
-    assert round_.place(replace(good, trajectories=good.trajectories * 2)) is None
-    assert round_.place(replace(good, returns=good.returns[1:], flags=good.flags[1:])) is None
-    assert round_.place(replace(good, traces=good.traces[1:])) is None
-    assert round_.place(replace(good, traces=good.traces[:, 1:])) is None
-    wide = replace(good.trajectories[0], bodies=np.zeros((1, 3, 7), "<f4"))
-    assert round_.place(replace(good, trajectories=(wide,))) is None
+    [shown] = good.trajectories
+    wide, other = replace(shown, bodies=np.zeros((1, 3, 7), "<f4")), replace(shown, channels={})
+    for change in (
+        {"trajectories": ()},
+        {"trajectories": good.trajectories * 2},
+        {"trajectories": (wide,)},
+        {"trajectories": (other,)},
+        {"returns": good.returns[1:], "flags": good.flags[1:]},
+        {"traces": good.traces[1:]},
+        {"traces": good.traces[:, 1:]},
+    ):
+        assert round_.place(replace(good, **change)) is None, change

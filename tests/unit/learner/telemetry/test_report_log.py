@@ -44,7 +44,7 @@ def test_every_generation_once_and_in_order() -> None:
 
 def tuple_of(page: list[RunReport]) -> object:
     return RunHistory(
-        run="r", incarnation="i", recording="r", config={}, generation=100, reports=tuple(page), end=None
+        run="r", incarnation="i", recording="r", config={}, files={}, generation=100, reports=tuple(page), end=None
     )  # fmt: skip
 
 

@@ -2,19 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from farm.errors import RunError
+from farm.errors import ConfigError, Interrupted, RunError
 from farm.net import codec, keys, session
-from farm.net.session import Session
+from farm.net.session import Session, free_endpoint
 from farm.net.telemetry import RunEnd, RunHistory, RunReport
 from learner import config as configs
 from learner.config import RunConfig
-from learner.run import free_endpoint
-from learner.telemetry import subscriber as following
+from learner.telemetry import subscriber as subscribers
 from learner.telemetry.report_log import ReportLog
-from learner.telemetry.subscriber import Subscriber
+from learner.telemetry.subscriber import Subscriber, find_run, localised
 
 
 class Told:
@@ -23,8 +23,8 @@ class Told:
     def __init__(self, link: Session) -> None:
         self.link, self.history = link, ReportLog(page=3000)
         self.page = RunHistory(
-            run="r", incarnation="one", recording="r", config=configs.to_dict(RunConfig()), generation=0, reports=(),
-            end=None,
+            run="r", incarnation="one", recording="r", config=configs.to_dict(RunConfig()),
+            files={"model.xml": "<mujoco/>"}, generation=0, reports=(), end=None,
         )  # fmt: skip
         self.asked: list[int] = []
         self.after: Callable[[], None] = lambda: None
@@ -62,7 +62,7 @@ def told() -> Iterator[tuple[Told, Subscriber]]:
     with session.listen(endpoint, "farm") as link, session.connect((endpoint,), 10, lambda: False) as other:
         learner = Told(link)
         follower = Subscriber(other, "farm", "r")
-        assert follower.begin(lambda: False) == ("r", RunConfig())
+        assert follower.begin(lambda: False) == ("r", RunConfig(), {"model.xml": "<mujoco/>"})
         yield learner, follower
 
 
@@ -105,7 +105,7 @@ def test_the_last_report_is_lost_and_nothing_follows(
     told: tuple[Told, Subscriber], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learner, follower = told
-    monkeypatch.setattr(following, "_QUIET", 0.1)
+    monkeypatch.setattr(subscribers, "_QUIET", 0.1)
     learner.report(1)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 1) == [1]
@@ -163,3 +163,34 @@ def test_a_learner_of_another_version(told: tuple[Told, Subscriber], monkeypatch
 def test_stopped(told: tuple[Told, Subscriber]) -> None:
     _, follower = told
     assert list(follower.follow(0, lambda: True)) == []
+
+
+def test_stopped_before_anybody_is_there(told: tuple[Told, Subscriber]) -> None:
+    learner, follower = told
+    with pytest.raises(Interrupted, match="stopped before run r was there"):
+        follower.begin(lambda: True)
+    with pytest.raises(Interrupted):
+        find_run(learner.link, "farm", lambda: True)
+
+
+def test_the_only_run_of_a_farm_is_found(told: tuple[Told, Subscriber]) -> None:
+    learner, follower = told
+    learner.link.token(keys.learner_token("farm", "r"))
+    assert find_run(follower._session, "farm", lambda: False) == "r"
+    learner.link.token(keys.learner_token("farm", "s"))
+    with pytest.raises(ConfigError, match="farm farm has several runs: r, s; choose one with --run"):
+        find_run(learner.link, "farm", lambda: False)
+
+
+def test_classes_in_files_are_those_of_this_machine(tmp_path: Path) -> None:
+    config = configs.to_dict(RunConfig())
+    assert localised(config, ()) == config
+    config["task"]["name"] = "/somewhere/else/pole.py:Pole"
+    here = tmp_path / "pole.py"
+    found = localised(config, (tmp_path / "other.py", here))
+    assert found["task"] == {**config["task"], "name": f"{here}:Pole"}
+    assert config["task"]["name"].startswith("/somewhere"), "the configuration is left alone"
+    with pytest.raises(
+        ConfigError, match=r"the run's task is a class in pole\.py: copy it here, and give --allow-file"
+    ):
+        localised(config, (tmp_path / "other.py",))

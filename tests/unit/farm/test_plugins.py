@@ -1,0 +1,239 @@
+"""Where tasks, policies and commands come from: built in, installed packages, files; and what goes wrong there."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import farm
+from farm import plugins
+from farm.errors import ConfigError, UnservedError
+from farm.plugins import allowed, code_digest, find, names
+from farm.tasks.finger_gait.task import FingerGait
+
+# ---------------------------------------------------------------- built in
+
+
+def test_built_in() -> None:
+    found = find("tasks", "finger-gait")
+    assert (found.target, found.wire, found.origin, found.release, found.file) == (
+        FingerGait, "finger-gait", "built in", "", None,
+    )  # fmt: skip
+    assert len(found.digest()) == 64
+    assert names("policies") == dict.fromkeys(("direct", "projected", "kernel", "cosine"), "built in")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, name) for kind in plugins.BUILT_IN for name in plugins.BUILT_IN[kind]]
+)
+def test_every_built_in_one_is_there(kind: str, name: str) -> None:
+    chosen = f"{name}:Swimmer-v5" if name == "gym" else name
+    assert callable(find(kind, chosen).target)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "words"),
+    [
+        ("tasks", "juggling", r"unknown task 'juggling'; known are finger-gait, gym, or FILE\.py:CLASS"),
+        ("policies", "pid", r"unknown policy 'pid'; known are direct, .*, or FILE\.py:CLASS"),
+        ("backends", "gpu", r"unknown backend 'gpu'; known are cpu, or FILE"),
+        ("commands", "fly", r"unknown command 'fly'; known are run, .*certificates$"),
+        ("tasks", "gym", "task 'gym': expected gym:NAME"),
+        ("tasks", "gym:", "task 'gym:': expected gym:NAME"),
+        ("tasks", "finger-gait:bar", "task 'finger-gait:bar': expected finger-gait$"),
+        ("tasks", "", "unknown task ''"),
+    ],
+)
+def test_unknown_names_say_what_there_is(kind: str, name: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        find(kind, name)
+
+
+def test_a_variant_is_what_stands_behind_the_colon() -> None:
+    found = find("tasks", "gym:Some-v5")
+    assert (found.variant, found.wire, found.name) == ("Some-v5", "gym:Some-v5", "gym:Some-v5")
+
+
+# ---------------------------------------------------------------- files
+
+Write = Callable[[str], Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def written(text: str, name: str = "mine.py") -> Path:
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return written
+
+
+def test_a_class_in_a_file(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write("class Mine:\n    number = 7\nclass Other: pass\n")
+    found = find("tasks", f"{path}:Mine")
+    assert (found.target.number, found.wire, found.origin, found.file) == (7, "mine.py:Mine", str(path), path)
+    assert found.digest() == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert find("policies", f"{path}:Other").target.__module__ == found.target.__module__, "it is imported once"
+    monkeypatch.chdir(path.parent)
+    assert find("tasks", "mine.py:Mine").target is found.target
+    assert str(path.parent) not in sys.path
+    assert not (path.parent / "__pycache__").exists()
+
+
+def test_a_file_that_changed_is_another_one(write: Write) -> None:
+    path = write("class Mine: number = 7\n")
+    before = find("tasks", f"{path}:Mine")
+    digest = before.digest()
+    path.write_text("class Mine: number = 8\n")
+    after = find("tasks", f"{path}:Mine")
+    assert (before.target.number, after.target.number) == (7, 8)
+    assert before.digest() == digest != after.digest(), "a digest is of the code that was imported"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = 1\nclass Mine\n", r"mine\.py cannot be imported: line 2: expected ':'"),
+        ("x = 1\n\nx = 1 / 0\n", r"mine\.py cannot be imported: line 3: ZeroDivisionError: division by zero"),
+        ("def f():\n    raise OSError('no')\n\nf()\n", r"cannot be imported: line 2: OSError: no"),
+        ("import nowhere_to_be_found\n", "line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
+        ("import json\njson.loads('{')\n", "line 2: JSONDecodeError"),
+        ("class Yours: pass\nfrom pathlib import Path\n", "mine.py has no class 'Mine'; it has Yours$"),
+        ("Mine = 3\n", "has no class 'Mine'; it has none"),
+        ("x = '\0'\n", "cannot be imported: "),
+    ],
+    ids=range(8),
+)
+def test_a_file_that_is_of_no_use_is_one_line(write: Write, text: str, words: str) -> None:
+    path = write(text)
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=words) as caught:
+            find("tasks", f"{path}:Mine")
+        assert len(str(caught.value).splitlines()) == 1
+
+
+def test_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"policy .*none\.py: there is no such file"):
+        find("policies", f"{tmp_path}/none.py:Mine")
+    (tmp_path / "folder.py").mkdir()
+    with pytest.raises(ConfigError, match=r"folder\.py: it cannot be read: Is a directory"):
+        find("policies", f"{tmp_path}/folder.py:Mine")
+
+
+def test_a_file_of_somebody_elses(write: Write, tmp_path: Path) -> None:
+    path = write("class Mine: pass\n")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    found = allowed("tasks", "mine.py:Mine", digest, (tmp_path / "other.py", path))
+    assert found.file == path
+    for wire, told, files, words in (
+        ("mine.py:Mine", digest, (), r"copy it here, and allow it by --allow-file mine\.py"),
+        ("../mine.py:Mine", digest, (path,), "allow it by --allow-file"),
+        ("mine.py:Mine", "", (path,), r"differs from the learner's mine\.py"),
+        ("mine.py:Mine", digest, (tmp_path / "gone" / "mine.py",), "there is no such file"),
+    ):
+        with pytest.raises(UnservedError, match=words):
+            allowed("tasks", wire, told, files)
+
+
+# ---------------------------------------------------------------- installed packages
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An installed distribution with a task, a broken one, and one that would take a built-in's name."""
+    (tmp_path / "theirs_1.py").write_text("import theirs_2\nclass Walk:\n    steps = 5\n")
+    (tmp_path / "theirs_2.py").write_text("")
+    (tmp_path / "theirs_broken.py").write_text("raise RuntimeError('no licence')\n")
+    info = tmp_path / "theirs-1.2.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.2\n")
+    (info / "entry_points.txt").write_text(
+        "[rolloutfarm.tasks]\nwalk = theirs_1:Walk\nbroken = theirs_broken:Task\nlost = theirs_1:Run\n"
+        "finger-gait = theirs_1:Walk\n[rolloutfarm.commands]\nhike = theirs_1:Walk\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins._points.cache_clear()
+    yield tmp_path
+    plugins._points.cache_clear()
+    for name in ("theirs_1", "theirs_2", "theirs_broken"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.usefixtures("package")
+def test_a_class_of_an_installed_package() -> None:
+    found = find("tasks", "walk")
+    assert (found.target.steps, found.wire, found.release, found.origin) == (5, "walk", "theirs 1.2", "theirs 1.2")
+    assert names("tasks") == {
+        **dict.fromkeys(("finger-gait", "gym"), "built in"),
+        **dict.fromkeys(("walk", "broken", "lost"), "theirs 1.2"),
+    }
+    assert find("tasks", "finger-gait").target is FingerGait, "nobody takes a built-in's name"
+    assert find("commands", "hike").target.steps == 5
+    with pytest.raises(ConfigError, match=r"unknown task 'juggling'; known are finger-gait, gym, walk, broken, lost"):
+        find("tasks", "juggling")
+
+
+@pytest.mark.usefixtures("package")
+def test_a_package_that_is_broken_says_so() -> None:
+    with pytest.raises(ConfigError, match=r"task 'broken' of theirs 1\.2 cannot be imported: RuntimeError: no licence"):
+        find("tasks", "broken")
+    with pytest.raises(ConfigError, match=r"task 'lost' of theirs 1\.2 cannot be imported: AttributeError: .*'Run'"):
+        find("tasks", "lost")
+
+
+# ---------------------------------------------------------------- digests
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package of five modules, of which `mine.a` imports all but one."""
+    folder = tmp_path / "mine"
+    (folder / "deep").mkdir(parents=True)
+    for name, text in {
+        "__init__": "", "a": "import json\nfrom mine import b\nfrom . import deep\ndef late():\n    from .c import x\n",
+        "b": "", "c": "x = 1\n", "unused": "", "deep/__init__": "from .e import y\n", "deep/e": "y = 2\n",
+    }.items():  # fmt: skip
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield folder
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mine"]:
+        del sys.modules[name]
+    code_digest.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [("a", True), ("b", True), ("c", True), ("deep/__init__", True), ("deep/e", True), ("unused", False)],
+)
+def test_a_digest_is_of_a_module_and_all_it_imports_of_its_package(source: Path, name: str, counts: bool) -> None:
+    code_digest.cache_clear()
+    before = code_digest("mine.a")
+    path = source / f"{name}.py"
+    path.write_text(path.read_text() + "# changed\n")
+    assert code_digest("mine.a") == before, "what was imported is not imported anew"
+    code_digest.cache_clear()
+    assert (code_digest("mine.a") != before) == counts
+
+
+# ---------------------------------------------------------------- the public names
+
+
+@pytest.mark.parametrize("name", farm.__all__)
+def test_every_public_name_is_there(name: str) -> None:
+    assert getattr(farm, name) is not None
+    assert name in dir(farm)
+
+
+def test_no_other_name_is_there() -> None:
+    with pytest.raises(AttributeError, match="module 'farm' has no attribute 'lean'"):
+        _ = farm.lean
+
+
+def test_farm_alone_imports_nothing_heavy() -> None:
+    code = "import sys, farm; farm.Task; print(*sorted({'mujoco', 'zenoh', 'rerun', 'tyro'} & set(sys.modules)))"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.strip() == "", "a task is declared without simulator or network"

@@ -1,0 +1,117 @@
+"""What a learner publishes for those who look on: every report, its log, pages of the past, the end."""
+
+import logging
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from farm.errors import MessageError
+from farm.net import codec, keys, session
+from farm.net.session import Session, free_endpoint
+from farm.net.stats import GenerationStats
+from farm.net.telemetry import RunHistory, RunReport
+from farm.sim.trajectory import Trajectory
+from learner.config import RunConfig
+from learner.telemetry import publisher as publishers
+from learner.telemetry.publisher import LINE, LINES, Publisher
+from learner.telemetry.report import Report, packed, unpacked
+
+SHOWN = Trajectory(
+    times=np.zeros(1), bodies=np.zeros((1, 2, 7)), actions=np.zeros((1, 1)), terms=np.zeros((1, 1)),
+    channels={"angle": np.ones((1, 1))}, value=0.5, success=None,
+)  # fmt: skip
+
+
+def stats(generation: int) -> GenerationStats:
+    return GenerationStats(
+        generation=generation, rollouts=10 * generation, return_mean=0.0, return_min=0.0, return_max=0.0,
+        return_std=0.0, best=0.0, baseline=None, mean_policy_return=0.0, mean_policy_success=None, success_rate=None,
+        sigma_mean=1.0, sigma_min=1.0, sigma_max=1.0, mean_norm=1.0, ended=0, failed=0, clamped=0, reissued=0,
+        workers=1, seconds=2.0 * generation,
+    )  # fmt: skip
+
+
+def report(generation: int, **changed: Any) -> Report:
+    traces = {"best": np.ones((3, 2), "<f4"), "all": np.ones((4, 3, 2), "<f4")}
+    values = {"rate": 5.0, "sample": SHOWN, "traces": traces, "replay": None, "replay_generation": 0}
+    return Report(progress=stats(generation), **(values | changed))
+
+
+def test_a_report_there_and_back() -> None:
+    made = report(3, replay=SHOWN, replay_generation=2)
+    sent = codec.decode(codec.encode(packed(made, "r", "i", ())), RunReport)
+    back = unpacked(sent)
+    assert (back.progress, back.rate, back.replay_generation) == (made.progress, 5.0, 2)
+    assert {name: values.shape for name, values in back.traces.items()} == {"best": (3, 2), "all": (4, 3, 2)}
+    assert back.sample is not None
+    assert back.sample.channels["angle"].tolist() == [[1.0]]
+    for changed in ({"generation": 4}, {"progress": {}}):
+        with pytest.raises(MessageError, match="^RunReport: "):
+            unpacked(RunReport(**(vars(sent) | changed)))
+
+
+@pytest.fixture
+def link() -> Iterator[tuple[Session, Session]]:
+    endpoint = free_endpoint()
+    with session.listen(endpoint, "farm") as own, session.connect((endpoint,), 10, lambda: False) as other:
+        yield own, other
+
+
+@pytest.fixture
+def publisher(link: tuple[Session, Session]) -> Iterator[Publisher]:
+    """Of a run with two generations behind it, in a folder that was renamed since."""
+    learner = SimpleNamespace(
+        folder=SimpleNamespace(name="r", progress=lambda: [stats(1), stats(2)]), run="first", config=RunConfig(),
+        state=SimpleNamespace(generation=2),
+        problem=SimpleNamespace(task=SimpleNamespace(sources={"model.xml": "<mujoco/>"})),
+    )  # fmt: skip
+    made = Publisher(link[0], "farm", "i", learner)  # type: ignore[arg-type]
+    yield made
+    made.close()
+
+
+def page(other: Session, first: object) -> RunHistory:
+    payload = other.ask(f"{keys.history('farm', 'r')}?from={first}", 10.0)
+    assert payload is not None
+    return codec.decode(payload, RunHistory)
+
+
+def test_who_comes_late_hears_everything(publisher: Publisher, link: tuple[Session, Session]) -> None:
+    publisher.generation(report(3))
+    said = page(link[1], 1)
+    assert (said.run, said.recording, said.generation, said.files) == ("r", "first", 3, {"model.xml": "<mujoco/>"})
+    assert [one.generation for one in said.reports] == [1, 2, 3]
+    assert [one.rate for one in said.reports] == [5.0, 5.0, 5.0]
+    assert [one.sample is None for one in said.reports] == [True, True, False]
+    assert [one.generation for one in page(link[1], 3).reports] == [3]
+    for nonsense in ("-1", "many", "", "9" * 50):
+        assert page(link[1], nonsense).generation == 3
+    publisher.end({"state": "finished"}, None, 0)
+    end = page(link[1], 4).end
+    assert end is not None
+    assert (end.summary, end.best, end.mean) == ({"state": "finished"}, None, None)
+
+
+def test_lines_of_the_log_travel_with_the_next_report(publisher: Publisher, link: tuple[Session, Session]) -> None:
+    log = logging.getLogger("learner.made_up")
+    for number in range(LINES + 5):
+        log.warning("%d %s", number, "x" * LINE)
+    publisher.generation(report(3))
+    publisher.generation(report(4))
+    third, fourth = page(link[1], 3).reports
+    assert len(third.lines) == LINES
+    assert third.lines[0].text.startswith("5 xxx")
+    assert {len(line.text) for line in third.lines} == {LINE}
+    assert fourth.lines == ()
+
+
+def test_traces_that_are_too_large_stay_behind(
+    publisher: Publisher, link: tuple[Session, Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publishers, "_TRACES", 50)
+    publisher.generation(report(3))
+    [said] = page(link[1], 3).reports
+    assert [trace.name for trace in said.traces] == ["best"]

@@ -1,0 +1,52 @@
+"""`farm worker`: what it is told, each of its processes is told."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+
+from farm import settings
+from farm.errors import ConfigError
+from workers.__main__ import Process
+from workers.command import WorkerCommand, _flags
+from workers.worker import WorkerConfig
+
+
+def passed_on(config: WorkerConfig) -> Process:
+    flags = _flags(WorkerCommand(worker=config, log_level="warning"))
+    return settings.parse(Process, flags, "python -m workers")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {},
+        {"connect": ("tcp/127.0.0.1:7000", "tcp/[::1]:7001"), "farm": "lab", "name": "bench-3"},
+        {"timeout": 2.5},
+        {"allow_file": ("a.py", "b.py")},
+    ],
+    ids=str,
+)
+def test_processes_are_told_everything(changed: dict[str, object], tmp_path: Path) -> None:
+    files = tuple(tmp_path / str(name) for name in changed.get("allow_file", ()))  # type: ignore[attr-defined]
+    for path in files:
+        path.touch()
+    config = WorkerConfig(**(changed | ({"allow_file": files} if files else {})))  # type: ignore[arg-type]
+    told = passed_on(config)
+    assert told.worker == config
+    assert told.log_level == "WARNING"
+
+
+def test_no_setting_is_left_out(tmp_path: Path) -> None:
+    """Whoever adds a setting to a worker adds its flag."""
+    path = tmp_path / "mine.py"
+    path.touch()
+    config = replace(WorkerConfig(allow_file=(path,), timeout=1.0), backend="cpu")
+    flags = {word.removeprefix("--").replace("-", "_") for word in _flags(WorkerCommand(worker=config))}
+    assert {field.name for field in fields(WorkerConfig)} - flags == {"tls"}, "needs certificates: see e2e"
+
+
+@pytest.mark.parametrize("count", [0, -1, 4097])
+def test_a_number_of_processes_that_makes_no_sense(count: int) -> None:
+    with pytest.raises(ConfigError, match=f"processes is {count}; expected 1 to 4096"):
+        WorkerCommand(processes=count)
