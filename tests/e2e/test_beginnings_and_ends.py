@@ -21,9 +21,7 @@ def test_a_run_that_starts_from_another(farm: Farm, sigma: str) -> None:
     expected = a.state["sigma"] if sigma == "run" else np.full_like(a.state["sigma"], 0.8)
     assert np.array_equal(b.state["sigma"], expected)
     assert np.array_equal(b.constants["frequencies"], a.constants["frequencies"])
-    assert np.array_equal(c.constants["phases"], a.constants["phases"]), (
-        "they belong to the parameters"
-    )
+    assert np.array_equal(c.constants["phases"], a.constants["phases"]), "they belong to the parameters"
     assert (b.state["generation"], b.rollouts, b.state["best"]) == (0, 0, None)
     assert not np.array_equal(c.state["mu"], a.state["mu"])
 

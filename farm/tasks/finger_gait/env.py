@@ -40,9 +40,10 @@ _SIZE: Final = (480, 640)  # height and width of a picture
 
 
 class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
-    """One rollout an episode; settings are those of `farm run`.
+    """One rollout per episode; settings are those of `farm run`.
 
-    The observation is the state base's x, (d,); at a drop, which ends an episode, it is that of the step before. The discounted sum of an episode's rewards is the farm's return.
+    The observation is the state base's x, (d,); at a drop, which ends an episode, it is that of the step before. The
+    discounted sum of an episode's rewards is the farm's return.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / CONTROL_PERIOD)}

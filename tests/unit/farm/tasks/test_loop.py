@@ -202,8 +202,8 @@ def broken(**methods) -> Runner:
         ({"reward": lambda _, sim, a: 1.0}, "reward reward gave a float"),
         ({"reward": lambda _, sim, a: {"near": np.full(len(sim), np.nan)}}, "reward 'near' is not finite in control "
          "step 1, though the physics is fine"),
-        ({"act": lambda _, sim, a: np.zeros((len(sim), 3))}, r"act gave an array of shape \(1, 3\); expected an array of "
-         r"shape \(1, 1\)"),
+        ({"act": lambda _, sim, a: np.zeros((len(sim), 3))}, r"act gave an array of shape \(1, 3\); expected an array "
+         r"of shape \(1, 1\)"),
         ({"observe": lambda _, sim: [1.0]}, "observe gave a list"),
         ({"ended": lambda _, sim: np.zeros(2, dtype=bool)}, r"ended gave an array of shape \(2,\)"),
         ({"measure": lambda _, sim: {"angle": np.zeros(3)}}, r"angle gave an array of shape \(3,\)"),
