@@ -45,7 +45,7 @@ class Pole(Task):
         """Turn it."""
         sim.qpos[row, 0] = 0.1 if rng is None else rng.uniform(-1.0, 1.0)
 
-    def reward(self, sim, action):  # noqa: ARG002  whatever was done
+    def reward(self, sim, action):
         """Upright."""
         return np.cos(sim.qpos[:, 0])
 

@@ -37,7 +37,7 @@ def test_a_signal_near_the_end_does_not_make_it_wait_for_ever() -> None:
     """A handler that outlasts the time is what SimpleQueue.get does not survive."""
     events, told = Events(), threading.Event()
 
-    def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  as signal wants it
+    def handle(number: int, frame: FrameType | None) -> None:
         told.set()
         time.sleep(0.1)
 

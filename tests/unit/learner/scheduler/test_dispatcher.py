@@ -141,7 +141,7 @@ def learner(endpoint: str) -> Iterator[Learner]:
 
 
 @pytest.fixture
-def hire(endpoint: str, learner: Learner) -> Iterator[Hire]:  # noqa: ARG001  the learner has to be there
+def hire(endpoint: str, learner: Learner) -> Iterator[Hire]:
     with ExitStack() as stack:
         yield lambda name: Worker(stack.enter_context(connect((endpoint,), WAIT, lambda: False)), name)
 
