@@ -26,7 +26,7 @@ class Slow:
     def settle(self):
         self.settled.set()
 
-    def close(self, *, merge=True):
+    def close(self, *, merge=True):  # noqa: ARG002
         self.closed = True
 
 
