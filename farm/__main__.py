@@ -56,6 +56,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except Exception as error:  # of a task of the user's own, whose lines are what helps
+        frames = plugins.author_frames(error)
+        if not frames:
+            raise
+        sys.stderr.write(f"{''.join(frames)}farm: {type(error).__name__}: {error}\n")
+        return 1
 
 
 def _overview() -> str:

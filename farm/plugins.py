@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import importlib.util
 import sys
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -194,6 +195,18 @@ def _where(error: Exception, path: Path) -> str:
         trace = trace.tb_next
     place = f"line {lines[-1]}: " if lines else ""
     return f"{place}{type(error).__name__}: {error}"
+
+
+def author_frames(error: Exception) -> list[str]:
+    """The part of a traceback that lies in classes from files, as text; empty where none does."""
+    found = [
+        summary
+        for (frame, _), summary in zip(
+            traceback.walk_tb(error.__traceback__), traceback.extract_tb(error.__traceback__), strict=True
+        )
+        if str(frame.f_globals.get("__name__")).startswith(_MODULES)
+    ]
+    return traceback.format_list(found)
 
 
 def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:

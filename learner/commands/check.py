@@ -2,7 +2,6 @@
 
 import sys
 import time
-import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ import tyro
 from farm import seeds, settings
 from farm.arrays import FloatArray
 from farm.commands.screen import draw_offscreen
-from farm.errors import ConfigError, FarmError, RunError, TaskError
+from farm.errors import ConfigError, RunError, TaskError
 from farm.tasks.base import TaskConfig
 from learner.config import RunConfig, plugin_path
 
@@ -41,24 +40,10 @@ def main(words: Sequence[str]) -> int:
     default = CheckCommand(name=tyro.MISSING, task=own.task_config if own else TaskConfig())
     command = settings.parse(CheckCommand, words, "farm check", default)
     assert own is not None
-    try:
-        for line in checked(RunConfig(task=own.task, task_config=command.task), command.picture):
-            sys.stdout.write(f"{line}\n")
-            sys.stdout.flush()
-    except FarmError:
-        raise
-    except Exception as error:  # the author's own code: its traceback says where
-        sys.stderr.write("".join(_own_frames(error, command.name)))
-        raise RunError(f"{command.name} failed: {type(error).__name__}: {error}") from None
+    for line in checked(RunConfig(task=own.task, task_config=command.task), command.picture):
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
     return 0
-
-
-def _own_frames(error: Exception, name: str) -> list[str]:
-    """The part of a traceback that lies in the task's own file; all of it where there is none."""
-    path = Path(name.rpartition(":")[0]).resolve()
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if frame.filename == str(path)] or list(frames)
-    return traceback.format_list(own)
 
 
 def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:

@@ -23,7 +23,7 @@ from learner.setup import problem
 
 @dataclass(frozen=True, kw_only=True)
 class SweepCommand:
-    """Settings x seeds on one set of workers, then a table and a figure; given again, it goes on where it stopped."""
+    """Settings x seeds on one set of workers, then a table and a figure; given again, it goes on."""
 
     vary: tuple[str, ...] = ()
     """NAME=V1,V2,...: a setting and its values, repeatable; every combination is done."""

@@ -1,0 +1,150 @@
+"""A learner and workers in one process, over a real Zenoh session on loopback: a task in a file is learnt."""
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from farm.errors import ConfigError
+from farm.net.session import free_endpoint
+from learner import checkpoint as checkpoints
+from learner.config import RunConfig, configure
+from learner.replay import load
+from learner.run import Placement, open_run
+from learner.run_folder import RunFolder
+from workers.worker import WorkerConfig, work
+
+TASK = '''
+import numpy as np
+from farm import Channel, Task
+
+class Cart(Task):
+    """Bring a cart to where it should be."""
+
+    xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
+    steps, substeps = 20, 5
+    channels = (Channel(name="place", kind="scalars", shape=(1,), unit="m", trace=True),)
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row] = 0.5 if rng is None else rng.uniform(0.3, 0.7)
+
+    def measure(self, sim):
+        return {"place": sim.qpos}
+
+    def reward(self, sim, action):
+        return -np.abs(sim.qpos[:, 0])
+'''
+SMALL: dict[str, Any] = {"generations": 6, "pairs": 6, "initial_sigma": 0.5}
+
+
+@pytest.fixture
+def cart(tmp_path: Path) -> Path:
+    path = tmp_path / "mine" / "cart.py"
+    path.parent.mkdir()
+    path.write_text(TASK)
+    return path
+
+
+@contextmanager
+def workers(endpoint: str, count: int, *files: Path) -> Iterator[None]:
+    """Workers on threads of this process; ended by an event."""
+    stop = threading.Event()
+    configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
+    threads = [threading.Thread(target=work, args=(config, stop.is_set)) for config in configs]
+    try:
+        for thread in threads:
+            thread.start()
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(20)
+
+
+def learnt(config: RunConfig, path: Path, count: int, *files: Path, resume: bool = False) -> dict[str, Any]:
+    """A run by so many workers; what its summary says."""
+    place = Placement(listen=free_endpoint(), record=False)
+    with open_run(config, path, place, resume=resume) as run, workers(place.listen, count, *files):
+        for _ in run.learn():
+            pass
+    return run.summary
+
+
+def test_a_task_in_a_file_is_learnt_alike_by_any_workers_and_resumed(cart: Path, tmp_path: Path) -> None:
+    config = configure(f"{cart}:Cart", **SMALL)
+    one, two = (learnt(config, tmp_path / str(count), count, cart) for count in (1, 2))
+    assert one["state"] == two["state"] == "finished"
+    assert one["parameters_sha256"] == two["parameters_sha256"]
+    assert one["best_return"] > -7.0 > -10.0, "standing still returns -10"
+    learnt(configure(f"{cart}:Cart", **{**SMALL, "generations": 3}), tmp_path / "half", 1, cart)
+    whole = learnt(config, tmp_path / "half", 2, cart, resume=True)
+    assert whole["parameters_sha256"] == one["parameters_sha256"]
+    policy = load(tmp_path / "half")
+    assert policy.rollout().trajectory.value == one["mean_policy_return"]
+    assert policy.rollout().trajectory.channels["place"][0, 0] == 0.5
+
+
+def test_a_file_is_served_only_where_it_is_allowed(
+    cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = tmp_path / "cart.py"
+    other.write_text(TASK.replace("np.abs", "2 * np.abs"))
+    config = configure(f"{cart}:Cart", **{**SMALL, "generations": 1})
+    place = Placement(listen=free_endpoint(), record=False)
+    told = threading.Event()
+
+    class Both(logging.Handler):
+        """Hears both sides."""
+
+        said: set[str] = set()
+
+        def emit(self, record: logging.LogRecord) -> None:
+            self.said |= {
+                wanted for wanted in ("allow it by --allow-file cart.py", "cart.py differs from the learner's")
+                if wanted in record.getMessage() and "does not serve this run" in record.getMessage()
+            }  # fmt: skip
+            if len(self.said) == 2:
+                told.set()
+
+    handler = Both()
+    logging.getLogger().addHandler(handler)
+    try:
+        with open_run(config, tmp_path / "r", place) as run:
+            endpoint = place.listen
+            with workers(endpoint, 1), workers(endpoint, 1, other):
+                reports = run.learn()
+                results: list[Any] = []
+                learning = threading.Thread(target=lambda: results.extend(reports))
+                learning.start()
+                assert told.wait(30), handler.said
+                with workers(endpoint, 1, cart):
+                    learning.join(30)
+        assert run.summary["state"] == "finished"
+    finally:
+        logging.getLogger().removeHandler(handler)
+
+
+def test_a_run_keeps_what_its_numbers_follow_from(cart: Path, tmp_path: Path) -> None:
+    config = configure(f"{cart}:Cart", **{**SMALL, "generations": 1})
+    learnt(config, tmp_path / "r", 1, cart)
+    folder = RunFolder.open(tmp_path / "r")
+    at = checkpoints.load(folder.checkpoint)
+    assert set(at.code) == {"task", "policy", "simulation"}
+    assert "slide" in at.files["model.xml"]
+    cart.write_text(TASK.replace("-np.abs", "-2 * np.abs"))
+    with pytest.raises(ConfigError, match="the code of its task has changed since the run began"):
+        learnt(configure(f"{cart}:Cart", **SMALL), tmp_path / "r", 1, cart, resume=True)
+
+
+def test_an_error_in_a_task_of_ones_own_is_named(cart: Path, tmp_path: Path) -> None:
+    cart.write_text(TASK.replace("return -np.abs(sim.qpos[:, 0])", "return 1 / 0"))
+    with pytest.raises(ZeroDivisionError):
+        learnt(configure(f"{cart}:Cart", **SMALL), tmp_path / "r", 1, cart)
+    cart.write_text(TASK.replace("import numpy", "import nunpy"))
+    with pytest.raises(ConfigError, match=r"cart.py cannot be imported: line 2: ModuleNotFoundError"):
+        configure(f"{cart}:Cart")
