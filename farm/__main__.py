@@ -46,22 +46,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments is None:  # where a command has no better idea, SIGTERM is as Ctrl-C
             signal.signal(signal.SIGTERM, signal.default_int_handler)
         return int(plugins.find("commands", name).target(words[1:]))
-    except (KeyboardInterrupt, Interrupted) as end:
-        if isinstance(end, KeyboardInterrupt):
-            sys.stderr.write("farm: stopped before the end\n")
-        return 130
-    except FarmError as error:
-        sys.stderr.write(f"farm: {error}\n")
-        return 2 if isinstance(error, ConfigError) else 1
-    except BrokenPipeError:
+    except (KeyboardInterrupt, Exception) as error:
+        return _ended(error)
+
+
+def _ended(error: BaseException) -> int:
+    """Say how a command ended, and return its exit status; what is no user's mistake is raised again."""
+    if isinstance(error, KeyboardInterrupt | Interrupted):
+        said, status = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n", 130
+    elif isinstance(error, FarmError):
+        said, status = f"farm: {error}\n", 2 if isinstance(error, ConfigError) else 1
+    elif isinstance(error, BrokenPipeError):
         sys.stderr.close()
         return 1
-    except Exception as error:  # of a task of the user's own, whose lines are what helps
+    else:  # of a task of the user's own, whose lines are what helps
         frames = plugins.author_frames(error)
         if not frames:
-            raise
-        sys.stderr.write(f"{''.join(frames)}farm: {type(error).__name__}: {error}\n")
-        return 1
+            raise error
+        said, status = f"{''.join(frames)}farm: {type(error).__name__}: {error}\n", 1
+    sys.stderr.write(said)
+    return status
 
 
 def _overview() -> str:

@@ -197,7 +197,7 @@ def _where(error: Exception, path: Path) -> str:
     return f"{place}{type(error).__name__}: {error}"
 
 
-def author_frames(error: Exception) -> list[str]:
+def author_frames(error: BaseException) -> list[str]:
     """The part of a traceback that lies in classes from files, as text; empty where none does."""
     found = [
         summary

@@ -7,15 +7,16 @@ ranks with ClipUp (Toklu 2020) or Adam are the modern one. Shapes: P parameters,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args, get_type_hints
+from typing import Literal
 
 import numpy as np
 
 from farm.arrays import FloatArray
-from learner.algorithms.checks import check_count, check_number, finite_rows
+from farm.errors import ConfigError
+from farm.settings import Settings, setting
+from learner.algorithms.checks import finite_rows
 from learner.algorithms.gradients import (
     Normaliser,
     baseline_contrast,
@@ -33,20 +34,6 @@ from learner.algorithms.state import Diverged, SearchState, StateValue
 
 # The authors' code: b = 0.9 b + 0.1 mean return.
 _BASELINE_MEMORY = 0.9
-
-_TINY, _BELOW_ONE = math.ulp(0.0), math.nextafter(1.0, 0.0)
-_RANGES = (
-    ("learning_rate_mu", (0.0, math.inf), "0 or more"),
-    ("learning_rate_sigma", (0.0, math.inf), "0 or more"),
-    ("momentum", (0.0, _BELOW_ONE), "0 or more and below 1"),
-    ("second_moment_decay", (0.0, _BELOW_ONE), "0 or more and below 1"),
-    ("max_speed", (_TINY, math.inf), "above 0"),
-    ("initial_mu", (-math.inf, math.inf), "of any sign"),
-    ("initial_sigma", (_TINY, math.inf), "above 0"),
-    ("sigma_floor", (_TINY, math.inf), "above 0"),
-    ("sigma_cap", (_TINY, 1.0), "above 0 and at most 1"),
-)
-_CHOICES = ("estimator", "normaliser", "baseline", "sigma_rule", "shaping", "optimiser")
 
 
 def _empty() -> FloatArray:
@@ -66,10 +53,10 @@ class PGPEState(SearchState):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PGPE:
+class PGPE(Settings):
     """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
 
-    pairs: int = 15
+    pairs: int = setting(15, least=1)
     """Pairs of rollouts a generation, N: 2N rollouts with either estimator."""
     estimator: Literal["symmetric", "plain"] = "symmetric"
     """Pairs mu + eps and mu - eps, or 2N single rollouts mu + eps (Plage 2016, eq. 3.1)."""
@@ -83,38 +70,31 @@ class PGPE:
     """Returns as they are and sums over the pairs, or centred ranks and means over the pairs."""
     optimiser: Literal["sgd", "clipup", "adam"] = "sgd"
     """How mu follows its gradient; sigma always takes a plain step."""
-    learning_rate_mu: float = 0.1
+    learning_rate_mu: float = setting(0.1, least=0.0)
     """Step size of mu, alpha_mu."""
-    learning_rate_sigma: float = 0.2
+    learning_rate_sigma: float = setting(0.2, least=0.0)
     """Step size of sigma, alpha_sigma."""
-    momentum: float = 0.9
+    momentum: float = setting(0.9, least=0.0, below=1.0)
     """Part of the last step that is kept, of ClipUp and Adam (its first decay)."""
-    second_moment_decay: float = 0.999
+    second_moment_decay: float = setting(0.999, least=0.0, below=1.0)
     """Part of the mean squared gradient that Adam keeps."""
-    max_speed: float = 0.2
+    max_speed: float = setting(0.2, above=0.0)
     """Longest step of mu with ClipUp, a Euclidean norm in units of the parameters."""
     initial_mu: float = 1.0
     """First mean of every parameter."""
-    initial_sigma: float = 2.0
+    initial_sigma: float = setting(2.0, above=0.0)
     """First standard deviation of every parameter."""
-    sigma_floor: float = 1e-3
+    sigma_floor: float = setting(1e-3, above=0.0)
     """Least standard deviation, in units of the parameters."""
-    sigma_cap: float = 0.2
+    sigma_cap: float = setting(0.2, above=0.0, most=1.0)
     """Largest relative change of a sigma in one generation, of the capped rule."""
 
     def __post_init__(self) -> None:
         """Check every value."""
-        check_count("pairs", self.pairs)
-        hints = get_type_hints(type(self))
-        for name in _CHOICES:
-            value, known = getattr(self, name), get_args(hints[name])
-            if value not in known:
-                raise ValueError(f"{name} is {value!r}, expected one of {', '.join(known)}")
-        for name, bounds, expected in _RANGES:
-            check_number(name, getattr(self, name), bounds, expected)
+        super().__post_init__()
         if self.initial_sigma < self.sigma_floor:
-            raise ValueError(
-                f"initial_sigma is {self.initial_sigma}, expected sigma_floor ({self.sigma_floor}) or more"
+            raise ConfigError(
+                f"initial-sigma is {self.initial_sigma}; expected {self.sigma_floor} (sigma-floor) or more"
             )
 
     def signs(self) -> tuple[int, ...]:
@@ -128,7 +108,6 @@ class PGPE:
 
     def init(self, size: int) -> PGPEState:
         """Return the state before the first generation, of `size` parameters."""
-        check_count("size", size)
         memory = dict.fromkeys(self._memory(), np.zeros(size))
         mu, sigma = np.full(size, float(self.initial_mu)), np.full(size, float(self.initial_sigma))
         return PGPEState(mu=mu, sigma=sigma, baseline=None, best=None, generation=0, **memory)

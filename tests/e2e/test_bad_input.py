@@ -37,7 +37,7 @@ MISTAKES = [
     (("run", "--task", "gym:Swimmer-v5", "--state", "tactile"), "unrecognized options: --state, tactile"),
     (("run", "--task", "gym:Swimmer-v5", "--stop-when-solved", "1"), "gym:Swimmer-v5 knows returns, but no success"),
     (("run", "--task", "gym:Swimmer-v5", "--steps", "10001"), "steps is 10001; expected 0 to 10000"),
-    (("run", "--pairs", "-3"), "pairs is -3, expected an integer of 1 or more"),
+    (("run", "--pairs", "-3"), "pairs is -3; expected 1 or more"),
     (("run", "--pairs", "many"), "error parsing --pairs"),
     (("run", "--gamma", "1.5"), "gamma is 1.5; expected a positive number, at most 1"),
     (("run", "--workers", "-1"), "workers is -1; expected 0 to 1024"),

@@ -186,8 +186,8 @@ REFUSED: list[tuple[tuple[str, ...], object, str]] = [
     (("task", "perturb"), 1, "task: perturb is 1; expected bool"),
     (("task", "gamma"), float("nan"), "gamma is nan; expected a finite number"),
     (("policy", "bandwidth"), float("inf"), "bandwidth is inf; expected a finite number"),
-    (("algorithm", "pairs"), 0, "algorithm: pairs is 0, expected an integer of 1 or more"),
-    (("algorithm", "estimator"), "guess", "estimator is 'guess', expected one of symmetric, plain"),
+    (("algorithm", "pairs"), 0, "algorithm: pairs is 0; expected 1 or more"),
+    (("algorithm", "estimator"), "guess", "unknown estimator 'guess'; known are symmetric, plain"),
 ]
 
 

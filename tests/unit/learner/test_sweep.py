@@ -101,7 +101,7 @@ def test_values_that_make_no_name_are_numbered(tmp_path):
         (("--vary", "foo=1,2"), "--vary foo=1: no such setting; known are task, policy, algorithm"),
         (("--vary", "out=a,b"), "no such setting"),
         (("--vary", "initial_sigma=a,b"), "could not convert string to float: 'a'"),
-        (("--vary", "initial_sigma=-1,1"), "initial_sigma is -1.0, expected above 0"),
+        (("--vary", "initial_sigma=-1,1"), "initial-sigma is -1.0; expected a positive number"),
         (("--vary", "initial_sigma=0.1,0.10"), "initial_sigma 0.1 and initial_sigma 0.10 are the same configuration"),
         (("--vary", "policy=direct,nope"), "unknown policy 'nope'"),
         (("--vary", "policy=direct,kernel", "--features", "9"), "unrecognized options: --features"),
