@@ -7,7 +7,7 @@ from typing import Final
 
 from learner.outcomes import Curve
 
-INSTALL: Final = "figures need matplotlib: pip install 'rolloutfarm[figures]'"
+INSTALL: Final = "figures need matplotlib: pip install matplotlib"
 
 _COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9")
 """Okabe and Ito's, told apart by the colour-blind; beyond them dashes change."""

@@ -24,11 +24,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from farm import plugins
-from farm.errors import RunError
-from farm.net import session
-from farm.net.session import free_endpoint
+from farm import plugins, rollouts
+from farm.errors import ConfigError, RunError
+from farm.net import keys, session
+from farm.net.session import check_endpoint, free_endpoint
 from farm.processes import Pool
+from farm.settings import Settings, setting
 from learner import config as configs
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
@@ -41,23 +42,42 @@ _OVER: Final = ("finished", "diverged")  # states that running again would not c
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sharing:
-    """Where runs are done; no number depends on it."""
+class Sharing(Settings):
+    """Where runs side by side are done; no number depends on it."""
 
-    parallel: int = 4
+    parallel: int = setting(4, least=1, most=256)
     """Learners at a time."""
-    workers: int = 2
-    """Local worker processes."""
+    workers: int | None = setting(None, least=0, most=1024)
+    """Local worker processes; None: one per core, with --connect none."""
     backend: str = "cpu"
-    """What they simulate with."""
+    """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
     connect: tuple[str, ...] = ()
-    """Routers of a farm to connect to; without: one of our own."""
+    """Use the workers of a farm: its router, repeatable."""
     tls: Path | None = None
     """Folder with the learner's certificates."""
     farm: str = "farm"
     """Name of the farm."""
     record: bool = False
     """Record every run with Rerun."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        if self.tls is not None and not self.connect:
+            raise ConfigError("--tls is for a farm to --connect to: without one everything stays on this machine")
+        if self.tls is not None and self.workers:
+            raise ConfigError("--workers with --tls: a farm's workers have certificates of their own; see farm worker")
+        if self.workers == 0 and not self.connect:
+            raise ConfigError("--workers 0 without --connect: nobody would simulate")
+        rollouts.backend(self.backend)
+        keys.checked("farm", self.farm)
+        for endpoint in self.connect:
+            check_endpoint(endpoint, encrypted=self.tls is not None)
+
+    @property
+    def processes(self) -> int:
+        """Local worker processes."""
+        return self.workers if self.workers is not None else 0 if self.connect else os.cpu_count() or 1
 
 
 class Shown(Protocol):
@@ -149,13 +169,13 @@ def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
 
 def _workers(sharing: Sharing, flags: Sequence[str], runs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
     """Local workers, which may serve the files that these runs come from."""
-    if not sharing.workers:
+    if not sharing.processes:
         return None
     chosen = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
     files = sorted({str(file) for kind, name in chosen if (file := plugins.find(kind, name).file)})
     own = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
     own += [word for file in files for word in ("--allow-file", file)]
-    return stack.enter_context(Pool(sharing.workers, own, dict(os.environ)))
+    return stack.enter_context(Pool(sharing.processes, own, dict(os.environ)))
 
 
 def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], shown: Shown) -> _Learner:

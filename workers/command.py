@@ -9,24 +9,20 @@ from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError
 from farm.processes import Pool
+from farm.settings import Settings, setting
 from workers.worker import WorkerConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkerCommand:
+class WorkerCommand(Settings):
     """Workers alone: they serve whichever learners they find, until stopped."""
 
     worker: WorkerConfig = field(default_factory=WorkerConfig)
     """Where they work."""
-    processes: int | None = None
+    processes: int | None = setting(None, least=1, most=4096)
     """Worker processes; None: one per core."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
-
-    def __post_init__(self) -> None:
-        """Check the number."""
-        if self.processes is not None and not 1 <= self.processes <= 4096:
-            raise ConfigError(f"processes is {self.processes}; expected 1 to 4096")
 
 
 def main(words: Sequence[str]) -> int:

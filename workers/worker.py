@@ -27,6 +27,7 @@ from farm.net.session import Session, check_endpoint, connect
 from farm.net.tls import Bundle, find
 from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
 from farm.rollouts import Runner, served
+from farm.settings import Settings, setting
 from workers import fingerprint
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ _MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkerConfig:
+class WorkerConfig(Settings):
     """A worker and where it works."""
 
     connect: tuple[str, ...] = ()
@@ -54,7 +55,7 @@ class WorkerConfig:
     """Name of this worker; without one: the host's, with --tls the certificate's."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed to dial tls/HOST:PORT."""
-    timeout: float | None = None
+    timeout: float | None = setting(None, least=0.0)
     """Give up when nobody answers for so long at the start [s]; None: keep trying."""
     backend: str = "cpu"
     """What simulates: a name, or FILE.py:CLASS."""
@@ -63,6 +64,7 @@ class WorkerConfig:
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""
+        super().__post_init__()
         bundle = self.bundle
         if bundle is not None:
             object.__setattr__(self, "name", bundle.name)
@@ -79,8 +81,6 @@ class WorkerConfig:
         for path in self.allow_file:
             if not path.is_file():
                 raise ConfigError(f"--allow-file {path}: there is no such file")
-        if self.timeout is not None and not 0 <= self.timeout < float("inf"):
-            raise ConfigError(f"timeout is {self.timeout}; expected a number of seconds")
 
     @property
     def bundle(self) -> Bundle | None:

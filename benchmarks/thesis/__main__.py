@@ -25,7 +25,8 @@ from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError, RunError
 from learner import sweep
 from learner.commands.learning import INTERRUPTED
-from learner.commands.side_by_side import Runs, SharingOptions
+from learner.commands.side_by_side import Runs, check
+from learner.sweep import Sharing
 from learner.figure import INSTALL, available
 
 ALL: Final = "thesis"
@@ -51,7 +52,7 @@ class ExperimentCommand:
     """Make every run this short."""
     out: Path | None = None
     """Folder for runs, data and figures; None: runs/NAME."""
-    sharing: SharingOptions = field(default_factory=SharingOptions)
+    sharing: Sharing = field(default_factory=Sharing)
     """Where the runs are done."""
 
     def __post_init__(self) -> None:
@@ -82,13 +83,13 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"which experiment? {PROGRAM} --list shows them")
     names = tuple(EXPERIMENTS) if command.name == ALL else (find(command.name).name,)
     check_matplotlib()
-    sharing = command.sharing.sharing()
+    check(command.sharing)
     logs.set_up("WARNING")
     out = command.out or Path("runs") / command.name
     folder = ExperimentFolder.prepare(out, names, command.trials, command.generations)
     with stop_flag("saving and ending") as stop:
         with Runs(folder.runs, folder.path) as shown:
-            complete = sweep.run(folder.runs, sharing, shown, stop.is_set)
+            complete = sweep.run(folder.runs, command.sharing, shown, stop.is_set)
         folder.gather()
         if stop.is_set():
             sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command goes on with them\n")

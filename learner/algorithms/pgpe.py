@@ -16,7 +16,6 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from learner.algorithms.checks import finite_rows
 from learner.algorithms.gradients import (
     Normaliser,
     baseline_contrast,
@@ -30,7 +29,7 @@ from learner.algorithms.gradients import (
     weighted_sum,
 )
 from learner.algorithms.optimisers import SigmaRule, adam, clipup, step_sigma
-from learner.algorithms.state import Diverged, SearchState, StateValue
+from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows
 
 # The authors' code: b = 0.9 b + 0.1 mean return.
 _BASELINE_MEMORY = 0.9

@@ -112,3 +112,13 @@ def _scalar(name: str, value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, float | int) or not np.isfinite(value):
         raise ValueError(f"state: {name} must be a finite number or None, not {value!r}")
     return float(value)
+
+
+def finite_rows(name: str, array: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Return the array in C order, so that sums over its rows run in index order."""
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} has the shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has non-finite values, expected finite ones everywhere")
+    return array

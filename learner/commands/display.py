@@ -4,7 +4,7 @@ import json
 import logging
 import sys
 from collections.abc import Sequence
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -26,24 +26,22 @@ Style = Literal["auto", "quiet", "json"]
 """What a user asked for: a screen or lines, nothing but the end, or a JSON object a line."""
 
 
-class Display(Protocol):
-    """Shows a run while it is entered, and how it ended after that."""
+class Display:
+    """Shows a run while it is entered, and how it ended after that; this one shows nothing before."""
 
     def __enter__(self) -> "Display":
         """Begin."""
-        ...
+        return self
 
     def __exit__(self, *_: object) -> None:
         """End."""
-        ...
 
     def show(self, report: Report) -> None:
         """A generation is over."""
-        ...
 
     def conclude(self, lines: Sequence[str]) -> None:
         """The run is over; the lines say how it went and what to do next."""
-        ...
+        _write(lines)
 
 
 def display(run: Run, announcement: Sequence[str], style: Style) -> Display:
@@ -51,31 +49,13 @@ def display(run: Run, announcement: Sequence[str], style: Style) -> Display:
     if style == "json":
         return JsonDisplay(run)
     if style == "quiet":
-        return QuietDisplay()
+        return Display()
     console = Console()
     return LiveDisplay(console, run, announcement) if console.is_terminal else PlainDisplay(run, announcement)
 
 
-class QuietDisplay:
-    """Nothing until the run is over."""
-
-    def __enter__(self) -> "QuietDisplay":
-        """Nothing to prepare."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to put away."""
-
-    def show(self, report: Report) -> None:
-        """Say nothing."""
-
-    def conclude(self, lines: Sequence[str]) -> None:
-        """Say how it ended."""
-        _write(lines)
-
-
-class PlainDisplay(QuietDisplay):
-    """One line a generation."""
+class PlainDisplay(Display):
+    """One line per generation."""
 
     def __init__(self, run: Run, announcement: Sequence[str]) -> None:
         """Say what begins."""
@@ -96,8 +76,8 @@ class PlainDisplay(QuietDisplay):
         )
 
 
-class JsonDisplay(QuietDisplay):
-    """One JSON object a line: the run, each generation as in progress.jsonl, at last the summary."""
+class JsonDisplay(Display):
+    """One JSON object per line: the run, each generation as in progress.jsonl, at last the summary."""
 
     def __init__(self, run: Run) -> None:
         """Say what begins."""
@@ -117,7 +97,7 @@ class JsonDisplay(QuietDisplay):
         _write([json.dumps({"event": event, **values})])
 
 
-class LiveDisplay:
+class LiveDisplay(Display):
     """Returns, sigma, workers, recording and a progress bar, refreshed in place; messages scroll above."""
 
     def __init__(self, console: Console, run: Run, announcement: Sequence[str]) -> None:
@@ -156,10 +136,6 @@ class LiveDisplay:
         self._returns.append(report.progress.mean_policy_return)
         self._bar.update(self._task, completed=report.progress.generation)
         self._live.update(self._screen(report))
-
-    def conclude(self, lines: Sequence[str]) -> None:
-        """Say how it ended."""
-        _write(lines)
 
     def _screen(self, report: Report | None) -> Group:
         rows = [self._bar] if report is None else [self._learning(report), self._farm(report), self._bar]

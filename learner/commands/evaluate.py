@@ -12,32 +12,25 @@ from rich.console import Console
 from rich.table import Table
 
 from farm import settings
-from farm.errors import ConfigError
 from farm.seeds import SEEDS
+from farm.settings import Settings, setting
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
 from learner.replay import loaded
 from learner.run_folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateCommand:
+class EvaluateCommand(Settings):
     """The learnt mean policy on perturbed starts and conditions, as its task draws them."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
-    rollouts: int = EVALUATION_ROLLOUTS
+    rollouts: int = setting(EVALUATION_ROLLOUTS, least=1, most=1_000_000)
     """Perturbed rollouts."""
-    seed: int = EVALUATION_SEED
+    seed: int = setting(EVALUATION_SEED, least=0, most=SEEDS - 1)
     """Seed of the perturbations."""
     json: bool = False
     """Print JSON instead of a table."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if not 1 <= self.rollouts <= 1_000_000:
-            raise ConfigError(f"rollouts is {self.rollouts}; expected 1 to 1000000")
-        if not 0 <= self.seed < SEEDS:
-            raise ConfigError(f"seed is {self.seed}; expected 0 to 2^32 - 1")
 
 
 def main(words: Sequence[str]) -> int:

@@ -9,28 +9,28 @@ import tyro
 
 from farm import settings as arguments
 from farm.errors import ConfigError
+from farm.settings import Settings, setting
 from learner import export
 from learner.replay import loaded
 from learner.run_folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportCommand:
+class ExportCommand(Settings):
     """A learnt policy as one file for plain MuJoCo and numpy; docs/export.md says how to run it."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: tyro.conf.Positional[Path]
     """File to write: a name that ends in .npz."""
-    generation: int | None = None
+    generation: int | None = setting(None, least=0)
     """Generation whose mean policy is written, 0 for the first; None: the last."""
 
     def __post_init__(self) -> None:
         """Check the values."""
+        super().__post_init__()
         if self.to.suffix != ".npz":
             raise ConfigError(f"{self.to}: expected a name that ends in .npz")
-        if self.generation is not None and self.generation < 0:
-            raise ConfigError(f"generation is {self.generation}; expected 0 or more")
 
 
 def main(words: Sequence[str]) -> int:

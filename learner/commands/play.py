@@ -14,6 +14,7 @@ from farm.commands import logs
 from farm.commands.screen import display
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError
+from farm.settings import Settings, setting
 from farm.sim.engines import DataEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskConfig
@@ -27,28 +28,19 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayCommand:
+class PlayCommand(Settings):
     """The learnt policy in MuJoCo's interactive viewer, over and over; Ctrl+drag pushes."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
-    generation: int | None = None
+    generation: int | None = setting(None, least=0)
     """Generation whose mean policy is played, 0 for the first; None: the last."""
-    speed: float = 1.0
+    speed: float = setting(1.0, least=0.01, most=10)
     """1 is real time."""
-    hold: float = 2.0
+    hold: float = setting(2.0, least=0, most=3600)
     """How long the scene rests before it begins again [s]."""
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task, the run's own unless given."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.generation is not None and self.generation < 0:
-            raise ConfigError(f"generation is {self.generation}; expected 0 or more")
-        if not 0.01 <= self.speed <= 10:
-            raise ConfigError(f"speed is {self.speed}; expected 0.01 to 10")
-        if not 0 <= self.hold <= 3600:
-            raise ConfigError(f"hold is {self.hold}; expected 0 to 3600")
 
 
 def main(words: Sequence[str]) -> int:

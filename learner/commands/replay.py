@@ -10,7 +10,8 @@ import tyro
 
 from farm import settings
 from farm.commands.screen import draw_offscreen
-from farm.errors import ConfigError, RunError
+from farm.errors import RunError
+from farm.settings import Settings, setting
 from farm.tasks.base import TaskConfig
 from learner.commands import recordings
 from learner.run_folder import RunFolder
@@ -20,28 +21,21 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayCommand:
+class ReplayCommand(Settings):
     """Any policy of a run again, at physics rate, into a recording; its task may have other settings."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: Path | None = None
     """Recording to write; None: rollout.rrd in the run's folder."""
-    generation: int | None = None
+    generation: int | None = setting(None, least=0)
     """Generation whose mean policy is shown, 0 for the first; None: the last."""
     video: Path | None = None
     """Video to write as well: a name that ends in .gif or .mp4."""
-    speed: float = 0.25
+    speed: float = setting(0.25, least=0.01, most=10)
     """Speed of the video: 1 is real time."""
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task, the run's own unless given."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.generation is not None and self.generation < 0:
-            raise ConfigError(f"generation is {self.generation}; expected 0 or more")
-        if not 0.01 <= self.speed <= 10:
-            raise ConfigError(f"speed is {self.speed}; expected 0.01 to 10")
 
 
 def main(words: Sequence[str]) -> int:

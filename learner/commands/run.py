@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from farm import rollouts
 from farm.errors import ConfigError
 from farm.net.session import free_endpoint
+from farm.settings import Settings, setting
 from learner.commands.learning import learn
 from learner.commands.options import LearnerOptions, parse
 from learner.config import RunConfig
@@ -13,12 +14,12 @@ from learner.run import Placement
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunCommand:
+class RunCommand(Settings):
     """Learner and local workers together: learns a task and records it."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
     """Where the run comes from and where it goes."""
-    workers: int = 2
+    workers: int = setting(2, least=0, most=1024)
     """Worker processes on this machine."""
     backend: str = "cpu"
     """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
@@ -26,9 +27,8 @@ class RunCommand:
     """The run."""
 
     def __post_init__(self) -> None:
-        """Check the number."""
-        if not 0 <= self.workers <= 1024:
-            raise ConfigError(f"workers is {self.workers}; expected 0 to 1024")
+        """Check every value."""
+        super().__post_init__()
         rollouts.backend(self.backend)
 
 

@@ -14,7 +14,8 @@ from learner import config as configs
 from learner import figure, grid, outcomes, sweep
 from learner.commands.learning import INTERRUPTED
 from learner.commands.options import parse
-from learner.commands.side_by_side import Runs, SharingOptions
+from learner.commands.side_by_side import Runs
+from learner.commands.side_by_side import check as check_sharing
 from learner.config import RunConfig
 from learner.grid import Setting, Sweep
 from learner.run import check_size
@@ -35,7 +36,7 @@ class SweepCommand:
     """Settings to begin with, by name (farm tasks NAME lists a task's); None: the task's first."""
     config: Path | None = None
     """Settings to begin with: a config.json (other flags override it)."""
-    sharing: SharingOptions = field(default_factory=SharingOptions)
+    sharing: sweep.Sharing = field(default_factory=sweep.Sharing)
     """Where the runs are done."""
     run: RunConfig = field(default_factory=RunConfig)
     """What all runs share."""
@@ -52,13 +53,13 @@ def main(words: Sequence[str]) -> int:
     settings = tuple(_setting(values, words) for values in grid.combinations(vary, len(seeds)))
     chosen = Sweep(command.out, settings, seeds)
     grid.check(chosen)
-    sharing = command.sharing.sharing()
+    check_sharing(command.sharing)
     _check_begins(chosen)
     logs.set_up("WARNING")
     chosen.prepare()
     with stop_flag("saving and ending") as stop:
         with Runs(chosen.runs, chosen.path) as shown:
-            complete = sweep.run(chosen.runs, sharing, shown, stop.is_set)
+            complete = sweep.run(chosen.runs, command.sharing, shown, stop.is_set)
         table = outcomes.rows(chosen)
         outcomes.write_csv(chosen.path / "table.csv", chosen, table)
         if stop.is_set():

@@ -7,43 +7,27 @@ from collections import deque
 from dataclasses import dataclass
 from statistics import median
 
+from farm.settings import Settings, setting
+
 _SAMPLES = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class SchedulerConfig:
+class SchedulerConfig(Settings):
     """How jobs are handed out, and when one is given to a second worker or given up."""
 
-    chunk_seconds: float = 0.2
+    chunk_seconds: float = setting(0.2, above=0.0)
     """Work sent to a worker in one message [s], by the running median."""
-    least_seconds: float = 0.015
+    least_seconds: float = setting(0.015, above=0.0)
     """Towards the end of a round chunks shrink down to this [s]: rollouts in small batches are slower."""
-    straggler_factor: float = 4.0
+    straggler_factor: float = setting(4.0, least=1.0)
     """A job out longer than this many running medians is copied to another worker."""
-    straggler_seconds: float = 1.0
+    straggler_seconds: float = setting(1.0, above=0.0)
     """A job is never copied sooner than this [s]."""
-    copies: int = 3
+    copies: int = setting(3, least=1)
     """Workers that may hold one job at once; 1 means no copies."""
-    max_errors: int = 3
+    max_errors: int = setting(3, least=1)
     """Different workers that answer an error for one job before the run stops."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        for name, least in (
-            ("chunk_seconds", 0.0),
-            ("least_seconds", 0.0),
-            ("straggler_factor", 1.0),
-            ("straggler_seconds", 0.0),
-        ):
-            value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not math.isfinite(value) or value < least or value == 0.0:
-                bound = "above 0" if least == 0.0 else f"of {least} or more"
-                raise ValueError(f"{name} is {value!r}, expected a finite number {bound}")
-        for name in ("copies", "max_errors"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} is {value!r}, expected an integer of 1 or more")
 
 
 class Chunking:

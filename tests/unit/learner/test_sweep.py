@@ -235,4 +235,4 @@ def test_the_figure_names_every_setting_and_is_the_same_again(tmp_path):
 def test_without_matplotlib_one_line_says_how_to_get_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(figure, "available", lambda: False)
     command._draw(made(tmp_path, "0.1"))
-    assert capsys.readouterr().out == "no figure: figures need matplotlib: pip install 'rolloutfarm[figures]'\n"
+    assert capsys.readouterr().out == "no figure: figures need matplotlib: pip install matplotlib\n"
