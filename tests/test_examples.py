@@ -34,3 +34,26 @@ def test_random_actions_play_episodes(tmp_path: Path) -> None:
     said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
     assert [line.split(":")[0] for line in said.splitlines()] == ["episode 0", "episode 1"]
     assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())
+
+
+_SCRIPT = """
+import farm
+
+config = farm.configure("finger-gait", generations=1, pairs=2)
+for report in farm.learn(config, "run", workers=1):
+    print(report.progress.generation)
+print(farm.load("run").rollout().trajectory.value)
+"""
+
+
+def test_a_script_beside_folders_of_ones_own_named_like_ours(tmp_path: Path) -> None:
+    for name in ("learner", "workers", "assets"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('not this one')")
+    (tmp_path / "script.py").write_text(_SCRIPT)
+    command = [sys.executable, "script.py"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines()[0] == "1"
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert float(ended.stdout.splitlines()[1]) == summary["mean_policy_return"]

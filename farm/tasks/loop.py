@@ -211,7 +211,9 @@ def _run(task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[
     while not batch.over:
         if len(batch.active) < len(prepared):
             prepared = all_prepared[batch.active]
-        batch.step(policy.act(prepared, batch.observe()))
+        action = policy.act(prepared, batch.observe())
+        columns = np.shape(action)[1:2] or (sim.model.nu,)
+        batch.step(_array("act of the policy", action, (len(batch.active), *columns)))
     return batch.rollouts()
 
 

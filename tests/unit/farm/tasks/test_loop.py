@@ -274,3 +274,10 @@ def test_sim_shows_what_is_going_and_follows_it():
     assert (sim.qpos[:, 0].tolist(), sim.own["name"].tolist(), len(sim)) == ([1.0, 3.0, 2.0], [10, 30, 20], 3)
     sim.step(2)
     assert sim.qvel.shape == (3, 2)
+
+
+def test_a_policy_of_another_shape_is_named():
+    made = runner()
+    made.policy.act = lambda prepared, x: np.zeros(len(x))
+    with pytest.raises(TaskError, match=r"act of the policy gave an array of shape \(2,\)"):
+        made.rollouts(thetas(made, 2), [None, None])
