@@ -92,6 +92,6 @@ def load(path: Path) -> Checkpoint:
     if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
         raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
     try:
-        return codec.decode(body, Checkpoint, _SCHEMA)
+        return codec.decode(body, Checkpoint, _SCHEMA, most=len(body))
     except MessageError as error:
         raise CheckpointError(f"{path}: {error}") from None

@@ -354,6 +354,11 @@ def check_size(problem: Problem) -> None:
     size, most = problem.policy.size, MESSAGE_LIMIT // 8
     if size > most:
         raise ConfigError(f"the policy has {size} parameters; at most {most} fit into a message")
+    constants = sum(values.nbytes for values in problem.policy.constants.values())
+    if constants > MESSAGE_LIMIT:
+        raise ConfigError(
+            f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit into a message"
+        )
 
 
 def check_rerun() -> None:

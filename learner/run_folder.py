@@ -169,7 +169,7 @@ class RunFolder:
         for line in lines:
             try:
                 out.append(GenerationStats.from_dict(json.loads(line)))
-            except ValueError:
+            except (ValueError, RecursionError):
                 break  # torn by a crash, or of another version: nothing behind it is trusted
         return out
 

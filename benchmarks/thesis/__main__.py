@@ -26,8 +26,8 @@ from farm.errors import ConfigError, FarmError, RunError
 from learner import sweep
 from learner.commands.learning import INTERRUPTED
 from learner.commands.side_by_side import Runs, check
-from learner.sweep import Sharing
 from learner.figure import INSTALL, available
+from learner.sweep import Sharing
 
 ALL: Final = "thesis"
 """All experiments."""

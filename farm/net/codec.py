@@ -47,15 +47,16 @@ def encode(message: object, schema: int | None = None) -> bytes:
     return bytes(msgpack.packb(body, default=_pack, use_bin_type=True) or b"")
 
 
-def decode(payload: bytes, kind: type[M], schema: int | None = None) -> M:
-    """The message of that type in these bytes.
+def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int | None = None) -> M:
+    """The message of that type in these bytes, at most so many; a file may have more than a message.
 
     Raises:
       MessageError: oversized ("large"), not msgpack or of the wrong shape ("bad"), another type
         ("bad") or another schema version ("version").
     """
-    if len(payload) > MAX_BYTES:
-        raise MessageError(f"a message of {len(payload)} bytes; at most {MAX_BYTES} are taken", "large")
+    most = MAX_BYTES if most is None else most
+    if len(payload) > most:
+        raise MessageError(f"a message of {len(payload)} bytes; at most {most} are taken", "large")
     try:
         structure = msgpack.Unpacker(max_buffer_size=max(len(payload), 1))
         structure.feed(payload)

@@ -33,6 +33,7 @@ _WAIT: Final = 0.2  # [s] between two looks at whether to stop
 _STATUS: Final = 0.5  # [s] between two refreshments of the status
 _ASK: Final = 0.5  # [s] for a token that may be there
 _LOOKS: Final = 5  # tokens that are asked for at a time: for all at once Zenoh needs 9 s where there are 30 000
+_CHUNK: Final = 32 << 20  # [bytes] of eps in one message, unless one job alone has more
 _REFUSED: Final = 10_000  # workers that are remembered to be refused
 _PATIENCE: Final = 3.0  # [s] without workers before the user is told
 
@@ -308,8 +309,10 @@ class Dispatcher:
         for worker, indices in self._scheduler.assign(time.monotonic()):
             # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
             head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
-            chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices), **head))
-            self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
+            most = max(1, _CHUNK // max(1, self._header.mu.nbytes))
+            for first in range(0, len(indices), most):
+                chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices[first : first + most]), **head))
+                self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
     def report(self, progress: GenerationStats) -> None:
         """Take in how the last generation went, for people who ask."""

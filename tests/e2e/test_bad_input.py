@@ -161,3 +161,23 @@ def test_a_checkpoint_of_another_configuration(farm: Farm) -> None:
     shutil.copy(runs / "a" / "checkpoint", runs / "b" / "checkpoint")
     said = farm.call("run", "--resume", "runs/b", "--generations", "2", status=2)
     assert "is of another configuration: --seed is 0 there and 3 in config.json" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--policy", "direct", "--features", "2000000"), "16000000 parameters; at most 4194304 fit into a message"),
+        (("--policy", "projected", "--features", "600000"), "the policy's constants take 41 MiB; at most 32 fit"),
+    ],
+)
+def test_a_policy_too_large_for_a_message_is_refused_before_the_run_begins(
+    words: tuple[str, ...],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(("run", "--no-record", *words)) == 2
+    assert line in "".join(capfd.readouterr())
+    assert not (tmp_path / "runs").exists()

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from farm.errors import CheckpointError
+from farm.net import codec
 from learner import checkpoint as checkpoints
 from learner.algorithms import PGPE, PGPEState
 from learner.checkpoint import BestRollout, Checkpoint, load, save
@@ -141,3 +142,10 @@ def test_a_failure_leaves_the_old_one(tmp_path: Path, whole: bytes, monkeypatch:
     assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"], "the torn new one takes room"
     save(path, checkpoint(rollouts=240))
     assert load(path).rollouts == 240
+
+
+def test_more_than_a_message_may_hold(tmp_path: Path) -> None:
+    large = checkpoint(constants={"frequencies": np.ones((codec.MAX_BYTES // 8 + 1, 1))})
+    save(tmp_path / "checkpoint", large)
+    assert (tmp_path / "checkpoint").stat().st_size > codec.MAX_BYTES
+    assert load(tmp_path / "checkpoint").constants["frequencies"].shape == large.constants["frequencies"].shape
