@@ -263,14 +263,12 @@ class FingerGait(Task):
     def measure(self, sim: Sim) -> dict[str, FloatArray]:
         """Forces (B, 3, C) [N] as of the last physics step's beginning, where they act in the fingertips' frames
         (B, 3, C, 3) [m], and joint targets (B, 8) [rad]."""  # noqa: D205, D209
-        count = len(sim)
-        sensors = sim.sensordata.reshape(count, len(FINGERS), model.CONTACTS, model.CONTACT_WIDTH)
+        count, sensors = len(sim), _sensors(sim)
         axes = sim.site_xmat[:, self.hand.tip_sites].reshape(count, len(FINGERS), 1, 3, 3)
         away = sensors[..., 4:7] - sim.site_xpos[:, self.hand.tip_sites][:, :, None, :]
         place = axes[..., 0, :] * away[..., 0:1] + axes[..., 1, :] * away[..., 1:2] + axes[..., 2, :] * away[..., 2:3]
         found = sensors[..., 0] > 0
-        force = np.where(found, sensors[..., 1], 0.0)
-        return {"force": force, "place": np.where(found[..., None], place, 0.0), "target": sim.ctrl}
+        return {"force": _force(sensors), "place": np.where(found[..., None], place, 0.0), "target": sim.ctrl}
 
     def observe(self, sim: Sim) -> FloatArray:
         """The state base's x, (B, d)."""
@@ -295,7 +293,7 @@ class FingerGait(Task):
 
     def ended(self, sim: Sim) -> BoolArray:
         """Where no fingertip touches the object any more."""
-        return ~touching(self.measure(sim)["force"])
+        return ~touching(_force(_sensors(sim)))
 
     # Whole rollouts
 
@@ -393,6 +391,17 @@ class FingerGait(Task):
             "goal_images": goal.images,
             "goal_points": goal.points,
         }
+
+
+def _sensors(sim: Sim) -> FloatArray:
+    """The contact sensors, (B, 3, C, 7)."""
+    values: FloatArray = sim.sensordata.reshape(len(sim), len(FINGERS), model.CONTACTS, model.CONTACT_WIDTH)
+    return values
+
+
+def _force(sensors: FloatArray) -> FloatArray:
+    """Normal forces, zero where there is no contact, (B, 3, C) [N]."""
+    return np.where(sensors[..., 0] > 0, sensors[..., 1], 0.0)
 
 
 def touching(force: FloatArray) -> BoolArray:
