@@ -12,6 +12,8 @@ import tyro
 from farm import plugins, settings
 from farm.commands.tables import compact, wide
 from farm.errors import ConfigError
+from farm.policies.base import Policy
+from farm.tasks.base import Task
 from learner import config as configs
 
 _KINDS = {"tasks": "--task", "policies": "--policy", "algorithms": "--algorithm", "backends": "--backend"}
@@ -45,16 +47,20 @@ def main(words: Sequence[str]) -> int:
 def _about(kind: str, name: str) -> str:
     """The first line of a plug-in's docstring, or why it cannot be used."""
     try:
-        target = _target(kind, name)
+        return _doc(_plugin(kind, name)).partition("\n")[0]
     except ConfigError as error:
         return str(error)
-    return (target.__doc__ or "").strip().partition("\n")[0]
 
 
-def _target(kind: str, name: str) -> Any:  # noqa: ANN401  a class
+def _doc(plugin: plugins.Plugin) -> str:
+    return (plugin.target.__doc__ or "").strip()
+
+
+def _plugin(kind: str, name: str) -> plugins.Plugin:
+    """The plug-in of a name, or of any variant where it is one that is many."""
     with contextlib.suppress(ConfigError):
-        return plugins.find(kind, name).target
-    return plugins.find(kind, f"{name}:NAME").target  # one that is many
+        return plugins.find(kind, name)
+    return plugins.find(kind, f"{name}:NAME")
 
 
 def described(name: str) -> str:
@@ -63,34 +69,38 @@ def described(name: str) -> str:
     Raises:
       ConfigError: nothing has this name.
     """
-    found = []
-    for kind in ("tasks", "policies", "algorithms"):
-        own = name.partition(":")[0]
-        if name.rpartition(":")[0].endswith(".py") or own in plugins.names(kind):
-            with contextlib.suppress(ConfigError):
-                found.append((kind, _plugin(kind, name)))
-                break
-    if not found:
-        known = ", ".join(each for kind in _KINDS for each in plugins.names(kind))
-        plugins.find("tasks", name)  # a file says what is wrong with it
-        raise ConfigError(f"nothing is called {name!r}; there are {known}")
-    [(kind, plugin)] = found
-    lines = [f"{_KINDS[kind]} {plugin.wire}, {plugin.origin}", (plugin.target.__doc__ or "").strip(), ""]
+    kind = _kind(name)
+    plugin = plugins.find(kind, name) if kind == "backends" else _plugin(kind, name)
+    lines = [f"{_KINDS[kind]} {plugin.wire}, {plugin.origin}", _doc(plugin), ""]
+    if kind == "backends":
+        return "\n".join(lines)
     if kind == "tasks":
         for preset, values in configs.presets(plugin.name).items():
-            lines.append(f"preset {preset}: " + ", ".join(f"--{k.replace('_', '-')} {v}" for k, v in values.items()))
+            flags = ", ".join(f"--{k.replace('_', '-')} {v}" for k, v in values.items())
+            lines.append(f"preset {preset}: {flags or 'its defaults'}")
     return "\n".join([*lines, _settings(configs.settings_class(kind, plugin.name), plugin.wire)])
 
 
-def _plugin(kind: str, name: str) -> plugins.Plugin:
-    with contextlib.suppress(ConfigError):
-        return plugins.find(kind, name)
-    return plugins.find(kind, f"{name}:NAME")
+def _kind(name: str) -> str:
+    """What kind of plug-in has this name.
+
+    Raises:
+      ConfigError: none has.
+    """
+    if name.rpartition(":")[0].endswith(".py"):
+        target = plugins.find("tasks", name).target
+        return "tasks" if issubclass(target, Task) else "policies" if issubclass(target, Policy) else "algorithms"
+    for kind in _KINDS:
+        if name.partition(":")[0] in plugins.names(kind):
+            return kind
+    known = ", ".join(each for kind in _KINDS for each in plugins.names(kind))
+    raise ConfigError(f"nothing is called {name!r}; there are {known}, and FILE.py:CLASS")
 
 
 def _settings(kind: type[Any], name: str) -> str:
     """The settings as --help shows them."""
     said = io.StringIO()
-    with contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
         settings.parse(kind, ["--help"], name)
-    return said.getvalue()
+    usage, box, rest = said.getvalue().partition("╭")
+    return box + rest if rest else usage
