@@ -102,5 +102,6 @@ def _settings(kind: type[Any], name: str) -> str:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
         settings.parse(kind, ["--help"], name)
-    usage, box, rest = said.getvalue().partition("╭")
-    return box + rest if rest else usage
+    lines = said.getvalue().splitlines(keepends=True)
+    first = next((i for i, line in enumerate(lines) if line.strip("╭╮─ \n") == "options"), 0)
+    return "".join(lines[first:])
