@@ -45,7 +45,7 @@ def base() -> str:
         return BASE
     if os.geteuid() != 0 or not shutil.which("debootstrap"):
         pytest.skip(f"{BASE} is not to be had; a base of Debian's packages needs root and debootstrap")
-    call(str(ROOT / "tests/integration/base_image.sh"), DEBIAN)
+    call(str(ROOT / "tests/e2e/base_image.sh"), DEBIAN)
     return DEBIAN
 
 
