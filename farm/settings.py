@@ -69,7 +69,8 @@ def _kinds(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401
     """The types a value may have; empty where anything goes."""
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
-        return tuple(kind for part in get_args(hint) for kind in _kinds(part))
+        parts = [_kinds(part) for part in get_args(hint)]
+        return tuple(kind for part in parts for kind in part) if all(parts) else ()
     if origin is Literal:
         return (str,)
     kind = origin or hint

@@ -1,6 +1,7 @@
 """Settings: what is checked of them, and command lines: one line for a mistake, a help that says what everything is."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import pytest
@@ -28,6 +29,7 @@ class Everything(Settings):
     flag: bool = False
     name: str = "n"
     names: tuple[str, ...] = ()
+    folder: Path | None = None
     anything: Any = None
 
 
@@ -36,14 +38,14 @@ class Everything(Settings):
     [
         {"count": 1}, {"count": 9}, {"part": 1.0}, {"part": 5e-324}, {"far": -1e9}, {"limit": 1}, {"limit": None},
         {"speed": None}, {"speed": -2.5}, {"mode": "slow"}, {"note": "b"}, {"flag": True}, {"names": ("a", "b")},
-        {"anything": object},
+        {"folder": Path("a")}, {"folder": None}, {"anything": object},
     ],
     ids=str,
 )  # fmt: skip
 def test_values_that_are_taken(changed: dict[str, Any]) -> None:
     (name, value), made = *changed.items(), Everything(**changed)
     assert getattr(made, name) == value
-    if name != "anything":
+    if name not in ("folder", "anything"):
         assert from_dict(Everything, to_dict(made), "here") == made
 
 
