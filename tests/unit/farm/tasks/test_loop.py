@@ -108,6 +108,36 @@ def test_a_rollout_does_not_depend_on_its_batch():
         same(together, row, fresh, 6 - row)
 
 
+class Changed(Pole):
+    """A task whose rollouts have models of their own: what a reset takes from the model among them."""
+
+    def prepare(self, sim, rngs):
+        """Draw masses and a pose that a reset begins at, and read an output in between."""
+        masses, pose = sim.expand("body_mass"), sim.expand("qpos0")
+        for row, rng in enumerate(rngs):
+            sim.qpos[row, 0] += 0.0 if rng is None else 0.1 * sim.xpos[row, 1, 2]
+            if rng is not None:
+                masses[row, 2] *= rng.uniform(0.5, 2.0)
+                pose[row, 1] += rng.uniform(-0.3, 0.3)
+        sim.own["goal"] = np.zeros(len(rngs))
+
+    def observe(self, sim):
+        """It sees its mass."""
+        return np.concatenate([sim.qpos, sim.qvel, sim.expand("body_mass")[:, 2:]], axis=1)
+
+
+def test_models_of_rollouts_do_not_leak_into_later_ones():
+    made = runner(Changed, width=0.2)
+    theta = thetas(made, len(SEEDS), 3.0)
+    first = made.rollouts(theta, SEEDS)
+    assert 0 < first.ended.sum() < len(SEEDS)
+    again = made.rollouts(theta, SEEDS)
+    for row in reversed(range(len(SEEDS))):
+        same(first, row, again, row)
+        for other in (made, runner(Changed, width=0.2)):
+            same(first, row, other.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+
+
 def test_more_rollouts_than_the_engine_has_rows_are_done_in_turns():
     made = runner()
     count = made.sim.engine.size + 9
@@ -221,6 +251,8 @@ def test_the_simulator_can_only_be_written_while_rollouts_begin():
 
     with pytest.raises(ValueError, match="read-only"):
         broken(observe=observe)
+    with pytest.raises(AttributeError, match=r"sim.qpos is written in place"):
+        broken(reset=lambda _, sim, row, rng: setattr(sim, "qpos", np.zeros((1, 2))))
     with pytest.raises(AttributeError, match="sim has no 'qpso'"):
         broken(observe=lambda _, sim: sim.qpso)
 
