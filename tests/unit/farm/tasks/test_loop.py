@@ -237,11 +237,44 @@ def broken(**methods) -> Runner:
         ({"observe": lambda _, sim: [1.0]}, "observe gave a list"),
         ({"ended": lambda _, sim: np.zeros(2, dtype=bool)}, r"ended gave an array of shape \(2,\)"),
         ({"measure": lambda _, sim: {"angle": np.zeros(3)}}, r"angle gave an array of shape \(3,\)"),
+        ({"measure": lambda _, sim: [sim.qpos]}, "measure gave a list; expected arrays by name"),
+        ({"measure": lambda _, sim: {"height": sim.qpos}}, "channel 'angle' is not measured: measure gives qpos, "
+         "height"),
+        ({"measure": lambda _, sim: {"angle": sim.qpos}}, r"channel 'angle' gave an array of shape \(1, 1, 2\)"),
+        ({"observe": lambda _, sim: sim.qpos[:, 0]}, r"observe gave an array of shape \(1,\); expected an array of "
+         r"shape \(1, 1\)"),
+        ({"observe": lambda _, sim: np.full((len(sim), 2), "x")}, "observe gave an array of <U1; expected real"),
+        ({"observe": lambda _, sim: sim.qpos * np.nan}, "observe is not finite at the nominal start"),
+        ({"reward": lambda _, sim, a: {}}, "reward gave no terms"),
+        ({"prepare": lambda _, sim, rngs: sim.own.update(goal=3)}, r"sim.own\['goal'\] is a int; expected an array of"),
+        ({"steps": 1, "success": lambda _, sim: np.ones(2)}, r"success gave an array of shape \(2,\)"),
     ],
 )  # fmt: skip
 def test_arrays_that_make_no_sense_are_named(methods, line):
     with pytest.raises(TaskError, match=line):
         broken(**methods)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "line"),
+    [
+        ({"steps": 0}, "task Broken: steps is 0; expected a whole number from 1 to 10000"),
+        ({"substeps": 1.0}, "task Broken: substeps is 1.0"),
+        ({"camera": (0, 0, 0)}, "task Broken: camera is .*; expected a farm.Camera"),
+        ({"reset": lambda _, row, rng: None}, r"reset\(_, row, rng\); expected \(self, sim, row, rng\)"),
+        ({"reward": Task.reward}, "task Broken has no reward: give it"),
+        ({"xml": XML.replace('<motor joint="slide" ctrlrange="-3 5"/>', "")}, "its model has no actuator"),
+    ],
+)
+def test_classes_that_make_no_sense_are_named(attributes, line):
+    with pytest.raises(ConfigError, match=line):
+        broken(**attributes)
+
+
+def test_an_observation_keeps_its_length():
+    made = broken(observe=lambda _, sim: np.zeros((len(sim), 2 + sim.t // 3)))
+    with pytest.raises(TaskError, match=r"observe gave an array of shape \(1, 3\); expected an array of shape \(1, 2\)"):
+        made.rollouts(thetas(made, 1), [None])
 
 
 def test_the_simulator_can_only_be_written_while_rollouts_begin():
