@@ -273,7 +273,7 @@ def test_classes_that_make_no_sense_are_named(attributes, line):
 
 def test_an_observation_keeps_its_length():
     made = broken(observe=lambda _, sim: np.zeros((len(sim), 2 + sim.t // 3)))
-    with pytest.raises(TaskError, match=r"observe gave an array of shape \(1, 3\); expected an array of shape \(1, 2\)"):
+    with pytest.raises(TaskError, match=r"shape \(1, 3\); expected an array of shape \(1, 2\)"):
         made.rollouts(thetas(made, 1), [None])
 
 
