@@ -129,7 +129,9 @@ def main() -> None:
         sys.exit("usage: python play_policy.py POLICY.npz")
     try:
         policy = Policy(sys.argv[1])
-    except (OSError, ValueError, KeyError) as error:
+    except KeyError as error:
+        sys.exit(f"{sys.argv[1]} is no policy of the finger gait that farm export wrote: it has no {error}")
+    except (OSError, ValueError) as error:
         sys.exit(f"{sys.argv[1]} is no policy that farm export wrote: {error}")
     policy.reset()
     total, held, t = 0.0, True, 0

@@ -178,13 +178,13 @@ def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
     sys.modules[name] = module  # dataclasses look for their annotations there
     try:
         exec(compile(source, str(path), "exec"), vars(module))
-    except Exception as error:  # whatever the file may raise; its own traceback says where
+    except (Exception, SystemExit) as error:  # whatever the file may raise; its own traceback says where
         del sys.modules[name]
         raise ConfigError(f"{path} cannot be imported: {_where(error, path)}") from error
     return module
 
 
-def _where(error: Exception, path: Path) -> str:
+def _where(error: BaseException, path: Path) -> str:
     """An error and its line in a file."""
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"

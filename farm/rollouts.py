@@ -102,7 +102,12 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
 def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping[str, str] | None) -> Task:
     """A task from its class, the settings in a table, and the texts that the run carries."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
-    return cast("Task", plugin.target(config, plugin.variant, files))
+    try:
+        return cast("Task", plugin.target(config, plugin.variant, files))
+    except TypeError as error:
+        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # it was not even called
+            raise ConfigError(f"{plugin.wire}: its __init__ must take config, variant and files ({error})") from None
+        raise
 
 
 _SAME = "install the learner's release on both sides"
@@ -128,6 +133,9 @@ def backend(name: str) -> Backend:
     """The backend of that name.
 
     Raises:
-      ConfigError: there is none.
+      ConfigError: there is none, or it is none.
     """
-    return cast("Backend", plugins.find("backends", name).target())
+    target = plugins.find("backends", name).target
+    if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
+        raise ConfigError(f"{name} is no backend: it needs capacity and engine(model)")
+    return cast("Backend", target())

@@ -160,6 +160,7 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
     """
     import tyro  # what only reads a configuration does without
 
+    distinct(default, program)
     said = io.StringIO()
     extra: dict[str, Any] = {} if default is None else {"default": default}
     try:
@@ -171,6 +172,26 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
             raise ConfigError(_one_line(said.getvalue(), program)) from None
         sys.stderr.write(said.getvalue())
         raise
+
+
+def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
+    """Whether every flag is there once: settings of a plug-in may be called as a command's own.
+
+    Raises:
+      ConfigError: one is there twice.
+    """
+    owners: dict[str, str] = {}
+    waiting = [default] if dataclasses.is_dataclass(default) else []
+    while waiting:
+        table = waiting.pop(0)
+        for each in dataclasses.fields(table):
+            value = getattr(table, each.name)
+            if dataclasses.is_dataclass(value) and not isinstance(value, type):
+                waiting.append(value)
+            elif owners.setdefault(each.name, type(table).__qualname__) != type(table).__qualname__:
+                raise ConfigError(
+                    f"--{_flag(each.name)} of {program} is also a setting of {type(table).__qualname__}: rename that"
+                )
 
 
 def _one_line(box: str, program: str) -> str:

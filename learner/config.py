@@ -62,11 +62,12 @@ class RunConfig(Settings):
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()
-        owners: dict[str, str] = {}
+        owners: dict[str, str] = {"name": "plug-in"}
         for part in ("run", *_PARTS):
             for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
                 if owners.setdefault(name, part) != part:
-                    raise ConfigError(f"setting {name!r} of the {part} {self.task!r} is also the {owners[name]}'s")
+                    whose = f"{part} {getattr(self, part)!r}"
+                    raise ConfigError(f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one")
 
 
 def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
@@ -107,8 +108,13 @@ def settings_class(kind: str, name: str) -> type[Any]:
     if base is not None and not (isinstance(target, type) and issubclass(target, base)):
         raise ConfigError(f"{name} is no {base.__name__}: derive its class from farm.{base.__name__}")
     config = getattr(target, "Config", target)
+    if base is None and not all(hasattr(config, each) for each in ("signs", "init", "restore", "ask", "tell")):
+        raise ConfigError(f"{name} is no algorithm: it needs signs, init, restore, ask and tell")
     if not dataclasses.is_dataclass(config) or "Config" in vars(target) and _undecorated(config):
         raise ConfigError(f"settings of {name}: put @dataclass(frozen=True, kw_only=True) on its class")
+    settings_base = {"tasks": TaskConfig, "policies": PolicyConfig}.get(kind, object)
+    if not issubclass(config, settings_base):
+        raise ConfigError(f"settings of {name}: derive its Config from farm.{settings_base.__name__}")
     return cast("type[Any]", config)
 
 
@@ -130,7 +136,9 @@ def plugin_path(kind: str, name: str) -> str:
 def presets(task: str) -> dict[str, Mapping[str, Any]]:
     """Settings that runs of a task begin with, by preset and flag; the first one unless told otherwise."""
     settings_class("tasks", task)
-    own = dict(plugins.find("tasks", task).target.presets)
+    own = plugins.find("tasks", task).target.presets
+    if not isinstance(own, Mapping) or not own or not all(isinstance(each, Mapping) for each in own.values()):
+        raise ConfigError(f"presets of {task}: expected tables of settings by name, one or more")
     return {name: given or _GENERAL for name, given in own.items()}
 
 

@@ -6,6 +6,7 @@ policy = farm.load("runs/first", friction=0.5)
 print(policy.rollout().trajectory.success)
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +23,8 @@ from learner import checkpoint as checkpoints
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
 from learner.setup import Problem, problem, start
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,13 @@ def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -
     if task is not None and task != config.task_config:
         files = _files(config, replace(config, task_config=task), at.files)
         config = replace(config, task_config=task)
-    return LoadedPolicy(problem(replace(config, stop_when_solved=None), at.constants, files), chosen, mu)
+    found = problem(replace(config, stop_when_solved=None), at.constants, files)
+    if changed := [name for name in ("task", "policy") if at.code.get(name) != found.code[name]]:
+        log.warning(
+            "%s: the code of its %s has changed since the run began; these are numbers of today's",
+            folder.path, " and ".join(changed),
+        )  # fmt: skip
+    return LoadedPolicy(found, chosen, mu)
 
 
 def _files(old: RunConfig, new: RunConfig, kept: Mapping[str, str]) -> dict[str, str]:

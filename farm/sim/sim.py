@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.errors import TaskError
 
 LIMIT = 1e8
 """A state beyond it has blown up, finite or not."""
@@ -86,6 +87,8 @@ class Backend(Protocol):
         ...
 
 
+_ATTRIBUTES = ("engine", "own", "t")
+
 MakeEngine = Callable[[mujoco.MjModel], Engine]
 
 
@@ -130,6 +133,11 @@ class Sim:
         self._now[name] = taken = self._rows(values)
         return taken
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in _ATTRIBUTES and not name.startswith("_"):
+            raise AttributeError(f"sim.{name} is written in place: sim.{name}[:] = ...; memory belongs in sim.own")
+        super().__setattr__(name, value)
+
     def _rows(self, values: AnyArray) -> AnyArray:
         """The rows still going, read-only."""
         rows = self._ids if self._source is None or values.flags.writeable else self._source
@@ -144,13 +152,22 @@ class Sim:
         self._ids, self._source = np.arange(count), None
         self.own, self.t, self._now = {}, 0, {}
         self._live, self._stepped = True, False
-        self.engine.reset(self._ids)
-        for name, values in self._expanded.items():
+        for name, values in self._expanded.items():  # before the reset: what it takes from the model is nominal too
             values[:count] = self._nominal[name]
-            self._dirty = True
+        self.engine.reset(self._ids)
+        self._dirty = bool(self._expanded)
 
     def start(self, sources: IntArray) -> None:
-        """End the preparation: B rollouts, each from where the prepared one of number sources[i] stands."""
+        """End the preparation: B rollouts, each from where the prepared one of number sources[i] stands.
+
+        Raises:
+          TaskError: what the task remembers is no array of them.
+        """
+        for name, values in self.own.items():
+            if not isinstance(values, np.ndarray) or np.shape(values)[:1] != (len(self),):
+                got = f"shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
+                raise TaskError(f"sim.own[{name!r}] is {got}; expected an array of shape ({len(self)}, ...)")
+        self._dirty = bool(self._expanded)  # somebody may have written since outputs were read
         self._constants()
         if not self._stepped:
             self.engine.forward(self._ids)
@@ -167,10 +184,14 @@ class Sim:
         self._source = sources
 
     def expand(self, name: str) -> AnyArray:
-        """A field of MjModel with a value for each rollout, (B, ...); to be written while rollouts are prepared."""
+        """A field of MjModel with a value for each rollout, (B, ...); read-only once they are prepared."""
         if name not in self._expanded:
             self._nominal[name] = np.array(_own_value(self.model, name))
             self._expanded[name] = self.engine.expand(name)
+        if not self._live:
+            values = self._expanded[name][self._ids]
+            values.flags.writeable = False
+            return values
         self._dirty = True
         return self._expanded[name][: len(self)]
 

@@ -185,9 +185,9 @@ class Task:
         low, high = self.limits
         return rescaled(action, low, high)
 
-    def reward(self, sim: "Sim", action: FloatArray) -> FloatArray | dict[str, FloatArray]:
+    def reward(self, sim: "Sim", action: FloatArray) -> FloatArray | dict[str, FloatArray]:  # noqa: ARG002
         """Reward of the control step that just ended, (B,); or named terms that add up to it."""
-        raise NotImplementedError
+        raise ConfigError(f"task {type(self).__name__} has no reward: give it reward(self, sim, action), or score")
 
     def ended(self, sim: "Sim") -> BoolArray | None:  # noqa: ARG002
         """Which rollouts end here, (B,); None: none before its last step."""

@@ -4,6 +4,7 @@ A rollout's numbers depend on (task, policy parameters, seed) alone: not on the 
 order, or threads. They equal, bit for bit, those of one rollout at a time in a plain `mj_step` loop.
 """
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
@@ -11,12 +12,13 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.errors import TaskError
+from farm.errors import ConfigError, TaskError
+from farm.sim.channels import Camera
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import Scene, quiet
 from farm.sim.sim import Rebound, Sim
 from farm.sim.trajectory import Trajectory
-from farm.tasks.base import Record, Task, TaskSpec, flat
+from farm.tasks.base import STEPS_LIMIT, Record, Task, TaskSpec, flat
 
 RETURN_FLOOR: Final = -1e12
 """A return that overflows, or is of a rollout that failed, counts as this: it must never look good."""
@@ -98,13 +100,15 @@ class Batch:
         self._actions: FloatArray | None = None
         self._terms: FloatArray | None = None
         self._names: tuple[str, ...] = ()
+        self._width = 0  # of an observation
         self._steps = np.full(count, task.steps)
         self._failed, self._ended, self._success = (np.zeros(count, dtype=bool) for _ in range(3))
 
     def observe(self) -> FloatArray:
         """What the policy sees of the rollouts still going, (n, d)."""
         x = self.task.observe(self.sim)
-        return _array("observe", x, (len(self.sim), *np.shape(x)[1:2]))
+        self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
+        return _array("observe", x, (len(self.sim), self._width))
 
     def step(self, action: FloatArray) -> None:
         """One control step of the rollouts still going: raw actions (n, A)."""
@@ -126,9 +130,11 @@ class Batch:
 
     def _measured(self) -> dict[str, FloatArray]:
         """What is kept of this frame, (n, ...) each."""
-        count = len(self.sim)
-        given = {name: _array(name, v, (count, *np.shape(v)[1:])) for name, v in self.task.measure(self.sim).items()}
-        return {"qpos": self.sim.qpos, **given}
+        count, given = len(self.sim), self.task.measure(self.sim)
+        if not isinstance(given, dict):
+            raise TaskError(f"measure gave a {type(given).__name__}; expected arrays by name")
+        own = {name: _array(name, v, (count, *np.shape(v)[1:])) for name, v in given.items()}
+        return {"qpos": self.sim.qpos, **own}
 
     def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> None:
         """Note the reward terms of a control step, unless whole rollouts are scored."""
@@ -136,6 +142,8 @@ class Batch:
             return
         given = self.task.reward(self.sim, action)
         terms = given if isinstance(given, dict) else {"reward": given}
+        if not terms:
+            raise TaskError("reward gave no terms; expected an array, or arrays by name")
         values = np.stack([_array(f"reward {n}", v, (len(self.sim),)) for n, v in terms.items()], axis=1)
         if self._terms is None:
             self._names = tuple(terms)
@@ -155,6 +163,7 @@ class Batch:
         if last or over.any():
             success = None if scores(self.task) else self.task.success(self.sim)
             if success is not None:
+                success = _array("success", success, (len(self.sim),)).astype(bool)
                 done = over | last
                 self._success[self.active[done]] = (success & ~failed)[done]
         if not over.any():
@@ -288,17 +297,26 @@ def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> An
 
 
 def probe(task: Task) -> TaskSpec:
-    """What others must know of a task, found by one control step of one rollout."""
+    """What others must know of a task, found by one control step of one rollout.
+
+    Raises:
+      ConfigError: the class cannot be a task.
+      TaskError: it gives arrays that make no sense.
+    """
     quiet()
+    _check_class(task)
     sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
 
     def look() -> tuple[Batch, int]:
         task.setup(sim)
         batch = Batch(task, sim, [None])
-        size = batch.observe().shape[1]
+        x = batch.observe()
+        if not np.isfinite(x).all():
+            raise TaskError("observe is not finite at the nominal start")
         with np.errstate(all="ignore"):
             batch.step(np.zeros((1, sim.model.nu)))
-        return batch, size
+            _check_channels(task, batch._frames)
+        return batch, x.shape[1]
 
     try:
         batch, size = again(look)
@@ -312,6 +330,43 @@ def probe(task: Task) -> TaskSpec:
         sim.engine.close()
 
 
+def _check_class(task: Task) -> None:
+    """Whether attributes and methods are what a task's are.
+
+    Raises:
+      ConfigError: names the first that is not.
+    """
+    name = type(task).__name__
+    for what, most in (("steps", STEPS_LIMIT), ("substeps", STEPS_LIMIT)):
+        value = getattr(task, what)
+        if type(value) is not int or not 1 <= value <= most:
+            raise ConfigError(f"task {name}: {what} is {value!r}; expected a whole number from 1 to {most}")
+    if task.camera is not None and not isinstance(task.camera, Camera):
+        raise ConfigError(f"task {name}: camera is {task.camera!r}; expected a farm.Camera")
+    if not task.model.nu:
+        raise ConfigError(f"task {name}: its model has no actuator, so that there is nothing to learn")
+    for method in ("setup", "prepare", "reset", "observe", "act", "reward", "ended", "success", "measure", "score"):
+        own, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
+        try:
+            own.bind(*base.parameters)
+        except TypeError:
+            raise ConfigError(f"task {name}: {method}{own}; expected ({', '.join(base.parameters)})") from None
+
+
+def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
+    """Whether the task shows what its channels say.
+
+    Raises:
+      TaskError: it does not show one, or in another shape.
+    """
+    missing = [c.name for c in task.channels if c.name not in frames]
+    if missing and type(task).show is Task.show:
+        raise TaskError(f"channel {missing[0]!r} is not measured: measure gives {', '.join(frames)}")
+    shown = task.show({name: values[:, :1] for name, values in frames.items()})
+    for channel in task.channels:
+        _array(f"channel {channel.name!r}", shown.get(channel.name), (1, 1, *channel.shape))
+
+
 def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa: ANN401  whatever a task gave
     """The values, if they are an array of that shape.
 
@@ -321,6 +376,8 @@ def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa:
     if not isinstance(values, np.ndarray) or values.shape != shape:
         got = f"an array of shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
         raise TaskError(f"{name} gave {got}; expected an array of shape {shape}")
+    if values.dtype.kind not in "biuf":
+        raise TaskError(f"{name} gave an array of {values.dtype}; expected real numbers")
     return values
 
 

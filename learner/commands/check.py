@@ -3,17 +3,20 @@
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import tyro
 
-from farm import seeds, settings
+from farm import plugins, seeds, settings
 from farm.arrays import FloatArray
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError, TaskError
 from farm.tasks.base import TaskConfig
+from learner import config as configs
+from learner.commands.replay import ReplayCommand
+from learner.commands.run import RunCommand
 from learner.config import RunConfig, plugin_path
 
 ROWS = 8
@@ -35,15 +38,24 @@ class CheckCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
-    name = next((word for word in words if not word.startswith("-")), None)
-    own = None if name is None else RunConfig(task=plugin_path("tasks", name))
+    name = _name(words)
+    own = None if name is None else configs.configure(plugin_path("tasks", name))
     default = CheckCommand(name=tyro.MISSING, task=own.task_config if own else TaskConfig())
     command = settings.parse(CheckCommand, words, "farm check", default)
     assert own is not None
-    for line in checked(RunConfig(task=own.task, task_config=command.task), command.picture):
+    settings.distinct(RunCommand(run=own), "farm run")
+    settings.distinct(ReplayCommand(run=Path(), task=own.task_config), "farm replay")
+    for line in checked(replace(own, task_config=command.task), command.picture):
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
     return 0
+
+
+def _name(words: Sequence[str]) -> str | None:
+    """The task among the words: the first that looks like one, else the first that is no flag."""
+    loose = [word for word in words if not word.startswith("-")]
+    named = [word for word in loose if ":" in word or word in plugins.names("tasks")]
+    return next(iter(named or loose), None)
 
 
 def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:

@@ -109,12 +109,6 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     return configs.changed_by(begin, parts), None
 
 
-def _resolved(parts: dict[str, str]) -> dict[str, str]:
-    """Names of plug-ins as config.json has them: a file's with its whole path."""
-    kinds = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
-    return {part: plugins.find(kinds[part], name).name for part, name in parts.items()}
-
-
 def _value(words: Sequence[str], flag: str) -> str | None:
     """The last value given for a flag, in either form; a missing one is left to the parser."""
     found = None

@@ -100,13 +100,14 @@ def test_a_file_that_changed_is_another_one(write: Write) -> None:
         ("x = 1\nclass Mine\n", r"mine\.py cannot be imported: line 2: expected ':'"),
         ("x = 1\n\nx = 1 / 0\n", r"mine\.py cannot be imported: line 3: ZeroDivisionError: division by zero"),
         ("def f():\n    raise OSError('no')\n\nf()\n", r"cannot be imported: line 2: OSError: no"),
+        ("import sys\nsys.exit(3)\n", r"cannot be imported: line 2: SystemExit: 3"),
         ("import nowhere_to_be_found\n", "line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
         ("import json\njson.loads('{')\n", "line 2: JSONDecodeError"),
         ("class Yours: pass\nfrom pathlib import Path\n", "mine.py has no class 'Mine'; it has Yours$"),
         ("Mine = 3\n", "has no class 'Mine'; it has none"),
         ("x = '\0'\n", "cannot be imported: "),
     ],
-    ids=range(8),
+    ids=range(9),
 )
 def test_a_file_that_is_of_no_use_is_one_line(write: Write, text: str, words: str) -> None:
     path = write(text)

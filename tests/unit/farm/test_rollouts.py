@@ -13,7 +13,7 @@ from farm.net import codec
 from farm.net.messages import Spec
 from farm.net.work import Jobs, Results, Simulated
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import SIMULATION, Runner, backend, served
+from farm.rollouts import SIMULATION, Runner, backend, build_task, served
 from farm.settings import setting
 from farm.sim.channels import Channel
 from farm.tasks.base import Task, TaskConfig
@@ -286,8 +286,14 @@ def test_what_is_no_task_is_no_task(spec, tmp_path):
         served(replace(spec, code=code), (path,))
 
 
-def test_backends_by_name():
+def test_backends_by_name(tmp_path):
     assert isinstance(backend("cpu"), CpuBackend)
     with pytest.raises(ConfigError, match="unknown backend 'gpu'; known are cpu"):
         backend("gpu")
+    path = tmp_path / "mine.py"
+    path.write_text("import farm\nclass Mine(farm.Task):\n    def __init__(self): pass\n")
+    with pytest.raises(ConfigError, match=r"mine.py:Mine is no backend: it needs capacity and engine"):
+        backend(f"{path}:Mine")
+    with pytest.raises(ConfigError, match=r"its __init__ must take config, variant and files"):
+        build_task(plugins.find("tasks", f"{path}:Mine"), {}, None)
     assert rolling.SIMULATION == "farm.tasks.loop"

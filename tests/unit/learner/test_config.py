@@ -43,10 +43,24 @@ class Bare(farm.Task):
 class NoTask:
     pass
 
+class Flat(farm.Task):
+    presets = {"initial_sigma": 0.3}
+
+class Strange(farm.Task):
+    @dataclass(frozen=True, kw_only=True)
+    class Config:
+        length: float = 1.0
+
+class Named(farm.Task):
+    @dataclass(frozen=True, kw_only=True)
+    class Config(farm.TaskConfig):
+        name: str = "x"
+
 @dataclass(frozen=True, kw_only=True)
 class Walk(farm.Settings):
     pairs: int = 5
     stride: float | None = None
+    signs = init = restore = ask = tell = lambda *_: None
 """
 
 
@@ -120,19 +134,27 @@ def test_a_part_that_is_chosen_anew_begins_with_its_own_defaults() -> None:
 
 
 def test_names_that_two_parts_have_are_refused(file: Path) -> None:
-    with pytest.raises(ConfigError, match=r"setting 'pairs' of the algorithm .*:Clash' is also the task's"):
+    with pytest.raises(ConfigError, match=r"setting 'pairs' of the algorithm 'pgpe' is also the task's"):
         RunConfig(task=f"{file}:Clash")
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("NoTask", r"NoTask is no Task: derive its class from farm\.Task"), ("Bare", r"put @dataclass\(frozen=True")],
+    [
+        ("NoTask", r"NoTask is no Task: derive its class from farm\.Task"),
+        ("Bare", r"put @dataclass\(frozen=True"),
+        ("Flat", "presets of .*: expected tables of settings by name"),
+        ("Strange", r"derive its Config from farm\.TaskConfig"),
+        ("Named", "setting 'name' of the task .* is also the plug-in's"),
+    ],
 )
 def test_classes_that_are_no_tasks_or_have_no_settings(file: Path, name: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         RunConfig(task=f"{file}:{name}")
     with pytest.raises(ConfigError, match="is no Policy"):
         RunConfig(policy=f"{file}:Pole")
+    with pytest.raises(ConfigError, match="is no algorithm: it needs signs"):
+        RunConfig(algorithm=f"{file}:Pole")
 
 
 # ---------------------------------------------------------------- config.json

@@ -108,6 +108,36 @@ def test_a_rollout_does_not_depend_on_its_batch():
         same(together, row, fresh, 6 - row)
 
 
+class Changed(Pole):
+    """A task whose rollouts have models of their own: what a reset takes from the model among them."""
+
+    def prepare(self, sim, rngs):
+        """Draw masses and a pose that a reset begins at, and read an output in between."""
+        masses, pose = sim.expand("body_mass"), sim.expand("qpos0")
+        for row, rng in enumerate(rngs):
+            sim.qpos[row, 0] += 0.0 if rng is None else 0.1 * sim.xpos[row, 1, 2]
+            if rng is not None:
+                masses[row, 2] *= rng.uniform(0.5, 2.0)
+                pose[row, 1] += rng.uniform(-0.3, 0.3)
+        sim.own["goal"] = np.zeros(len(rngs))
+
+    def observe(self, sim):
+        """It sees its mass."""
+        return np.concatenate([sim.qpos, sim.qvel, sim.expand("body_mass")[:, 2:]], axis=1)
+
+
+def test_models_of_rollouts_do_not_leak_into_later_ones():
+    made = runner(Changed, width=0.2)
+    theta = thetas(made, len(SEEDS), 3.0)
+    first = made.rollouts(theta, SEEDS)
+    assert 0 < first.ended.sum() < len(SEEDS)
+    again = made.rollouts(theta, SEEDS)
+    for row in reversed(range(len(SEEDS))):
+        same(first, row, again, row)
+        for other in (made, runner(Changed, width=0.2)):
+            same(first, row, other.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+
+
 def test_more_rollouts_than_the_engine_has_rows_are_done_in_turns():
     made = runner()
     count = made.sim.engine.size + 9
@@ -207,11 +237,44 @@ def broken(**methods) -> Runner:
         ({"observe": lambda _, sim: [1.0]}, "observe gave a list"),
         ({"ended": lambda _, sim: np.zeros(2, dtype=bool)}, r"ended gave an array of shape \(2,\)"),
         ({"measure": lambda _, sim: {"angle": np.zeros(3)}}, r"angle gave an array of shape \(3,\)"),
+        ({"measure": lambda _, sim: [sim.qpos]}, "measure gave a list; expected arrays by name"),
+        ({"measure": lambda _, sim: {"height": sim.qpos}}, "channel 'angle' is not measured: measure gives qpos, "
+         "height"),
+        ({"measure": lambda _, sim: {"angle": sim.qpos}}, r"channel 'angle' gave an array of shape \(1, 1, 2\)"),
+        ({"observe": lambda _, sim: sim.qpos[:, 0]}, r"observe gave an array of shape \(1,\); expected an array of "
+         r"shape \(1, 1\)"),
+        ({"observe": lambda _, sim: np.full((len(sim), 2), "x")}, "observe gave an array of <U1; expected real"),
+        ({"observe": lambda _, sim: sim.qpos * np.nan}, "observe is not finite at the nominal start"),
+        ({"reward": lambda _, sim, a: {}}, "reward gave no terms"),
+        ({"prepare": lambda _, sim, rngs: sim.own.update(goal=3)}, r"sim.own\['goal'\] is a int; expected an array of"),
+        ({"steps": 1, "success": lambda _, sim: np.ones(2)}, r"success gave an array of shape \(2,\)"),
     ],
 )  # fmt: skip
 def test_arrays_that_make_no_sense_are_named(methods, line):
     with pytest.raises(TaskError, match=line):
         broken(**methods)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "line"),
+    [
+        ({"steps": 0}, "task Broken: steps is 0; expected a whole number from 1 to 10000"),
+        ({"substeps": 1.0}, "task Broken: substeps is 1.0"),
+        ({"camera": (0, 0, 0)}, "task Broken: camera is .*; expected a farm.Camera"),
+        ({"reset": lambda _, row, rng: None}, r"reset\(_, row, rng\); expected \(self, sim, row, rng\)"),
+        ({"reward": Task.reward}, "task Broken has no reward: give it"),
+        ({"xml": XML.replace('<motor joint="slide" ctrlrange="-3 5"/>', "")}, "its model has no actuator"),
+    ],
+)
+def test_classes_that_make_no_sense_are_named(attributes, line):
+    with pytest.raises(ConfigError, match=line):
+        broken(**attributes)
+
+
+def test_an_observation_keeps_its_length():
+    made = broken(observe=lambda _, sim: np.zeros((len(sim), 2 + sim.t // 3)))
+    with pytest.raises(TaskError, match=r"shape \(1, 3\); expected an array of shape \(1, 2\)"):
+        made.rollouts(thetas(made, 1), [None])
 
 
 def test_the_simulator_can_only_be_written_while_rollouts_begin():
@@ -221,6 +284,8 @@ def test_the_simulator_can_only_be_written_while_rollouts_begin():
 
     with pytest.raises(ValueError, match="read-only"):
         broken(observe=observe)
+    with pytest.raises(AttributeError, match=r"sim.qpos is written in place"):
+        broken(reset=lambda _, sim, row, rng: setattr(sim, "qpos", np.zeros((1, 2))))
     with pytest.raises(AttributeError, match="sim has no 'qpso'"):
         broken(observe=lambda _, sim: sim.qpso)
 
