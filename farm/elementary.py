@@ -12,8 +12,8 @@ Arguments are reduced with a constant split into short parts, whose products wit
     exp(r) = 1 + 2 r / (r coth(r/2) - r), |r| <= ln(2) / 2; r coth(r/2) = 2 + sum B_2k z^k 2 / (2k)! with the Bernoulli
              numbers B_2k (the series that defines them), up to z^6: what is left out is below 1e-17
 
-Errors, held by `tests/unit/farm/test_elementary.py`: below 1.5 units in the last place for exp, 2.5 for cos and sin, 3 for
-tanh.
+Errors, held by `tests/unit/farm/test_elementary.py`: below 1.5 units in the last place for exp, 2.5 for
+cos and sin, 3 for tanh.
 """
 
 import math
