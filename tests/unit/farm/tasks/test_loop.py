@@ -209,8 +209,17 @@ class Fragile(Pole):
         """Never."""
 
 
-def test_a_rollout_that_blows_up_fails_alone():
-    made = runner(Fragile)
+class Compiled(Fragile):
+    """The same, compiled by itself."""
+
+    def compiled(self):
+        """MuJoCo would begin again where it blows up."""
+        return mujoco.MjModel.from_xml_string(self.mjcf())
+
+
+@pytest.mark.parametrize("kind", [Fragile, Compiled])
+def test_a_rollout_that_blows_up_fails_alone(kind):
+    made = runner(kind)
     theta = thetas(made, 3)
     rollouts = made.rollouts(theta, [None, (1, 1, 1, 1), None])
     assert rollouts.failed.tolist() == [False, True, False]
