@@ -25,8 +25,7 @@ from farm.tasks.finger_gait import model, touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
-from learner.replay import Again, again
-from learner.run_folder import RunFolder
+from learner.replay import LoadedPolicy, Replay, load
 
 PANEL: Final = (400, 450)
 """Width and height of one hand [pixels]."""
@@ -102,26 +101,27 @@ def _photograph(qpos: FloatArray) -> Image.Image:
 def gait_video(run: Path) -> Iterator[rendering.Picture]:
     """The run's first and last policy beside each other, a third of real time."""
     shown = {
-        "before learning": again(RunFolder.open(run), generation=0),
-        "after learning": again(RunFolder.open(run)),
+        "before learning": load(run, generation=0),
+        "after learning": load(run),
     }
-    longest = max((part.trajectory.times for part in shown.values()), key=len)
+    replays = {name: policy.rollout() for name, policy in shown.items()}
+    longest = max((replay.trajectory.times for replay in replays.values()), key=len)
     chosen = video.moments(longest.tolist(), speed=1 / 3, rest=1.5)
     sides = []
-    for name, part in shown.items():
-        rows = [min(moment, len(part.trajectory.times) - 1) for moment in chosen]
+    for name, policy in shown.items():
+        rows = [min(moment, len(replays[name].trajectory.times) - 1) for moment in chosen]
         moments = sorted(set(rows))
-        drawn = dict(zip(moments, _drawn(part, moments), strict=True))
+        drawn = dict(zip(moments, _drawn(policy, replays[name], moments), strict=True))
         sides.append([_named(drawn[row], name) for row in rows])
     return (np.concatenate(pair, axis=1) for pair in zip(*sides, strict=True))
 
 
-def _drawn(part: Again, moments: list[int]) -> Iterator[rendering.Picture]:
+def _drawn(policy: LoadedPolicy, replay: Replay, moments: list[int]) -> Iterator[rendering.Picture]:
     """Moments of a rollout."""
-    task, channels = part.task, part.trajectory.channels
-    values = {name: frames[moments] for name, frames in channels.items()}
+    task = policy.problem.task
+    values = {name: frames[moments] for name, frames in replay.trajectory.channels.items()}
     return rendering.pictures(
-        task.model, part.qpos[moments], SIDE, camera=task.camera, channels=task.channels, values=values
+        task.model, replay.frames["qpos"][moments], SIDE, camera=task.camera, channels=task.channels, values=values
     )
 
 
