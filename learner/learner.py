@@ -85,7 +85,7 @@ class Learner:
         begun = time.monotonic() - self._at.seconds
         if self.over:
             return
-        eps = self._explore(farm)
+        eps, hopeless = self._explore(farm), False
         while not self.over:
             results, last = farm.collect(), self._at
             rollouts = len(eps) * len(self._signs)  # the jobs behind them are the mean policy's, and perhaps the best's
@@ -104,6 +104,9 @@ class Learner:
                     f"cannot write to {self.folder.path}: {error.strerror}; the run stands as of generation "
                     f"{before.generation}: make room and --resume it"
                 ) from None
+            if progress.failed == returns.size and not hopeless:
+                log.warning("the physics of all %d rollouts blew up: farm check shows how they start", returns.size)
+            hopeless = progress.failed == returns.size
             farm.report(progress)
             yield Report(
                 progress=progress,

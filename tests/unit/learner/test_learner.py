@@ -185,6 +185,19 @@ def test_solved_often_enough_is_the_end(pole: str, tmp_path: Path) -> None:
         setup.problem(config)
 
 
+def test_physics_that_always_blows_up_is_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("fast.py").write_text(
+        POLE.replace("        sim.qpos[row, 0] =", "        sim.qvel[row] = 1e30\n        sim.qpos[row, 0] =")
+    )
+    assert [report.progress.failed for report in learnt(configure("fast.py:Pole"), tmp_path / "r")] == [8, 8, 8]
+    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [
+        "the physics of all 8 rollouts blew up: farm check shows how they start"
+    ]
+
+
 def test_a_full_disk_leaves_the_last_generation(pole: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     learner, alone = begun(configure(pole), tmp_path / "r")
     reports: Iterator[Report] = learner.learn(alone)  # type: ignore[arg-type]
