@@ -1,4 +1,4 @@
-"""Who may take part in a run, who is there, and what is known of them. Pure: time is an argument, in seconds."""
+"""Which workers may join a run, which are connected, and what is known of each. Pure: time is an argument [s]."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -81,10 +81,10 @@ class Attendance:
         self._early.pop(worker, None)
 
     def asked(self, want: WorkRequest, now: float) -> bool:
-        """Say whether who asks is there; what others ask is kept until they are, if that is soon.
+        """Say whether the worker that asks is connected; another's request is kept for a while, until it is.
 
         Raises:
-          MessageError: too many ask who are not.
+          MessageError: too many requests are kept already.
         """
         if want.worker in self._there:
             return True
@@ -135,7 +135,7 @@ class Census:
         self._known.pop(worker, None)
 
     def status(self, now: float) -> tuple[WorkerStatus, ...]:
-        """Everybody who is here, by name."""
+        """The connected workers, by name."""
         return tuple(
             WorkerStatus(
                 worker=name,

@@ -1,4 +1,4 @@
-"""A run for those who look on over the network: every generation as it ends, and all before on request."""
+"""A run for viewers over the network: every generation as it ends, and all earlier ones on request."""
 
 import logging
 import time

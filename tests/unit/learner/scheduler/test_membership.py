@@ -1,4 +1,4 @@
-"""Who may take part, who is there among those who say so, and what is known of them."""
+"""Which workers may join, which of those that announce themselves are connected, and what is known of each."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What a learner publishes for those who look on: every report, its log, pages of the past, the end."""
+"""What a learner publishes for viewers: every report, its log, pages of the past, the end."""
 
 import logging
 from collections.abc import Iterator
