@@ -24,7 +24,8 @@ from pathlib import Path
 import rerun_cli
 
 from farm.net.session import free_endpoint
-from learner.config import RunConfig
+from learner.config import RunConfig, configure
+from learner.recording.drawing import Drawing
 from learner.recording.run import RunRecording
 from learner.run import Placement, Run, open_run
 
@@ -61,7 +62,7 @@ def main() -> None:
     found = {name: (Times(), Times()) for name in KINDS}
     for repeat in range(arguments.repeats):
         for name, kind in KINDS.items():
-            _run(RunConfig(seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *found[name])
+            _run(configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *found[name])
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}")
     print("\n| recorded | a generation [ms] | recorded | longest | learner's thread | recorded | of it | recorder |")
     print("|---|---|---|---|---|---|---|---|")
@@ -77,7 +78,7 @@ def main() -> None:
         )
     with tempfile.TemporaryDirectory() as folder:
         place = Placement(workers=2, listen=free_endpoint())
-        with open_run(RunConfig(generations=arguments.long), Path(folder, "r"), place) as run:
+        with open_run(configure(pairs=15, generations=arguments.long), Path(folder, "r"), place) as run:
             for _ in run.learn():
                 pass
         size = Path(folder, "r", "run.rrd").stat().st_size
@@ -89,10 +90,9 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
     place = Placement(workers=2, listen=free_endpoint(), record=False)
     port = int(free_endpoint().rpartition(":")[2])
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
-        problem = run.learner.problem
         recording = RunRecording(
-            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config, scene=problem.scene,
-            spec=problem.spec, camera=problem.task.camera, done=0, serve=("127.0.0.1", port) if kind else None,
+            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config,
+            drawing=Drawing.of(run.learner.problem), done=0, serve=("127.0.0.1", port) if kind else None,
         )  # fmt: skip
         looking = (
             _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("watches", "stopped") else nullcontext()
@@ -112,7 +112,7 @@ def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> N
         block, within = divmod(number, BLOCK)
         recorded = block % 4 in (1, 2)
         if within == 0:
-            recording.settled()
+            recording.thread.settled()
         now = _now()
         if block >= 4 and within:
             times = with_ if recorded else without

@@ -64,14 +64,15 @@ class MadeUp:
         self._plain = {name: shape for name, shape in shapes.items() if not name.startswith("channels/")}
         self._channels = {name[9:]: shape for name, shape in shapes.items() if name.startswith("channels/")}
 
-    def run(self, mu: FloatArray, jobs: Jobs, traces: str = "none") -> Simulated:
+    def run(self, mu: FloatArray, jobs: Jobs, traces: str = "none", _: FloatArray | None = None) -> Simulated:
         """Make results up."""
         returns = jobs.theta(mu).sum(axis=1)
         exploring = ~np.repeat(jobs.seen, jobs.rollouts)
         rows = traced(traces if self.spec.traced else "none", returns, exploring)
         seen = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
         flags = np.zeros((len(returns), 4), dtype=bool)
-        return Simulated(returns, flags, np.zeros((len(rows), *self.spec.trace), "<f4"), seen)
+        steps = np.full(len(returns), self.spec.steps)
+        return Simulated(returns, flags, steps, np.zeros((len(rows), *self.spec.trace), "<f4"), seen)
 
     def _trajectory(self, *, physics: bool) -> WireTrajectory:
         frames = self.spec.steps * (self._parts if physics else 1) + 1
@@ -202,7 +203,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for count in counts:
         pair, pairs = max(arguments.pair, count / MOST), max(PAIRS, PAIRS * count // 64)
-        m, ideal = _measure(count, pairs, pair, arguments.seconds), 2 * count / pair
+        m, ideal = measure(count, pairs, pair, arguments.seconds), 2 * count / pair
         print(
             f"| {count} | {pair * 1000:g} | {pairs} | {m.joined:.1f} | {2 * m.pairs_per_second:.0f} | {ideal:.0f} | "
             f"{2 * m.pairs_per_second / ideal:.2f} | {m.cpu:.2f} | {1e6 * m.cpu / m.pairs_per_second:.0f} | "
@@ -212,36 +213,36 @@ def main() -> None:
     print("\nA generation's time [ms], where simulating takes none (16 workers):\n")
     print("| N | median | us a pair, learner |\n|---|---|---|")
     for pairs in (15, 100, 1000):
-        m = _measure(16, pairs, 0.0, arguments.seconds)
+        m = measure(16, pairs, 0.0, arguments.seconds)
         print(f"| {pairs} | {1e3 * m.latency:.1f} | {1e6 * m.cpu / m.pairs_per_second:.0f} |", flush=True)
 
 
-def _measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
+def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
     """Let a farm of so many workers work for a while."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         endpoint, run = free_endpoint(), Path(folder, "runs/r")
         words = ["--listen", endpoint, "--name", "r", "--pairs", str(pairs), "--generations", "100000", "--no-record"]
-        learner = stack.enter_context(_process(["-m", "farm", "learner", *words], folder))
+        learner = stack.enter_context(process(["-m", "farm", "learner", *words], folder))
         link = stack.enter_context(session.connect((endpoint,), 30.0, lambda: False))
         begun, emulators = time.monotonic(), []
         for first in range(0, workers, TOGETHER):
             count = min(TOGETHER, workers - first)
             command = [__file__, "--pair", str(pair), "--emulate", endpoint, str(count)]
-            emulators.append(stack.enter_context(_process(command, folder)))
+            emulators.append(stack.enter_context(process(command, folder)))
         while _present(link) < workers:
-            _pause(learner, *emulators)
+            pause(learner, *emulators)
         joined = time.monotonic() - begun
-        _wait(run, len(_progress(run)) + 2, learner, *emulators)
-        first, cpu, start = len(_progress(run)), _cpu(learner.pid), time.monotonic()
-        others = sum(_cpu(emulator.pid) for emulator in emulators)
+        _wait(run, len(progress(run)) + 2, learner, *emulators)
+        first, before, start = len(progress(run)), cpu(learner.pid), time.monotonic()
+        others = sum(cpu(emulator.pid) for emulator in emulators)
         time.sleep(seconds)
-        _wait(run, len(_progress(run)) + 1, learner, *emulators)
-        lines, used, took = _progress(run), _cpu(learner.pid) - cpu, time.monotonic() - start
+        _wait(run, len(progress(run)) + 1, learner, *emulators)
+        lines, used, took = progress(run), cpu(learner.pid) - before, time.monotonic() - start
         times = [line["seconds"] for line in lines[first - 1 :]]
         over = (len(times) - 1) * pairs / (times[-1] - times[0])
         latency = statistics.median(b - a for a, b in zip(times, times[1:], strict=False))
-        others = sum(_cpu(emulator.pid) for emulator in emulators) - others
-        return Measured(joined, over, latency, used / took, _megabytes(learner.pid), others / took)
+        others = sum(cpu(emulator.pid) for emulator in emulators) - others
+        return Measured(joined, over, latency, used / took, megabytes(learner.pid), others / took)
 
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
@@ -266,7 +267,8 @@ def _until_closed(over: threading.Event) -> None:
 
 
 @contextmanager
-def _process(words: list[str], folder: str) -> "Iterator[subprocess.Popen[bytes]]":
+def process(words: list[str], folder: str) -> "Iterator[subprocess.Popen[bytes]]":
+    """A Python process that ends with the block."""
     with Path(folder, "said").open("ab") as said:
         process = subprocess.Popen(
             [sys.executable, *words], cwd=folder, stdin=subprocess.PIPE, stdout=said, stderr=said,
@@ -290,30 +292,33 @@ def _present(link: session.Session) -> int:
     return sum(len(run.workers) for run in ask(link, "farm"))
 
 
-def _progress(run: Path) -> list[dict[str, Any]]:
+def progress(run: Path) -> list[dict[str, Any]]:
+    """A run's generations so far."""
     path = run / "progress.jsonl"
     lines = path.read_text().split("\n")[:-1] if path.exists() else []
     return [json.loads(line) for line in lines]
 
 
 def _wait(run: Path, generations: int, *processes: "subprocess.Popen[bytes]") -> None:
-    while len(_progress(run)) < generations:
-        _pause(*processes)
+    while len(progress(run)) < generations:
+        pause(*processes)
 
 
-def _pause(*processes: "subprocess.Popen[bytes]") -> None:
+def pause(*processes: "subprocess.Popen[bytes]") -> None:
+    """Wait a moment; end if one of the processes has."""
     time.sleep(0.05)
     if any(process.poll() is not None for process in processes):
         sys.exit("a learner or a process full of workers ended before its time")
 
 
-def _cpu(pid: int) -> float:
+def cpu(pid: int) -> float:
     """Processor time of a process [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _megabytes(pid: int) -> float:
+def megabytes(pid: int) -> float:
+    """Memory that a process has in use."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 

@@ -21,7 +21,7 @@ from farm.sim import rendering, video
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks import loop
-from farm.tasks.finger_gait import model, touch
+from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
@@ -67,7 +67,7 @@ _HELD: Final = ("index+thumb", "index+middle+thumb")
 
 def _waiting() -> FloatArray:
     """Fingers open, the object frozen in front of them, (15,)."""
-    hand = model.load("bar")
+    hand = FingerGait().hand
     qpos = hand.model.qpos0.copy()
     qpos[: len(JOINTS)] = Grasping(hand).command(())
     return qpos
@@ -94,7 +94,7 @@ def _held(grip: str) -> FloatArray:
 
 def _photograph(qpos: FloatArray) -> Image.Image:
     camera = replace(FingerGait.camera, distance=0.4)
-    (picture,) = rendering.pictures(model.load("bar").model, qpos[None], PANEL, camera=camera)
+    (picture,) = rendering.pictures(FingerGait().model, qpos[None], PANEL, camera=camera)
     return Image.fromarray(picture)
 
 

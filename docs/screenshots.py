@@ -110,7 +110,7 @@ def main() -> None:
         swim = ("--task", "gym:Swimmer-v5", "--steps", "300", "--generations", "15")
         _farm(folder, "run", *swim, "--name", "swim", "--quiet")
         for name, source, tab, at in (
-            ("viewer", "runs/first/run.rrd", "Learning", ("generation", {"sequence": 150})),
+            ("viewer", "runs/first/run.rrd", "Learning", ("generation", {"sequence": 90})),
             ("rollout", "runs/first/run.rrd", "Rollout", ("sim_time", {"duration": 225.9})),
             ("replay", "runs/first/gait.rrd", "", ("sim_time", {"duration": 1.2})),
             ("compare", "compare.rrd", "", None),

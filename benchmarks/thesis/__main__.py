@@ -21,11 +21,10 @@ from benchmarks.thesis.experiment import judge, verdict
 from benchmarks.thesis.folder import ExperimentFolder, find
 from farm import settings
 from farm.commands import logs
-from farm.commands.signals import stop_flag
+from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
 from learner import sweep
-from learner.commands.learning import INTERRUPTED
-from learner.commands.side_by_side import Runs, check
+from learner.commands.sweep import Runs, check_sharing
 from learner.figure import INSTALL, available
 from learner.sweep import Sharing
 
@@ -83,7 +82,7 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"which experiment? {PROGRAM} --list shows them")
     names = tuple(EXPERIMENTS) if command.name == ALL else (find(command.name).name,)
     check_matplotlib()
-    check(command.sharing)
+    check_sharing(command.sharing)
     logs.set_up("WARNING")
     out = command.out or Path("runs") / command.name
     folder = ExperimentFolder.prepare(out, names, command.trials, command.generations)

@@ -4,6 +4,7 @@ The set-up of the thesis' experiments is `--preset thesis` with what the figure'
 are silent the preset's value stays (docs/method.md says what that leaves open).
 """
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 from benchmarks.thesis import claims
@@ -29,6 +30,17 @@ def _projected(state: str, features: int, **settings: Any) -> RunConfig:  # noqa
 def _direct(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: ANN401
     own = {"weights": "direct", "clip": False, **settings}
     return setup("thesis", policy="direct", state=state, features=features, **own)
+
+
+_FORMER: Final[Mapping[str, Any]] = {
+    "pairs": 15, "initial_mu": 1.75, "initial_sigma": 0.8, "learning_rate_mu": 0.1, "learning_rate_sigma": 0.2,
+    "sigma_floor": 1e-3, "generations": 150,
+}  # fmt: skip
+"""What the preset `default` was when the experiments were made."""
+
+
+def _default(**settings: Any) -> RunConfig:  # noqa: ANN401
+    return setup("default", **{**_FORMER, **settings})
 
 
 _RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb"}
@@ -65,26 +77,26 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "tactile-D10800": _projected("tactile", 10800),
     "joints-tactile-D12600": _projected("joints+tactile", 12600),
     "joints-kernel": setup("thesis", policy="kernel"),
-    "default-contacts": setup("default", state="joints+contacts"),
-    "default-contacts-h2": setup("default", state="joints+contacts", bandwidth=2.0),
-    "default-contacts-x0.3": setup("default", state="joints+contacts", contacts_scale=0.3),
-    "default-contacts-x0.1": setup("default", state="joints+contacts", contacts_scale=0.1),
+    "default-contacts": _default(state="joints+contacts"),
+    "default-contacts-h2": _default(state="joints+contacts", bandwidth=2.0),
+    "default-contacts-x0.3": _default(state="joints+contacts", contacts_scale=0.3),
+    "default-contacts-x0.1": _default(state="joints+contacts", contacts_scale=0.1),
     "joints-D8000-near": _projected("joints", 8000, initial_mu=1.75, initial_sigma=0.8),
     "joints-D8000-capped": _projected("joints", 8000, sigma_rule="capped"),
     "joints-D8000-near-capped": _projected(
         "joints", 8000, initial_mu=1.75, initial_sigma=0.8, sigma_rule="capped"
     ),
     "joints-D8000-sehnke": _projected("joints", 8000, normaliser="sehnke"),
-    **{f"default-{name}": setup("default", object=name) for name in OBJECTS},
-    "default-direct": setup("default", policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
-    "release-kernel": setup("default", **_RELEASE),
-    "release-direct": setup(
-        "default", policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1, **_RELEASE
+    **{f"default-{name}": _default(object=name) for name in OBJECTS},
+    "default-direct": _default(policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
+    "release-kernel": _default(**_RELEASE),
+    "release-direct": _default(
+        policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1, **_RELEASE
     ),
-    "default-optimal-baseline": setup("default", baseline="optimal"),
-    "default-no-baseline": setup("default", baseline="none"),
-    "default-plain": setup("default", estimator="plain"),
-    "default-plain-optimal-baseline": setup("default", estimator="plain", baseline="optimal"),
+    "default-optimal-baseline": _default(baseline="optimal"),
+    "default-no-baseline": _default(baseline="none"),
+    "default-plain": _default(estimator="plain"),
+    "default-plain-optimal-baseline": _default(estimator="plain", baseline="optimal"),
 }  # fmt: skip
 """Configurations by name; a run is one of them and a seed, shared by all experiments that show it."""
 

@@ -1,0 +1,69 @@
+"""What a farm does under loads that nobody plans: many learners, idle workers, huge and tiny generations; one table.
+
+    python benchmarks/load.py [--seconds 10] [--learners 40]
+
+Workers are the emulated ones of scaling.py, whose rollouts take no time, on this machine.
+"""
+
+import argparse
+import signal
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from scaling import __file__ as emulator
+from scaling import cpu, measure, megabytes, pause, process, progress
+
+from farm.net.session import free_endpoint
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--learners", type=int, default=40)
+    arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without ending what it began
+    print("| load | generations/s | rollouts/s | a generation [ms] | learner: cores | learner MB |")
+    print("|---|---|---|---|---|---|")
+    for what, workers, pairs in (
+        ("one pair a generation, 1 worker", 1, 1),
+        ("20 000 pairs a generation, 16 workers", 16, 20_000),
+        ("200 workers, one pair a generation", 200, 1),
+    ):
+        m = measure(workers, pairs, 0.0, arguments.seconds)
+        rate = m.pairs_per_second / pairs
+        figures = f"{rate:.1f} | {2 * m.pairs_per_second:.0f} | {1e3 * m.latency:.1f} | {m.cpu:.2f} | {m.megabytes:.0f}"
+        print(f"| {what} | {figures} |", flush=True)
+    _learners(arguments.learners, arguments.seconds)
+
+
+def _learners(count: int, seconds: float) -> None:
+    """So many learners behind one router, and four workers who serve them all."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        endpoint, generations = free_endpoint(), 20
+        router = stack.enter_context(process(["-m", "farm", "router", "--listen", endpoint], folder))
+        workers = stack.enter_context(process([emulator, "--pair", "0", "--emulate", endpoint, "4"], folder))
+        words = ["-m", "farm", "learner", "--connect", endpoint, "--no-record", "--pairs", "15"]
+        words += ["--generations", str(generations)]
+        begun = time.monotonic()
+        learners = [stack.enter_context(process([*words, "--name", f"r{i}"], folder)) for i in range(count)]
+        runs = [Path(folder, f"runs/r{i}") for i in range(count)]
+        most = 0.0
+        while any(len(progress(run)) < generations for run in runs):
+            most = max(most, *(megabytes(each.pid) for each in learners if each.poll() is None), 0.0)
+            if time.monotonic() - begun > 60 * seconds:
+                sys.exit(f"{sum(len(progress(run)) for run in runs)} of {count * generations} generations were done")
+            pause(router, workers)
+        took = time.monotonic() - begun
+        print(
+            f"| {count} learners behind a router, 4 workers | {count * generations / took:.1f} | "
+            f"{30 * count * generations / took:.0f} | - | router: {cpu(router.pid) / took:.2f} | "
+            f"{most:.0f}, router {megabytes(router.pid):.0f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,238 @@
+"""Does touch decide? The fragile bar, learnt with it and without; a table, a figure, and the numbers.
+
+    python benchmarks/touch.py [--seeds 20,21,22,23,24] [--bias 0.05] [--out docs/results/touch] [--rows forces,joints]
+
+Each row is learnt by the farm for 1280 rollouts, in runs of its own under runs/touch, and judged on 200 starts that no
+run trained on. Settings were chosen on seeds 0 to 14. Without touch: the best constant targets, a policy of time alone,
+the joints, the joints with their targets (the servos' deflection is a sensor of force), the joints with a memory, and
+an expert made by hand: close the middle finger at a constant rate until its joints lag behind by so much; rate and lag
+are the best of a grid on starts of its own.
+"""
+
+import argparse
+import itertools
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import farm
+from farm.arrays import FloatArray
+from farm.policies.base import Policy
+from farm.rollouts import Runner
+from farm.settings import setting
+from farm.sim.sim import Sim
+from farm.tasks.base import TaskSpec
+from farm.tasks.finger_gait.fragile_bar import TERMS, FragileBar, FragileBarConfig
+from farm.tasks.finger_gait.hand import FINGER_JOINTS, JOINTS
+from farm.tasks.finger_gait.task import CONTROL_PERIOD
+from farm.tasks.loop import Batch, Seed, again
+from learner.run_folder import RunFolder
+from learner.setup import problem
+
+HERE = Path(__file__).resolve()
+STARTS: tuple[Seed, ...] = tuple((2, 0, 9, i) for i in range(200))
+"""Starts that are judged."""
+GRID: tuple[Seed, ...] = tuple((2, 0, 8, i) for i in range(100))
+"""Starts that the expert's rate and lag are chosen on."""
+BLIND = {"time": 1, "joints+targets": 16, "joints+memory": 16}
+"""Observations without touch that the task itself does not have, and their sizes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlindConfig(FragileBarConfig):
+    """The fragile bar's settings, but for the state base."""
+
+    sight: str = "time"
+    """What the policy sees: time | joints+targets | joints+memory."""
+    memory: float = setting(0.7, least=0.0, below=1.0)
+    """Part of the memory that is kept at each control step."""
+
+
+class Blind(FragileBar):
+    """The fragile bar for policies that feel nothing."""
+
+    Config = BlindConfig
+
+    def spec(self) -> TaskSpec:
+        """As the fragile bar's, with another observation."""
+        return TaskSpec(
+            observation=BLIND[self.config.sight], action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
+            terms=TERMS, success=True, channels=self.channels,
+        )  # fmt: skip
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """One part for each kind of number."""
+        size = BLIND[self.config.sight]
+        return (size,) if size == 1 else (len(JOINTS), len(JOINTS))
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """Time, or readings of the joints with their targets or their running mean."""
+        if self.config.sight == "time":
+            return np.full((len(sim), 1), sim.t / self.steps)
+        q = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)]
+        if self.config.sight == "joints+targets":
+            return np.concatenate([q, sim.own["target"]], axis=1)
+        keep = self.config.memory
+        past = sim.own.get("past", q)
+        sim.own["past"] = keep * past + (1.0 - keep) * q
+        return np.concatenate([q, sim.own["past"]], axis=1)
+
+
+class Constant(Policy):
+    """The same action always: a = b."""
+
+    @property
+    def size(self) -> int:
+        """A."""
+        return self.spec.action
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Actions."""
+        return np.array(prepared)
+
+
+WIDE: dict[str, Any] = {"width": 1.77, "weight_scale": 0.25, "initial_sigma": 1.0, "action": "offset"}
+"""The weighted kernel as it is for the finger gait."""
+ROWS: dict[str, dict[str, Any]] = {
+    "forces": {},
+    "cop": {"state": "cop"},
+    "tactile": {"state": "tactile", "width": 1.0},
+    "constant": {"policy": f"{HERE}:Constant", "initial_sigma": 0.3, "action": "offset", "state": "joints"},
+    "time": {"task": f"{HERE}:Blind", "sight": "time"},
+    "joints": {"state": "joints"},
+    "joints, offset": {"state": "joints", **WIDE},
+    "joints+targets": {"task": f"{HERE}:Blind", "sight": "joints+targets"},
+    "joints+targets, offset": {"task": f"{HERE}:Blind", "sight": "joints+targets", **WIDE},
+    "joints+memory": {"task": f"{HERE}:Blind", "sight": "joints+memory", "width": 1.0},
+}
+TOUCH = ("forces", "cop", "tactile")
+
+
+def main() -> None:
+    """Learn, judge, and write down."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="20,21,22,23,24")
+    parser.add_argument("--bias", type=float, default=0.05)
+    parser.add_argument("--out", type=Path, default=Path("runs/touch"))
+    parser.add_argument("--rows", default=",".join(name for name in ROWS if ", " not in name))
+    arguments = parser.parse_args()
+    seeds = [int(word) for word in arguments.seeds.split(",")]
+    rows = [
+        name for name in ROWS if name in arguments.rows.split(",") or name.split(", ")[0] in arguments.rows.split(",")
+    ]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / f"bias-{arguments.bias:g}.json"
+    found: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
+    print("| policy sees | success on 200 new starts by seed [%] | shuffled touch [%] |\n|---|---|---|")
+    found.setdefault("expert", [_expert(arguments.bias)])
+    for name in rows:
+        if name not in found:
+            judged = [_learnt(name, seed, arguments.bias) for seed in seeds]
+            found[name] = [own for own, _ in judged]
+            if name in TOUCH:
+                found[f"{name}, shuffled"] = [shuffled for _, shuffled in judged]
+            path.write_text(json.dumps(found, indent=1) + "\n")
+        print(f"| {name} | {_percent(found[name])} | {_percent(found.get(f'{name}, shuffled', ()))} |", flush=True)
+    print(f"| hand-made: rate and lag of the joints | {_percent(found['expert'])} | |")
+    path.write_text(json.dumps(found, indent=1) + "\n")
+    draw(found, arguments.out / f"bias-{arguments.bias:g}.png", arguments.bias)
+
+
+def _percent(parts: Sequence[float]) -> str:
+    return ", ".join(f"{100 * part:.3g}" for part in parts)
+
+
+def _learnt(name: str, seed: int, bias: float) -> tuple[float, float]:
+    """Learn a row of the table; its success, and that with the touch of another rollout."""
+    options = {"task": "fragile-bar", **ROWS[name], "bias": bias, "seed": seed}
+    config = farm.configure(options.pop("task"), **options)
+    folder = Path("runs/touch", f"{re.sub('[^a-z]+', '-', name)}-b{bias:g}-s{seed}")
+    if not (folder / "summary.json").exists():
+        for _ in farm.learn(config, folder, workers=2):
+            pass
+    mean = RunFolder.open(folder).parameters()["mu"][-1]
+    runner = problem(config).runner()
+    try:
+        own, shuffled = (_success(runner, mean, shuffle=each) for each in (False, True))
+    finally:
+        runner.close()
+    return own, shuffled
+
+
+def _success(runner: Runner, mean: FloatArray, *, shuffle: bool) -> float:
+    """Part of the new starts that succeed; perhaps each rollout sees what its neighbour feels."""
+    done, size = [], runner.sim.engine.size
+    for first in range(0, len(STARTS), size):
+        starts = STARTS[first : first + size]
+
+        def rollouts(starts: tuple[Seed, ...] = starts) -> Any:  # noqa: ANN401
+            batch = Batch(runner.task, runner.sim, starts)
+            prepared = runner.policy.prepare(np.tile(mean, (len(starts), 1)))
+            while not batch.over:
+                x = batch.observe()
+                batch.step(runner.policy.act(prepared[batch.active], np.roll(x, 1, axis=0) if shuffle else x))
+            return batch.rollouts()
+
+        done.append(again(rollouts).success)
+    return float(np.concatenate(done).mean())
+
+
+def _expert(bias: float) -> float:
+    """The best hand-made policy without touch: close at a rate until the middle finger's last joint lags so much."""
+    runner = problem(farm.configure("fragile-bar", bias=bias)).runner()
+    middle = FINGER_JOINTS["middle"]
+
+    def judge(starts: tuple[Seed, ...], rate: float, lag: float) -> float:
+        done = []
+        for first in range(0, len(starts), runner.sim.engine.size):
+
+            def rollouts(some: tuple[Seed, ...] = starts[first : first + runner.sim.engine.size]) -> Any:  # noqa: ANN401
+                batch, sim = Batch(runner.task, runner.sim, some), runner.sim
+                while not batch.over:
+                    q = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, sim.t]
+                    behind = (sim.own["target"] - q)[:, middle].sum(axis=1)
+                    action = np.zeros((len(sim), len(JOINTS)))
+                    action[:, middle] = np.where(behind < lag, rate, 0.0)[:, None]
+                    batch.step(action)
+                return batch.rollouts()
+
+            done.append(again(rollouts).success)
+        return float(np.concatenate(done).mean())
+
+    try:
+        grid = itertools.product((0.01, 0.015, 0.02, 0.03, 0.05), np.linspace(-0.1, 0.3, 21).tolist())
+        best = max(grid, key=lambda each: judge(GRID, *each))
+        return judge(STARTS, *best)
+    finally:
+        runner.close()
+
+
+def draw(found: dict[str, list[float]], path: Path, bias: float) -> None:
+    """One figure: success by what a policy sees, a dot for each seed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 3.6))
+    colours = {True: "#0072b2", False: "#999999"}
+    for row, (name, parts) in enumerate(reversed(found.items())):
+        touch = name.split(", ")[0] in TOUCH and "shuffled" not in name
+        axes.barh(row, 100 * float(np.median(parts)), color=colours[touch], alpha=0.5)
+        axes.plot([100 * part for part in parts], [row] * len(parts), "o", color=colours[touch], markersize=4)
+    axes.set_yticks(range(len(found)), list(reversed(found)))
+    axes.set_xlim(0, 101)
+    axes.set_xlabel("success on 200 new starts [%]; bar: median, dots: seeds")
+    axes.set_title(f"fragile bar, joint readings wrong by up to {bias:g} rad; blue: by touch")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
