@@ -12,7 +12,7 @@ import sys
 import mujoco
 import numpy as np
 
-# Parts of pi and ln 2, and coefficients, of the two functions below.
+# Parts of pi and ln 2, and coefficients, of the functions below.
 PI = tuple(map(float.fromhex, ("0x1.921fb54400000p+1", "0x1.0b4611a600000p-33", "0x1.3198a2e037073p-68")))
 LN2 = tuple(map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
 SINE = (
@@ -37,6 +37,22 @@ def exp(x: np.ndarray) -> np.ndarray:
     return np.ldexp(1.0 + 2.0 * (r / (np.polyval(COTH, r * r) - r)), k.astype(int))
 
 
+def tanh(x: np.ndarray) -> np.ndarray:
+    """Hyperbolic tangent, the same way: (e^2|x| - 1) / (e^2|x| + 1)."""
+    y = np.minimum(2.0 * np.abs(x), 40.0)
+    k = np.rint(y * float.fromhex("0x1.71547652b82fep+0"))
+    r = y - k * LN2[0] - k * LN2[1]
+    grown, whole = 2.0 * (r / (np.polyval(COTH, r * r) - r)), np.ldexp(1.0, k.astype(int))
+    above = grown * whole + (whole - 1.0)
+    return np.copysign(above / (above + 2.0), x)
+
+
+def powers(centres: np.ndarray, x: np.ndarray, bandwidth: float) -> np.ndarray:
+    """-|c - x|^2 / (2 h^2) of each row of centres."""
+    difference = np.ascontiguousarray(centres) - x
+    return (difference * difference).sum(axis=-1) * (-0.5 / bandwidth**2)
+
+
 class Policy:
     """The controller: joint positions and touch in, targets of the eight servos out."""
 
@@ -47,9 +63,10 @@ class Policy:
         self.model = mujoco.MjModel.from_xml_string(self.p["mjcf"])
         self.data = mujoco.MjData(self.model)
         self.sites = [self.model.site(name).id for name in self.p["tips"]]
-        self.theta = self.p["mu"].reshape(8, -1)
-        self.bandwidth = json.loads(self.p["policy_config"])["bandwidth"]
-        if self.p["policy"] != "kernel":
+        self.config = json.loads(self.p["policy_config"])
+        self.bandwidth = self.config.get("bandwidth")
+        self.theta = self.p["mu"] if self.p["policy"] in ("rbf", "mlp") else self.p["mu"].reshape(8, -1)
+        if "frequencies" in self.p:
             self.rows = np.ascontiguousarray((self.p["frequencies"] / self.bandwidth).T)  # one per state component
         if self.p["policy"] in ("projected", "cosine"):
             maps = {"projected": lambda rows: np.stack([self.features(row) for row in rows]), "cosine": cos}
@@ -62,18 +79,38 @@ class Policy:
 
     def act(self) -> np.ndarray:
         """One action (8,) [rad]; the servos' targets follow from it."""
-        if self.p["policy"] == "kernel":
-            difference = self.theta - self.x
-            powers = (difference * difference).sum(axis=-1) * (-0.5 / self.bandwidth**2)
-            a = np.array([math.exp(power) for power in powers])
-        else:
-            a = (self.theta * self.features(self.x)).sum(axis=-1)
+        x = self.x
+        if "observation_mean" in self.p:
+            x = (x - self.p["observation_mean"]) / self.p["observation_deviation"]
+        a = self.action(self.p["policy"], self.theta, x)
         base = {"offset": self.p["start_command"], "absolute": 0.0, "increment": self.last}[self.p["action"]]
         target = base + a
         target[np.isnan(target)] = 0.0
         self.last = np.minimum(np.maximum(target, self.p["lower"]), self.p["upper"])
         self.data.ctrl[:] = self.last
         return a
+
+    def action(self, policy: str, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The controller's action, (8,), of the state x (d,)."""
+        if policy == "kernel":
+            return np.array([math.exp(power) for power in powers(theta, x, self.bandwidth)])
+        if policy == "rbf":
+            centres, weights = np.split(theta, [self.config["centres"] * len(x)])
+            values = exp(powers(centres.reshape(-1, len(x)), x, self.bandwidth))
+            return (weights.reshape(8, -1) * values).sum(axis=-1)
+        if policy == "weighted-kernel":
+            y, bandwidth = (x - self.p["origin"]) / self.p["spread"], self.config["width"] * np.sqrt(len(x))
+            return self.config["weight_scale"] * theta[:, -1] * exp(powers(theta[:, :-1], y, bandwidth))
+        if policy == "linear":
+            return (theta[:, :-1] * x).sum(axis=-1) + theta[:, -1]
+        if policy == "mlp":
+            for units in (*self.config["layers"], 8):
+                rows, theta = np.split(theta, [units * (len(x) + 1)])
+                rows = rows.reshape(units, -1)
+                out = (np.ascontiguousarray(rows[:, :-1]) * x).sum(axis=-1) + rows[:, -1]
+                x = tanh(out)
+            return out
+        return (theta * self.features(x)).sum(axis=-1)
 
     def features(self, x: np.ndarray) -> np.ndarray:
         """Random Fourier features z(x), (d,) -> (D,)."""
@@ -111,6 +148,8 @@ class Policy:
         joints, (images, points, held) = self.data.qpos[:8].copy(), self.feel()
         parts = {"joints": joints * self.p["joints_scale"], "contacts": points.ravel() * self.p["contacts_scale"]}
         parts["tactile"] = images.ravel() * self.p["tactile_scale"]
+        parts["forces"] = (images * self.p["tactile_scale"]).sum(axis=-1)
+        parts["cop"] = np.concatenate([parts["contacts"], parts["forces"]])
         self.x = np.concatenate([parts[part] for part in self.p["input"].split("+")])
         punished = np.minimum(np.abs(a), self.p["punished_to"])
         wrong = (

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from farm.tasks.base import TaskSpec as TaskSpec
 
 _WHERE: Final = {
-    "learn": "learner.run", "load": "learner.replay", "RunConfig": "learner.config", "configure": "learner.config",
+    "learn": "learner.run", "Farm": "learner.pool", "load": "learner.replay",
+    "RunConfig": "learner.config", "configure": "learner.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
     "Channel": "farm.sim.channels", "Camera": "farm.sim.channels",
     "Record": "farm.tasks.base", "Score": "farm.tasks.base",

@@ -10,6 +10,8 @@ FarmError                 anything we can say in one line
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 _LINE: Final = 500  # characters
@@ -19,6 +21,17 @@ def brief(text: str) -> str:
     """One printable line of at most 500 characters, of whatever text: for logs, and for what others are told."""
     line = " ".join(text[: 2 * _LINE].split())[:_LINE]
     return "".join(letter if letter.isprintable() else "?" for letter in line)
+
+
+def printable(text: str, kept: str = "") -> str:
+    r"""The text with whatever is not to be seen escaped, as \x1b: it may come from anybody, and terminals obey it.
+
+    Letters of all languages stay; characters in `kept` do as well.
+    """
+    return "".join(
+        letter if letter.isprintable() or letter in kept else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
 
 
 class FarmError(Exception):
@@ -55,3 +68,12 @@ class RunError(FarmError):
 
 class Interrupted(FarmError):  # noqa: N818  not an error
     """The user ended it before there was anything to save."""
+
+
+@contextmanager
+def writing(what: object, kind: type[FarmError] = RunError) -> Iterator[None]:
+    """Have an error of the file system say in one line what could not be written."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"cannot write {what}: {error.strerror or error}") from None

@@ -23,6 +23,7 @@ from farm.errors import ConfigError, UnservedError
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     "tasks": {
         "finger-gait": "farm.tasks.finger_gait.task:FingerGait",
+        "fragile-bar": "farm.tasks.finger_gait.fragile_bar:FragileBar",
         "gym": "farm.tasks.gymnasium:Environment",
     },
     "policies": {
@@ -30,9 +31,17 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "projected": "farm.policies.fourier:Projected",
         "kernel": "farm.policies.fourier:Kernel",
         "cosine": "farm.policies.fourier:Cosine",
+        "linear": "farm.policies.networks:Linear",
+        "mlp": "farm.policies.networks:Mlp",
+        "rbf": "farm.policies.radial:Rbf",
+        "weighted-kernel": "farm.policies.radial:WeightedKernel",
     },
     "algorithms": {
         "pgpe": "learner.algorithms.pgpe:PGPE",
+        "snes": "learner.algorithms.snes:SNES",
+        "ars": "learner.algorithms.ars:ARS",
+        "cma-es": "learner.algorithms.cma:CMAES",
+        "sep-cma": "learner.algorithms.cma:SepCMA",
     },
     "backends": {
         "cpu": "workers.backends.cpu:CpuBackend",
@@ -118,7 +127,10 @@ def find(kind: str, name: str) -> Plugin:
     own, _, variant = name.partition(":")
     if own in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][own].partition(":")
-        found = Plugin(kind, name, getattr(_import(module, kind, own), attribute), variant)
+        try:
+            found = Plugin(kind, name, getattr(load(module), attribute), variant)
+        except ImportError as error:
+            raise ConfigError(f"{_one(kind)} {own!r} cannot be imported: {error}") from error
     else:
         found = _from_package(kind, own, variant)
     takes = getattr(found.target, "takes", "")
@@ -159,13 +171,10 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
     module = _file_module(path, source)
     target = getattr(module, inside, None)
     if not isinstance(target, type):
-        known = [name for name, value in vars(module).items() if _own_class(value, module.__name__)]
+        classes = [(name, value) for name, value in vars(module).items() if isinstance(value, type)]
+        known = [name for name, value in classes if value.__module__ == module.__name__]
         raise ConfigError(f"{path} has no class {inside!r}; it has {', '.join(known) or 'none'}")
     return Plugin(kind, f"{path}:{inside}", target, file=path, imported=hashlib.sha256(source).hexdigest())
-
-
-def _own_class(value: object, module: str) -> bool:
-    return isinstance(value, type) and value.__module__ == module
 
 
 @cache
@@ -188,35 +197,19 @@ def _where(error: BaseException, path: Path) -> str:
     """An error and its line in a file."""
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
-    lines, trace = [], error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            lines.append(trace.tb_lineno)
-        trace = trace.tb_next
+    lines = [each.lineno for each in traceback.extract_tb(error.__traceback__) if each.filename == str(path)]
     place = f"line {lines[-1]}: " if lines else ""
     return f"{place}{type(error).__name__}: {error}"
 
 
 def author_frames(error: BaseException) -> list[str]:
     """The part of a traceback that lies in classes from files, as text; empty where none does."""
-    found = [
-        summary
-        for (frame, _), summary in zip(
-            traceback.walk_tb(error.__traceback__), traceback.extract_tb(error.__traceback__), strict=True
-        )
-        if str(frame.f_globals.get("__name__")).startswith(_MODULES)
-    ]
-    return traceback.format_list(found)
+    files = {module.__file__ for name, module in list(sys.modules.items()) if name.startswith(_MODULES)}
+    return traceback.format_list([each for each in traceback.extract_tb(error.__traceback__) if each.filename in files])
 
 
 def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:
-    """A class from a file that somebody else named, if this machine was told to serve that file.
-
-    Args:
-      kind: of the plug-in.
-      wire: NAME.py:CLASS.
-      digest: of the file's bytes, as the other side has it.
-      files: those that may be served.
+    """A class NAME.py:CLASS that somebody else named, from the one of these files of that name and digest.
 
     Raises:
       UnservedError: none is allowed, or the one that is differs.
@@ -255,32 +248,23 @@ def _sources(module: str) -> dict[str, bytes]:
         if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
             continue
         found[name] = Path(spec.origin).read_bytes()
-        waiting += _imports(found[name], name, module.partition(".")[0])
+        waiting += _imports(found[name], spec.parent, module.partition(".")[0])
     return found
 
 
-def _imports(source: bytes, module: str, package: str) -> Iterator[str]:
-    """Modules of the package that a source imports."""
+def _imports(source: bytes, parent: str | None, package: str) -> Iterator[str]:
+    """Modules of the top-level package that a source imports; relative to its parent."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            base = _absolute(node, module)
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), parent)
             names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
         else:
             continue
         for name in names:
             if name.partition(".")[0] == package and _is_module(name):
                 yield name
-
-
-def _absolute(node: ast.ImportFrom, module: str) -> str:
-    if not node.level:
-        return node.module or ""
-    spec = importlib.util.find_spec(module)
-    parts = module.split(".") if spec is not None and spec.submodule_search_locations else module.split(".")[:-1]
-    kept = parts[: len(parts) - node.level + 1]
-    return ".".join([*kept, *([node.module] if node.module else [])])
 
 
 def _is_module(name: str) -> bool:
@@ -317,13 +301,6 @@ def load(module: str) -> Any:  # noqa: ANN401  a module
     elif init.exists() and Path(str(getattr(known, "__file__", None) or "")) != init:
         raise ConfigError(f"a module named {package!r} that is not rolloutfarm's is loaded: import farm before it")
     return importlib.import_module(module)
-
-
-def _import(module: str, kind: str, name: str) -> Any:  # noqa: ANN401  a module
-    try:
-        return load(module)
-    except ImportError as error:
-        raise ConfigError(f"{_one(kind)} {name!r} cannot be imported: {error}") from error
 
 
 def _one(kind: str) -> str:

@@ -5,13 +5,26 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.5  # [s] that a worker has to leave before it is killed
 _RESTARTS: Final = 20  # a worker that keeps dying is not started for ever
 _ENVIRONMENT: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+
+
+def end(processes: "Sequence[subprocess.Popen[Any]]", grace: float) -> None:
+    """Ask processes to leave; those that still run after so many seconds are killed."""
+    for process in processes:
+        process.terminate()
+    until = time.monotonic() + grace
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 class Pool:
@@ -50,29 +63,21 @@ class Pool:
                     log.warning("worker process %d ended with status %d and is not replaced", process.pid, status)
                 continue
             self._restarts += 1
+            if process.stdin:
+                process.stdin.close()
             log.warning("worker process %d ended with status %d; starting another", process.pid, status)
             self._processes[i] = self._start()
         return given_up
 
     def close(self) -> None:
         """Ask all to leave, wait, kill those that do not."""
+        end(self._processes, _GRACE)
         for process in self._processes:
-            if process.poll() is None:
-                process.terminate()
-        until = time.monotonic() + _GRACE
-        for process in self._processes:
-            try:
-                process.wait(max(0.0, until - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
             if process.stdin:
                 process.stdin.close()
 
     def __enter__(self) -> "Pool":
-        """Running already."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()

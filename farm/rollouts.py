@@ -9,9 +9,11 @@ import numpy as np
 from farm import plugins, settings
 from farm.arrays import FloatArray
 from farm.errors import ConfigError, UnservedError
+from farm.moments import usable
 from farm.net.messages import Spec
-from farm.net.work import Jobs, Simulated, WireTrajectory, traced
+from farm.net.work import NOT_NORMALISED, Jobs, Simulated, WireTrajectory, traced
 from farm.policies.base import Policy
+from farm.policies.normalised import Normalised
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import Scene, quiet
 from farm.sim.sim import Backend, MakeEngine, Sim
@@ -26,38 +28,64 @@ class Runner:
     """Runs one run's jobs."""
 
     def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine) -> None:
-        """Simulate what all rollouts need.
-
-        Raises:
-          ConfigError: the task cannot be begun.
-        """
+        """Simulate what all rollouts need; a ConfigError where the task cannot be begun."""
         quiet()
         self.task, self.policy = task, policy
         self.spec, self.scene = policy.spec, Scene(task.model)
         self.sim = Sim(task.engine(make))
         loop.again(lambda: task.setup(self.sim))
 
-    def run(self, mu: FloatArray, jobs: Jobs, traces: str = "none") -> Simulated:
-        """Run jobs around a mean (P,), with those traces of exploring rollouts that are wanted, one of TRACES."""
+    def run(
+        self, mu: FloatArray, jobs: Jobs, traces: str = "none", normaliser: FloatArray = NOT_NORMALISED
+    ) -> Simulated:
+        """Run jobs around a mean (P,).
+
+        Args:
+          mu: (P,).
+          jobs: what to run.
+          traces: which traces of exploring rollouts are wanted, one of TRACES.
+          normaliser: as a RoundHeader has it, (2, 2, d); with d > 0 the result has moments of the observations.
+
+        Raises:
+          UnservedError: the normaliser is of other observations.
+        """
         theta, seeds, first = jobs.theta(mu), jobs.seeds(), np.cumsum(jobs.rollouts) - jobs.rollouts
-        at_physics = np.repeat(jobs.physics, jobs.rollouts)
+        policies, wanted = self._normalised(normaliser), normaliser.shape[-1]
+        kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: normalised in its own way
+        kind_of = np.repeat(kinds, jobs.rollouts)
         returns, flags = np.zeros(len(theta)), np.zeros((len(theta), 4), dtype=bool)
+        steps = np.zeros(len(theta), dtype="<i8")
+        moments = np.zeros((len(theta), 1 + 2 * wanted) if wanted else (0, 0))
         seen: dict[int, WireTrajectory] = {}
         values = np.empty((0, *self.spec.trace), dtype="<f4")
-        for physics in (False, True):
-            rows = np.flatnonzero(at_physics == physics)
+        for kind, policy in enumerate(policies):
+            rows, physics = np.flatnonzero(kind_of == kind), kind > 0
             if not len(rows):
                 continue
-            rollouts = self.rollouts(theta[rows], [seeds[row] for row in rows], physics=physics)
-            returns[rows], flags[rows] = rollouts.returns, rollouts.flags
+            rollouts = loop.run(
+                self.task, policy, self.sim, theta[rows], [seeds[row] for row in rows], int(physics),
+                moments=bool(wanted) and not physics,
+            )  # fmt: skip
+            returns[rows], flags[rows], steps[rows] = rollouts.returns, rollouts.flags, rollouts.steps
+            if rollouts.moments.size:
+                moments[rows] = np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
             place = {int(row): at for at, row in enumerate(rows)}
-            for job in np.flatnonzero(jobs.seen & (jobs.physics == physics)).tolist():
+            for job in np.flatnonzero(jobs.seen & (kinds == kind)).tolist():
                 seen[job] = WireTrajectory.of(self.trajectory(rollouts, place[int(first[job])]))
             if not physics:
                 exploring = ~np.repeat(jobs.seen, jobs.rollouts)[rows]
                 chosen = traced(traces if self.spec.traced else "none", rollouts.returns, exploring)
                 values = loop.traces(self.task, self.spec, rollouts, chosen)
-        return Simulated(returns, flags, values, tuple(seen[job] for job in sorted(seen)))
+        return Simulated(returns, flags, steps, values, tuple(seen[job] for job in sorted(seen)), moments)
+
+    def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy, Policy]:
+        """The policy of jobs at control rate, of those at physics rate, and of those of parameters of their own."""
+        if normaliser.shape[-1] not in (0, self.spec.observation):
+            raise UnservedError(f"a normaliser of {normaliser.shape[-1]} numbers, not {self.spec.observation}")
+        if not normaliser.size:
+            return (self.policy,) * 3
+        around, own = (Normalised(self.policy, each) for each in normaliser)
+        return around, around, own
 
     def rollouts(self, theta: FloatArray, seeds: list[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
         """Rollouts of parameters theta (B, P), with a frame each control step or each physics step."""
@@ -73,11 +101,7 @@ class Runner:
 
 
 def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
-    """The task and the policy of a run that somebody else specified.
-
-    Args:
-      spec: the specification.
-      files: files of classes that this machine may serve.
+    """The task and the policy of a run that somebody else specified; of files these may be served.
 
     Raises:
       UnservedError: it names something that is not here, is not allowed, or has other code here.
@@ -130,11 +154,7 @@ def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple
 
 
 def backend(name: str) -> Backend:
-    """The backend of that name.
-
-    Raises:
-      ConfigError: there is none, or it is none.
-    """
+    """The backend of that name; a ConfigError where there is no such, or it is none."""
     target = plugins.find("backends", name).target
     if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
         raise ConfigError(f"{name} is no backend: it needs capacity and engine(model)")

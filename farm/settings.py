@@ -1,6 +1,7 @@
 """Settings as dataclasses: checked, read from flags and from JSON. The only validator, and the only door to tyro."""
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import io
@@ -23,7 +24,6 @@ class Settings:
     """Base of frozen, keyword-only settings; every value is checked against its annotation and its `setting`."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         check(self)
 
 
@@ -137,9 +137,7 @@ def from_dict(kind: type[C], values: object, where: str) -> C:
     made = {name: _natural(value, hints[name]) for name, value in values.items()}
     try:
         return kind(**made)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    except (TypeError, ValueError) as error:
+    except (ConfigError, TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: {error}") from None
 
 
@@ -151,7 +149,7 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
-    """The dataclass that these arguments say; flags of nested dataclasses have no prefix.
+    """The dataclass that these arguments say; flags of nested dataclasses have no prefix, those of tuples are repeated.
 
     `--help` prints and exits with status 0.
 
@@ -162,7 +160,7 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
     distinct(default, program)
     said = io.StringIO()
-    extra: dict[str, Any] = {} if default is None else {"default": default}
+    extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, arguments)}
     try:
         with contextlib.redirect_stderr(said):
             style = (tyro.conf.OmitArgPrefixes, tyro.conf.UseAppendAction)
@@ -174,12 +172,21 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
         raise
 
 
-def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
-    """Whether every flag is there once: settings of a plug-in may be called as a command's own.
+def _emptied(default: C, arguments: Sequence[str]) -> C:
+    """The defaults, with those tuples empty that arguments give: tyro would append to what is there."""
+    given = {word.partition("=")[0] for word in arguments}
+    out = copy.copy(default)
+    for each in dataclasses.fields(default):  # type: ignore[arg-type]
+        value = getattr(default, each.name)
+        if isinstance(value, tuple) and f"--{_flag(each.name)}" in given:
+            object.__setattr__(out, each.name, ())  # unchecked: what is given stands here in the end
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            object.__setattr__(out, each.name, _emptied(value, arguments))
+    return out
 
-    Raises:
-      ConfigError: one is there twice.
-    """
+
+def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
+    """See that every flag is there once: a plug-in's settings may be called as a command's own. Else a ConfigError."""
     owners: dict[str, str] = {}
     waiting = [default] if dataclasses.is_dataclass(default) else []
     while waiting:

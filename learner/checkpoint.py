@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from farm.arrays import FloatArray
 from farm.errors import CheckpointError, MessageError
 from farm.net import codec
@@ -24,6 +26,8 @@ class BestRollout:
     """None for nominal conditions."""
     theta: FloatArray = array("<f8", 1)
     """Its parameters, (P,)"""
+    normaliser: FloatArray = array("<f8", 2, np.empty((2, 0)))
+    """Mean and standard deviation that its observations were normalised by, (2, d) or (2, 0)"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +61,10 @@ class Checkpoint:
     """Texts that its task is made of."""
     constants: dict[str, Any]
     """Arrays that its policy is made of."""
+    steps: int = 0
+    """Control steps of all exploring rollouts so far."""
+    moments: FloatArray = array("<f8", 1, np.empty(0))
+    """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:

@@ -43,14 +43,18 @@ class RunConfig(Settings):
     """Settings of the algorithm."""
     seed: int = setting(0, least=0, most=SEEDS - 1)
     """Seed of everything random in the run."""
-    generations: int = setting(150, least=0, most=10_000_000)
+    generations: int = setting(None, least=0, most=10_000_000)  # filled in below
     """Updates of the search distribution."""
     stop_when_solved: int | None = setting(None, least=1)
     """End after so many generations in a row in which the mean policy succeeded."""
+    stop_after_steps: int | None = setting(None, least=1)
+    """End after the generation in which the exploring rollouts have made so many control steps in all."""
     init_from: str | None = None
     """Start from the mean, sigma and constants of another run: its folder."""
     init_sigma: Literal["run", "fresh"] = "run"
     """With init-from: take that run's sigma as well, or start with --initial-sigma."""
+    start: Literal["printed", "fitted"] = "printed"
+    """Begin with --bandwidth and --initial-sigma as they are, or as they suit the observation (kernel, projected)."""
     traces: Literal["all", "extremes", "none"] = "extremes"
     """Traces that are recorded: of all rollouts, of the best and worst of a generation, or none."""
 
@@ -58,7 +62,7 @@ class RunConfig(Settings):
         """Fill in what is left out, and check every value."""
         for part, kind in _PARTS.items():
             if name := getattr(self, part):
-                object.__setattr__(self, part, plugin_path(kind, name))
+                object.__setattr__(self, part, plugins.find(kind, name).name)  # a file's with its whole path
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -76,19 +80,24 @@ def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
 
 def _filled(config: RunConfig) -> dict[str, Any]:
     """What a configuration leaves out, from the task's first preset."""
-    if all((config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)):
+    parts = (config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)
+    if all(parts) and config.generations is not None:
         return {}
     table = presets(config.task)
-    given = dict(next(iter(table.values()), {}))
+    given: dict[str, Any] = dict(next(iter(table.values()), {}))
     out: dict[str, Any] = {}
+    if config.generations is None:
+        out["generations"] = given.get("generations", _GENERATIONS)
     for part, kind in _PARTS.items():
-        name = getattr(config, part) or given.get(part) or _DEFAULT[part]
+        name = getattr(config, part) or given.get(part) or _GENERAL[part]
         own = getattr(config, f"{part}_config")
         out |= {part: name, f"{part}_config": own or _part(kind, name, given)}
     return out
 
 
-_DEFAULT: Final = {"policy": "direct", "algorithm": "pgpe"}
+_GENERATIONS: Final = 150
+"""Of presets that say nothing else."""
+
 _GENERAL: Final[Mapping[str, Any]] = {
     "policy": "direct", "features": 50, "bandwidth": 1.0, "algorithm": "pgpe", "initial_mu": 0.0,
     "initial_sigma": 1.0, "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.5,
@@ -128,11 +137,6 @@ def _part(kind: str, name: str, given: Mapping[str, Any]) -> Any:  # noqa: ANN40
     return settings.from_dict(config, known, name)
 
 
-def plugin_path(kind: str, name: str) -> str:
-    """A plug-in's name as config.json has it: a file's with its whole path."""
-    return plugins.find(kind, name).name
-
-
 def presets(task: str) -> dict[str, Mapping[str, Any]]:
     """Settings that runs of a task begin with, by preset and flag; the first one unless told otherwise."""
     settings_class("tasks", task)
@@ -152,7 +156,14 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
     name = preset or next(iter(table))
     if name not in table:
         raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
-    return changed_by(RunConfig(task=task), {**table[name], **changed}, fresh=True)
+    begin = RunConfig(task=task)
+    given: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
+    for part, kind in _PARTS.items():  # another policy takes of the preset's what it has, another algorithm nothing
+        own = given.get(part, getattr(begin, part))
+        chosen = changed.get(part, own)
+        others = set(_fields(settings_class(kind, chosen))) if part == "policy" or chosen == own else set()
+        given = {k: v for k, v in given.items() if k in others or k not in _fields(settings_class(kind, own))}
+    return changed_by(begin, {**given, **changed}, fresh=True)
 
 
 def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
@@ -166,17 +177,15 @@ def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = Fal
         name = given.get(part, getattr(config, part))
         old = getattr(config, f"{part}_config")
         begin = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
-        own = _fields(settings_class(kind, name))
-        known |= set(own)
-        table = {**begin, **{k: v for k, v in given.items() if k in own}}
-        parts |= {part: name, f"{part}_config": settings.from_dict(settings_class(kind, name), table, name)}
+        known |= set(_fields(settings_class(kind, name)))
+        parts |= {part: name, f"{part}_config": _part(kind, name, {**begin, **given})}
     run = {k: v for k, v in given.items() if k in _fields(config) and k not in known}
     if unknown := [k for k in given if k not in known and k not in run]:
         raise ConfigError(f"unknown setting {', '.join(unknown)}")
     return replace(config, **parts, **run)
 
 
-_APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved"}
+_APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved", "stop-after-steps"}
 
 
 def preset_of(config: RunConfig) -> str:
@@ -243,6 +252,11 @@ def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, objec
     for name, value in before.items():
         if name in after and value != after[name]:
             yield name, value, after[name]
+
+
+def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
+    """Changes by which two configurations are of different runs: all but the number of generations."""
+    return (change for change in changes(old, new) if change[0] != "generations")
 
 
 def flat(config: RunConfig) -> dict[str, object]:

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from farm import settings
-from farm.errors import RunError
+from farm.errors import writing
 from farm.sim.engines import STATE, DataEngine
 from farm.sim.sim import Sim
 from farm.tasks.loop import Batch
@@ -56,8 +56,5 @@ def write(path: Path, policy: LoadedPolicy) -> None:
     Raises:
       RunError: it cannot be written.
     """
-    try:
-        with path.open("wb") as file:  # np.savez would add a suffix of its own
-            np.savez_compressed(file, allow_pickle=False, **contents(policy))
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}") from None
+    with writing(path), path.open("wb") as file:  # np.savez would add a suffix of its own
+        np.savez_compressed(file, allow_pickle=False, **contents(policy))

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from learner.outcomes import Curve
 
 INSTALL: Final = "figures need matplotlib: pip install matplotlib"
@@ -38,7 +40,7 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         axis = canvas.subplots()
         for i, curve in enumerate(curves):
             colour, dash = _COLOURS[i % len(_COLOURS)], _DASHES[i // len(_COLOURS) % len(_DASHES)]
-            mean, deviation = curve.mean, curve.deviation
+            mean, deviation = np.nanmean(curve.returns, axis=0), np.nanstd(curve.returns, axis=0)
             axis.plot(curve.rollouts, mean, color=colour, linestyle=dash, lw=1.5, label=curve.label)
             axis.fill_between(curve.rollouts, mean - deviation, mean + deviation, color=colour, alpha=0.15, lw=0)
         axis.set(xlabel="rollouts", ylabel="return of the mean policy")

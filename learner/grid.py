@@ -15,13 +15,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from farm.errors import ConfigError
+from farm.errors import ConfigError, writing
 from farm.net import keys
 from farm.seeds import SEEDS
 from learner import config as configs
 from learner.config import RunConfig
+from learner.run_folder import replace_text
 
 MOST: Final = 10_000
 """Runs of a sweep."""
@@ -89,27 +90,22 @@ class Sweep:
           ConfigError: it is another sweep's, or something else's.
         """
         file = self.path / "sweep.json"
-        try:
+        with writing(f"to {self.path}", ConfigError):
             if file.exists():
-                self._check_same(json.loads(file.read_text("utf-8")), file)
+                self._check_same(file)
             elif self.path.exists() and any(self.path.iterdir()):
                 raise ConfigError(f"{self.path} holds something else and no sweep.json: give another --out")
             self.path.mkdir(parents=True, exist_ok=True)
-            aside = file.with_name(file.name + ".new")
-            aside.write_text(json.dumps(self._told(), indent=2) + "\n", "utf-8")
-            aside.replace(file)
-        except OSError as error:
-            raise ConfigError(f"cannot write to {self.path}: {error.strerror}") from None
+            made = [configs.to_dict(setting.config) for setting in self.settings]
+            told = {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": made}
+            replace_text(file, json.dumps(told, indent=2) + "\n")
+
+    def _check_same(self, file: Path) -> None:
+        """See that what is there is this sweep, perhaps with fewer seeds."""
+        try:
+            told = json.loads(file.read_text("utf-8"))
         except ValueError as error:
             raise ConfigError(f"{file} is not JSON: {error}") from None
-
-    def _told(self) -> dict[str, Any]:
-        """As it stands in sweep.json."""
-        made = [configs.to_dict(setting.config) for setting in self.settings]
-        return {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": made}
-
-    def _check_same(self, told: Any, file: Path) -> None:  # noqa: ANN401  parsed JSON
-        """See that what is there is this sweep, perhaps with fewer seeds."""
         lists = isinstance(told, dict) and all(isinstance(told.get(name), list) for name in ("seeds", "settings"))
         if not lists or told.get("version") != _VERSION:
             raise ConfigError(f"{file} is not of version {_VERSION}")
@@ -132,18 +128,13 @@ def _plain(values: Mapping[str, str]) -> str:
 
 
 def _words(vary: object) -> str:
-    """What is varied, as it is given."""
     if not isinstance(vary, dict) or not vary:
         return "nothing"
     return " and ".join(f"{name}={','.join(map(str, values))}" for name, values in vary.items())
 
 
 def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
-    """NAME=V1,V2,... each, as values by name with underscores.
-
-    Raises:
-      ConfigError: one has another form, or a name or value comes twice.
-    """
+    """NAME=V1,V2,... each, as values by name with underscores; a ConfigError where one is no such, or comes twice."""
     out: dict[str, list[str]] = {}
     for word in given:
         name, equals, listed = word.partition("=")
@@ -161,11 +152,7 @@ def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """A-B or A,B,C, or both, as seeds in that order.
-
-    Raises:
-      ConfigError: it has another form, or a seed is too large or comes twice.
-    """
+    """A-B or A,B,C, or both, as seeds in that order; a ConfigError where one is no such, too large, or comes twice."""
     out: list[int] = []
     for part in text.split(","):
         found = _RANGE.fullmatch(part.strip())
@@ -181,11 +168,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str, str]]:
-    """Every combination of values, the last name's changing fastest.
-
-    Raises:
-      ConfigError: that is too many runs.
-    """
+    """Every combination of values, the last name's changing fastest; a ConfigError where that is too many runs."""
     found = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
     if len(found) * seeds > MOST:
         raise ConfigError(f"{len(found)} settings x {seeds} seeds are {len(found) * seeds} runs; expected up to {MOST}")
@@ -193,11 +176,7 @@ def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str
 
 
 def check(sweep: Sweep) -> None:
-    """See that no two settings are the same runs.
-
-    Raises:
-      ConfigError: two are, or a run's name cannot be used.
-    """
+    """See that no two settings are the same runs, and that names of runs can be used; else a ConfigError."""
     seen: dict[str, Setting] = {}
     for setting in sweep.settings:
         other = seen.setdefault(json.dumps(configs.to_dict(setting.config)), setting)

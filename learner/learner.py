@@ -1,6 +1,7 @@
 """The learning loop: ask, simulate, tell, save, and say how it went."""
 
 import hashlib
+import itertools
 import logging
 import time
 from collections.abc import Iterator, Mapping
@@ -10,8 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from farm import seeds
-from farm.arrays import AnyArray, BoolArray, FloatArray
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import CheckpointError, RunError
+from farm.moments import merged, normaliser
 from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.work import Jobs
@@ -71,8 +73,10 @@ class Learner:
     @property
     def over(self) -> bool:
         """Whether no generation is left to do."""
-        solved = self.config.stop_when_solved
-        return self.state.generation >= self.config.generations or (solved is not None and self._at.solved >= solved)
+        config, at = self.config, self._at
+        solved = config.stop_when_solved is not None and at.solved >= config.stop_when_solved
+        spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
+        return self.state.generation >= config.generations or solved or spent
 
     def learn(self, farm: Dispatcher) -> Iterator[Report]:
         """Generations until the run is over; the next one is under way while a report is looked at.
@@ -91,8 +95,9 @@ class Learner:
             rollouts = len(eps) * len(self._signs)  # the jobs behind them are the mean policy's, and perhaps the best's
             returns = results.returns[:rollouts].reshape(len(eps), len(self._signs))
             before = self.state
-            self.state = self._algorithm.tell(before, eps, returns)
-            self._note(before, eps, results, returns, time.monotonic() - begun, farm)
+            told = self._learnt_from(returns, results.steps[:rollouts])
+            self.state = self._algorithm.tell(before, eps, told)
+            self._note(before, eps, results, told, time.monotonic() - begun, farm)
             if not self.over:
                 eps = self._explore(farm)
             progress = self._progress(results, returns, farm)
@@ -120,7 +125,7 @@ class Learner:
     def evaluate(self, farm: Dispatcher) -> Evaluation:
         """The mean policy at the end of the run."""
         jobs = Jobs.joined([evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()])
-        farm.begin(self.state.generation, self.state.mu, jobs)
+        farm.begin(self.state.generation, self.state.mu, jobs, normaliser=self._normalisers())
         results, last = farm.collect(), EVALUATION_ROLLOUTS
         return Evaluation(
             mean=Nominal(
@@ -144,6 +149,7 @@ class Learner:
             "seed": self.config.seed,
             "generations": at,
             "rollouts": self._at.rollouts,
+            "steps": self._at.steps,
             "best_return": self.state.best,
             "mean_policy_return": mean.value if mean else None,
             "mean_policy_success": mean.success if mean else None,
@@ -173,8 +179,22 @@ class Learner:
         replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
         exploring = Jobs.exploring(eps, self._signs, drawn)
         jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay])
-        farm.begin(state.generation, state.mu, jobs, self._keep)
+        farm.begin(state.generation, state.mu, jobs, self._keep, self._normalisers())
         return eps
+
+    def _learnt_from(self, returns: FloatArray, steps: IntArray) -> FloatArray:
+        """Returns with the reward's offset, of rollouts of so many steps (S,)."""
+        config, task = self.config.task_config, self.problem.task
+        if not config.reward_offset:
+            return returns
+        weights = [task.return_scale * config.gamma**t * config.reward_offset for t in range(task.steps)]
+        offsets = np.array([0.0, *itertools.accumulate(weights)])
+        return returns + offsets[steps].reshape(returns.shape)
+
+    def _normalisers(self) -> FloatArray:
+        """Of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
+        now, best = normaliser(self._at.moments), self._at.best
+        return np.stack([now, now if best is None else best.normaliser])
 
     def _seed(self, generation: int, index: int) -> tuple[int, ...] | None:
         return seeds.training(self.config.seed, generation, index) if self.config.task_config.perturb else None
@@ -199,13 +219,15 @@ class Learner:
         if before.best is None or returns.max() > before.best:
             row, column = np.unravel_index(int(returns.argmax()), returns.shape)
             theta = before.mu + self._signs[column] * eps[row]
-            best = BestRollout(seed=self._seed(before.generation, int(row)), theta=theta)
+            seed = self._seed(before.generation, int(row))
+            best = BestRollout(seed=seed, theta=theta, normaliser=normaliser(self._at.moments))
             generation, replayed = self.state.generation, False
         self._at = replace(
             self._at,
             config=configs.to_dict(self.config),
             state=self.state.to_dict(),
             rollouts=self._at.rollouts + returns.size,
+            steps=self._at.steps + int(results.steps[: returns.size].sum()),
             reissued=self._before + farm.reissued,
             seconds=seconds,
             solved=self._at.solved + 1 if results.flags[returns.size, 0] else 0,
@@ -213,6 +235,7 @@ class Learner:
             best_generation=generation,
             canary=farm.admission.canary,
             replayed=replayed,
+            moments=merged(self._at.moments, results.moments[: returns.size]),
         )
 
     def _progress(self, results: RoundResults, returns: FloatArray, farm: Dispatcher) -> GenerationStats:
@@ -247,7 +270,8 @@ class Learner:
         return float(np.mean(flags[:, 0])) if self._judged else None
 
     def _save(self, progress: GenerationStats) -> None:
-        self.folder.append(progress, self.state.mu, self.state.sigma, self.config.generations)
+        mu, sigma, seen = self.state.mu, self.state.sigma, normaliser(self._at.moments)
+        self.folder.append(progress, mu, sigma, self.config.generations, seen)
         self.folder.save(self._at)
 
 

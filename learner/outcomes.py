@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 
 from farm.arrays import FloatArray
-from farm.errors import RunError
+from farm.errors import writing
 from farm.tasks.loop import RETURN_FLOOR
 from learner.grid import Sweep
-from learner.run_folder import RunFolder
+from learner.run_folder import RunFolder, replace_text
 
 COLUMNS: Final = (
     "seed", "state", "generations", "rollouts", "first_mean_policy_return", "mean_policy_return",
@@ -44,20 +44,13 @@ def _row(path: Path, seed: int) -> dict[str, Any]:
 
 
 def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
-    """Write table.csv, as a whole or not at all.
-
-    Raises:
-      RunError: it cannot be written.
-    """
-    text, aside = io.StringIO(), path.with_name(path.name + ".new")
+    """Write table.csv, as a whole or not at all: a RunError says why not."""
+    text = io.StringIO()
     writer = csv.DictWriter(text, [*sweep.vary, *COLUMNS], lineterminator="\n")
     writer.writeheader()
     writer.writerows(table)
-    try:
-        aside.write_text(text.getvalue(), "utf-8")
-        aside.replace(path)
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}") from None
+    with writing(path):
+        replace_text(path, text.getvalue())
 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:
@@ -75,16 +68,6 @@ class Curve:
     """Exploring rollouts that the policy had behind it, (G,)"""
     returns: FloatArray
     """(runs, G), nan behind a run's end and where the physics blew up"""
-
-    @property
-    def mean(self) -> FloatArray:
-        """Over the runs that are there, (G,)."""
-        return np.asarray(np.nanmean(self.returns, axis=0))
-
-    @property
-    def deviation(self) -> FloatArray:
-        """Their standard deviation, (G,)."""
-        return np.asarray(np.nanstd(self.returns, axis=0))
 
 
 def curves(sweep: Sweep) -> list[Curve]:
@@ -104,7 +87,7 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
     rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
     returns = [p.mean_policy_return for p in progress]
     if progress and summary.get("state") == "finished":  # the evaluation's: after the last update
-        rollouts, returns = [*rollouts, progress[-1].rollouts], [*returns, summary["mean_policy_return"]]
+        rollouts, returns = [*rollouts, progress[-1].rollouts], [*returns, summary.get("mean_policy_return")]
     values = np.array(returns, dtype=float)
     return np.array(rollouts, dtype=float), np.where(values <= RETURN_FLOOR, np.nan, values)
 

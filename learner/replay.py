@@ -13,9 +13,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from farm import plugins, settings
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
+from farm.moments import normaliser
+from farm.policies.normalised import Normalised
 from farm.rollouts import Runner, build_task
 from farm.sim.trajectory import Trajectory
 from farm.tasks.loop import Rollouts, Seed, whole
@@ -85,7 +89,8 @@ def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -
     at = checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     chosen = last if generation is None else generation
-    mu = at.state["mu"] if chosen == last else _earlier(folder, config, chosen)
+    seen = normaliser(at.moments)
+    mu, seen = (at.state["mu"], seen) if chosen == last else _earlier(folder, config, chosen, seen)
     files = at.files
     if task is not None and task != config.task_config:
         files = _files(config, replace(config, task_config=task), at.files)
@@ -96,6 +101,8 @@ def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -
             "%s: the code of its %s has changed since the run began; these are numbers of today's",
             folder.path, " and ".join(changed),
         )  # fmt: skip
+    if seen.size:
+        found = replace(found, policy=Normalised(found.policy, seen))
     return LoadedPolicy(found, chosen, mu)
 
 
@@ -106,11 +113,10 @@ def _files(old: RunConfig, new: RunConfig, kept: Mapping[str, str]) -> dict[str,
     return {name: kept[name] if name in kept and text == before.get(name) else text for name, text in after.items()}
 
 
-def _earlier(folder: RunFolder, config: RunConfig, generation: int) -> FloatArray:
-    """A mean before the checkpoint's; that of generation 0 follows from the configuration."""
+def _earlier(folder: RunFolder, config: RunConfig, generation: int, last: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A mean before the checkpoint's, and its normaliser; that of generation 0 follows from the configuration."""
     if generation != 0:
         return folder.mean(generation)
     if config.init_from is not None:
         raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
-    mu: FloatArray = start(config, folder.name)[1].state["mu"]
-    return mu
+    return start(config, folder.name)[1].state["mu"], normaliser(np.zeros(1 + last.size))

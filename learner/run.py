@@ -9,6 +9,7 @@ for report in farm.learn(farm.RunConfig(seed=3), "runs/first", workers=2):
 import importlib.util
 import logging
 import os
+import secrets
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -17,16 +18,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from farm.errors import CheckpointError, ConfigError, RunError
+from farm.commands.logs import Formatter
+from farm.errors import ConfigError, RunError
 from farm.net import keys, session
 from farm.net.session import LISTEN, Session, free_endpoint
-from farm.net.telemetry import WorkerStatus
 from farm.net.tls import Bundle
 from farm.processes import Pool
-from learner import checkpoint as checkpoints
-from learner import config as configs
 from learner.algorithms import Diverged
-from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.evaluation import Evaluation
 from learner.learner import Learner
@@ -34,7 +32,7 @@ from learner.run_folder import RunFolder
 from learner.scheduler.dispatcher import Dispatcher, Stopped
 from learner.scheduler.membership import Admission
 from learner.scheduler.scheduler import SchedulerConfig
-from learner.setup import Problem, resumed, start
+from learner.setup import Problem, fitted, resumed, start
 from learner.telemetry.publisher import Publisher
 from learner.telemetry.report import Report
 
@@ -43,10 +41,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MESSAGE_LIMIT: Final = 32 << 20
-"""What a mean may take in a message [bytes]; a chunk holds it and eps besides."""
-
 _REMEMBERED: Final = 5.0  # [s] for which a router may believe that a killed learner is still there
+_LOOK: Final = 0.3  # [s] between two looks at who else claims a run's name
 _TEND: Final = 0.5  # [s] between two looks at the worker processes
 
 
@@ -78,47 +74,28 @@ class Placement:
     """How jobs are cut into chunks, and when they are given out again."""
 
 
+@dataclass
 class Run:
-    """A run that is open: iterate over `learn`, then `finish`."""
+    """A run that `open_run` opened: iterate over `learn`."""
 
-    def __init__(
-        self,
-        learner: Learner,
-        farm: Dispatcher,
-        broadcast: Publisher,
-        recording: "RunRecording | None",
-        pool: Pool | None,
-    ) -> None:
-        """Made by `open_run`."""
-        self.learner, self._farm, self._recording, self._pool = learner, farm, recording, pool
-        self._broadcast = broadcast
-        self.summary: dict[str, Any] = {}
-        """What summary.json says, once it is over."""
+    learner: Learner
+    farm: Dispatcher
+    publisher: Publisher
+    recording: "RunRecording | None"
+    pool: Pool | None
+    """The local workers."""
+    summary: dict[str, Any] = field(default_factory=dict)
+    """What summary.json says, once it is over."""
 
     @property
     def worker_pids(self) -> list[int]:
         """Process ids of the local workers."""
-        return self._pool.pids if self._pool else []
-
-    @property
-    def workers(self) -> tuple[WorkerStatus, ...]:
-        """Workers that take part, with what they did lately."""
-        return self._farm.census()
-
-    @property
-    def recorded(self) -> bool:
-        """Whether there is a recording."""
-        return self._recording is not None
-
-    @property
-    def dropped(self) -> int:
-        """Generations that were recorded without their rollout, because the recorder could not keep up."""
-        return self._recording.dropped if self._recording else 0
+        return self.pool.pids if self.pool else []
 
     @property
     def live(self) -> str | None:
         """Where viewers find the live stream, if it is served."""
-        return self._recording.uri if self._recording else None
+        return self.recording.uri if self.recording else None
 
     def learn(self) -> Iterator[Report]:
         """Generations until the run is over, each recorded; then the evaluation. `summary` tells how it ended.
@@ -128,19 +105,15 @@ class Run:
         """
         state, evaluation = "failed", None
         try:
-            for report in self.learner.learn(self._farm):
-                self._broadcast.generation(report)
-                if self._recording:
-                    self._recording.generation(report)
+            for report in self.learner.learn(self.farm):
+                self.publisher.generation(report)
+                if self.recording:
+                    self.recording.generation(report)
                 yield report
-            evaluation = self.learner.evaluate(self._farm)
-            if self._recording:
-                self._recording.end(
-                    self.learner.state.generation,
-                    evaluation.mean.trajectory,
-                    evaluation.replay,
-                    self.learner.best_generation,
-                )
+            evaluation = self.learner.evaluate(self.farm)
+            if self.recording:
+                done, best = self.learner.state.generation, self.learner.best_generation
+                self.recording.end(done, evaluation.mean.trajectory, evaluation.replay, best)
             state = "finished"
         except (Stopped, GeneratorExit):
             state = "interrupted"
@@ -154,7 +127,7 @@ class Run:
             self._finish(state, evaluation)
 
     def _finish(self, state: str, evaluation: Evaluation | None) -> None:
-        workers = max(len(self._farm.workers), len(self.worker_pids))
+        workers = max(len(self.farm.workers), len(self.worker_pids))
         self.summary = self.learner.summary(state, workers, evaluation)
         log.info("%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s", self.summary)
         try:
@@ -164,7 +137,7 @@ class Run:
                 raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
         finally:
             if state in ("finished", "diverged"):  # otherwise the run may go on
-                self._broadcast.end(self.summary, evaluation, self.learner.best_generation)
+                self.publisher.end(self.summary, evaluation, self.learner.best_generation)
 
 
 def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False) -> Iterator[Report]:
@@ -196,11 +169,11 @@ def open_run(
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())
-        problem, at = _resumed(folder, config, mixed=place.mixed) if resume else start(config, folder.name)
-        check_size(problem)
+        config = config if resume else fitted(config)
+        problem, at = resumed(folder, config, mixed=place.mixed) if resume else start(config, folder.name)
         if place.workers:
             problem.runner().close()  # says in time what no worker could simulate
-        link = stack.enter_context(_session(place, stopped))
+        link = stack.enter_context(connected(place, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:
             RunFolder.create(path, config)
@@ -210,7 +183,7 @@ def open_run(
                 folder.rewind(at)
                 folder.write_config(config)
             learner = Learner(problem, folder, at)
-            recording = stack.enter_context(_recording(place, learner)) if place.record or place.serve else None
+            recording = _recording(place, learner, stack)
             stack.enter_context(_log_file(folder))
         except (ConfigError, OSError) as error:
             if not resume:
@@ -218,45 +191,40 @@ def open_run(
             if isinstance(error, OSError):
                 raise RunError(f"cannot write to {folder.path}: {error.strerror}") from None
             raise
-        tend = _Tending(stopped)
-        farm = Dispatcher(
-            link,
-            place.farm,
-            learner.spec,
-            config.generations,
-            None if place.workers else how_to_join(place, problem),
-            tend,
-            Admission(learner.canary, mixed=place.mixed),
-            (problem.spec.trace, problem.spec.shapes(len(problem.scene.bodies))),
-            place.scheduler,
-        )
-        if place.workers:
-            flags = [
-                *_worker_flags(place, problem),
-                "--backend",
-                place.backend,
-                "--log-level",
-                "WARNING",
-            ]  # what they do, the learner says
-            tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
-        broadcast = stack.enter_context(closing(Publisher(link, place.farm, farm.incarnation, learner)))
-        yield Run(learner, farm, broadcast, recording, tend.pool)
+        canary = Admission(learner.canary, mixed=place.mixed)
+        farm, pool = dispatch(stack, link, place, problem, folder.name, canary, config.generations, stopped)
+        publisher = stack.enter_context(closing(Publisher(link, place.farm, farm.incarnation, learner)))
+        yield Run(learner, farm, publisher, recording, pool)
 
 
-def _resumed(folder: RunFolder, config: RunConfig, *, mixed: bool) -> tuple[Problem, Checkpoint]:
-    """The checkpoint to go on from, and what its run searches for.
-
-    Raises:
-      CheckpointError: it cannot be used, or belongs to another configuration.
-    """
-    at = checkpoints.load(folder.checkpoint)
-    saved = configs.from_dict(at.config, str(folder.checkpoint))
-    for name, old, new in configs.changes(saved, config):
-        if name != "generations":
-            raise CheckpointError(
-                f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
-            )
-    return resumed(config, at, folder.path, mixed=mixed), at
+def dispatch(
+    stack: ExitStack,
+    link: Session,
+    place: Placement,
+    problem: Problem,
+    name: str,
+    admission: Admission,
+    generations: int,
+    stopped: Callable[[], bool],
+) -> tuple[Dispatcher, Pool | None]:
+    """Show a problem on the network under a name, and start its local workers; all ends with the stack."""
+    tend = _Tending(stopped)
+    farm = Dispatcher(
+        link,
+        place.farm,
+        problem.specification(name),
+        generations,
+        None if place.workers else how_to_join(place, problem),
+        tend,
+        admission,
+        (problem.spec.trace, problem.spec.shapes(len(problem.scene.bodies))),
+        place.scheduler,
+    )
+    if place.workers:
+        flags = [*_worker_flags(place, problem), "--backend", place.backend]
+        flags += ["--log-level", "WARNING"]  # what they do, the learner says
+        tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
+    return farm, tend.pool
 
 
 class _Tending:
@@ -277,16 +245,25 @@ class _Tending:
 def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[], bool]) -> None:
     """See that no other learner has a run of this name behind the same router: they would void each other's work.
 
-    Raises:
-      ConfigError: one has, and stays longer than a dead one would be remembered.
+    Of several that start together the first one stays: each claims the name, then looks who else does.
     """
+    if not place.connect:
+        return
+    taken = ConfigError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
     until = time.monotonic() + _REMEMBERED
-    while place.connect and link.present(keys.learner_token(place.farm, run), 1.0):
+    while link.present(keys.learner_token(place.farm, run), 1.0):
         if time.monotonic() > until or stopped():
-            raise ConfigError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
+            raise taken
+    mine = f"{time.time_ns():020}-{secrets.token_hex(8)}".encode()
+    link.answer(keys.claim(place.farm, run), lambda: mine)
+    for pause in (0.0, _LOOK):  # again, because a claim takes its time through routers
+        time.sleep(pause)
+        if any(other < mine for other in link.ask_all(keys.claim(place.farm, run), 1.0)):
+            raise taken
 
 
-def _session(place: Placement, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
+def connected(place: Placement, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
+    """A session as the placement says: one that listens, or one that is connected to a router."""
     if place.connect:
         return session.connect(place.connect, None, stopped, place.tls)
     return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted)
@@ -302,11 +279,9 @@ def _worker_flags(place: Placement, problem: Problem) -> list[str]:
 def how_to_join(place: Placement, problem: Problem) -> str:
     """The command by which workers join."""
     host = socket.gethostname()  # for an address that means all of them, other machines need the name
-    flags = [
-        flag.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:") for flag in _worker_flags(place, problem)
-    ]
     tls = ["--tls", "worker-NAME"] if place.tls else []
-    return " ".join(["farm worker", *flags, *tls])
+    command = " ".join(["farm worker", *_worker_flags(place, problem), *tls])
+    return command.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:")
 
 
 class _LogFile(logging.FileHandler):
@@ -318,8 +293,8 @@ class _LogFile(logging.FileHandler):
 
 @contextmanager
 def _log_file(folder: RunFolder) -> Iterator[None]:
-    handler = _LogFile(folder.log, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler = _LogFile(folder.path / "log.txt", encoding="utf-8")
+    handler.setFormatter(Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.getLogger().addHandler(handler)
     try:
         yield
@@ -329,43 +304,21 @@ def _log_file(folder: RunFolder) -> Iterator[None]:
             handler.close()
 
 
-@contextmanager
-def _recording(place: Placement, learner: Learner) -> "Iterator[RunRecording]":
+def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunRecording | None":
+    if not (place.record or place.serve):
+        return None
+    from learner.recording.drawing import Drawing
     from learner.recording.run import RunRecording
 
-    problem = learner.problem
     recording = RunRecording(
-        learner.folder.recording if place.record else None, replay=learner.folder.replay, run=learner.run,
-        config=learner.config, spec=problem.spec, scene=problem.scene, camera=problem.task.camera,
-        done=learner.state.generation, serve=place.serve,
+        learner.folder.recording if place.record else None, replay=learner.folder.path / "replay.rrd", run=learner.run,
+        config=learner.config, drawing=Drawing.of(learner.problem), done=learner.state.generation, serve=place.serve,
     )  # fmt: skip
-    try:
-        yield recording
-    finally:
-        recording.finish()
-
-
-def check_size(problem: Problem) -> None:
-    """See that a mean fits into a message.
-
-    Raises:
-      ConfigError: it does not; says the largest size that does.
-    """
-    size, most = problem.policy.size, MESSAGE_LIMIT // 8
-    if size > most:
-        raise ConfigError(f"the policy has {size} parameters; at most {most} fit into a message")
-    constants = sum(values.nbytes for values in problem.policy.constants.values())
-    if constants > MESSAGE_LIMIT:
-        raise ConfigError(
-            f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit into a message"
-        )
+    stack.callback(recording.finish)
+    return recording
 
 
 def check_rerun() -> None:
-    """Whether rerun-sdk is there; it is an extra, workers do without.
-
-    Raises:
-      ConfigError: it is not; says what to install.
-    """
+    """See that rerun-sdk is there, an extra that workers do without: a ConfigError says what to install."""
     if importlib.util.find_spec("rerun") is None:
         raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or go without by --no-record")

@@ -9,16 +9,19 @@
     log.txt          what was said
 
 docs/files.md describes them. The checkpoint is written last: what the other files hold beyond it
-is cut off when the run is resumed.
+is cut off when the run is resumed; damaged lines of progress.jsonl are left out then, and a copy is kept.
 """
 
 import fcntl
+import itertools
 import json
+import logging
 import math
 import os
 import shutil
+from bisect import bisect_left
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -33,10 +36,22 @@ from learner import config as configs
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 
+log = logging.getLogger(__name__)
+
 PARAMETERS_LIMIT: Final = 100_000_000
 """Size from which `parameters` keeps only every k-th generation [bytes]."""
 
 _PARAMETERS_VERSION: Final = 1
+_NUMBER: Final = (float, int, type(None))
+_SUMMARY: Final = {
+    **dict.fromkeys(("run", "state", "parameters_sha256"), (str, type(None))),
+    **dict.fromkeys(("seed", "generations", "rollouts"), (int,)),
+    **dict.fromkeys(("seconds", "mean_policy_return", "robust_success_rate", "robust_return"), _NUMBER),
+    "mean_policy_success": (bool, type(None)),
+}
+"""Types of what is shown of a summary."""
+_ASIDE: Final = "moved elsewhere, it keeps no run from going on"
+_NONE: Final = np.empty((2, 0))  # the normaliser of observations that are taken as they are
 
 
 @dataclass(frozen=True)
@@ -56,16 +71,6 @@ class RunFolder:
         return self.path / "run.rrd"
 
     @property
-    def replay(self) -> Path:
-        """The recording at physics rate."""
-        return self.path / "replay.rrd"
-
-    @property
-    def log(self) -> Path:
-        """The log file."""
-        return self.path / "log.txt"
-
-    @property
     def checkpoint(self) -> Path:
         """The checkpoint."""
         return self.path / "checkpoint"
@@ -79,12 +84,12 @@ class RunFolder:
         """
         try:
             path.mkdir(parents=True)
-        except FileExistsError:
-            raise ConfigError(
-                f"run folder {path} exists and is never overwritten: choose another --name, or --resume {path}"
-            ) from None
         except OSError as error:
-            raise ConfigError(f"cannot make the run folder {path}: {error.strerror}") from None
+            if os.path.isdir(path):  # noqa: PTH112  never raises
+                raise ConfigError(
+                    f"run folder {path} exists and is never overwritten: choose another --name, or --resume {path}"
+                ) from None
+            raise ConfigError(f"cannot make the run folder {path}: {_in_the_way(path) or error.strerror}") from None
         folder = cls(path)
         try:
             folder.write_config(config)
@@ -95,22 +100,14 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """An existing run's folder.
-
-        Raises:
-          ConfigError: there is none.
-        """
+        """An existing run's folder; a ConfigError where there is none."""
         if not (path / "config.json").is_file():
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         return cls(path)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other processes from going on with the run; released when this one ends, however it ends.
-
-        Raises:
-          ConfigError: another process holds it.
-        """
+        """Keep others (a ConfigError) from going on with the run; released when this process ends, however it ends."""
         folder = os.open(self.path, os.O_RDONLY)
         try:
             try:
@@ -127,7 +124,7 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Write config.json."""
-        _replace(self.path / "config.json", json.dumps(configs.to_dict(config), indent=2) + "\n")
+        replace_text(self.path / "config.json", json.dumps(configs.to_dict(config), indent=2) + "\n")
 
     def read_config(self) -> RunConfig:
         """Read config.json."""
@@ -135,51 +132,68 @@ class RunFolder:
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write summary.json."""
-        _replace(self.path / "summary.json", json.dumps(summary, indent=2) + "\n")
+        replace_text(self.path / "summary.json", json.dumps(summary, indent=2) + "\n")
 
     def read_summary(self) -> dict[str, Any] | None:
         """Read summary.json, None when there is no readable one."""
         try:
             summary = json.loads((self.path / "summary.json").read_text("utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
-        return summary if isinstance(summary, dict) else None
+        return summary if isinstance(summary, dict) and _makes_sense(summary) else None
 
-    def append(self, progress: GenerationStats, mu: FloatArray, sigma: FloatArray, generations: int) -> None:
-        """Add a generation to progress.jsonl and parameters."""
+    def append(
+        self,
+        progress: GenerationStats,
+        mu: FloatArray,
+        sigma: FloatArray,
+        generations: int,
+        normaliser: FloatArray = _NONE,
+    ) -> None:
+        """Add a generation to progress.jsonl and parameters: mu and sigma (P,), and a normaliser (2, d)."""
         with (self.path / "progress.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(progress.to_dict()) + "\n")
         path = self.path / "parameters"
         if not path.exists():
-            _replace(path, _parameters_head(len(mu), generations))
+            replace_text(path, _parameters_head(len(mu), generations, normaliser.shape[1]))
         head, _ = _read_head(path)
         if progress.generation % head["every"] == 0:
-            row = np.empty(1, _row_type(len(mu)))
-            row["generation"], row["mu"], row["sigma"] = progress.generation, mu, sigma
+            numbers = np.empty(1, _row_type(len(mu), normaliser.shape[1]))
+            numbers["generation"], numbers["mu"], numbers["sigma"] = progress.generation, mu, sigma
+            if normaliser.size:
+                numbers["normaliser"] = normaliser
             with path.open("ab") as binary:
-                binary.write(row.tobytes())
+                binary.write(numbers.tobytes())
 
     def progress(self) -> list[GenerationStats]:
-        """Every whole line of progress.jsonl."""
+        """Every line of progress.jsonl that can be read, generations rising."""
         try:
-            lines = (self.path / "progress.jsonl").read_text("utf-8", "replace").splitlines()
+            return [stats for _, stats in self._lines()[0]]
         except OSError:
             return []
-        out = []
-        for line in lines:
-            try:
-                out.append(GenerationStats.from_dict(json.loads(line)))
-            except (ValueError, RecursionError):
-                break  # torn by a crash, or of another version: nothing behind it is trusted
-        return out
 
-    def every(self, parameters: int, generations: int) -> int:
+    def _lines(self) -> tuple[list[tuple[int, GenerationStats]], list[int], bool]:
+        """Lines of progress.jsonl that can be read, by number; numbers of those that cannot; whether the end is torn.
+
+        One line that is damaged costs no other: neither what it holds, nor the generation that it claims.
+        """
+        *lines, end = (self.path / "progress.jsonl").read_text("utf-8", "replace").split("\n")
+        read = []
+        for number, line in enumerate([*lines, end], 1):
+            with suppress(ValueError, RecursionError):
+                read.append((number, GenerationStats.from_dict(json.loads(line))))
+        read = [read[i] for i in _rising([stats.generation for _, stats in read])]
+        known = {number for number, _ in read}
+        lost = [number for number in range(1, len(lines) + 1) if number not in known]
+        return read, lost, bool(end) and len(lines) + 1 not in known
+
+    def every(self, parameters: int, generations: int, observation: int = 0) -> int:
         """Every how many generations are kept in `parameters`, or would be of a new run."""
         path = self.path / "parameters"
-        return int(_read_head(path)[0]["every"]) if path.exists() else every(parameters, generations)
+        return int(_read_head(path)[0]["every"]) if path.exists() else every(parameters, generations, observation)
 
     def parameters(self) -> "np.ndarray[Any, Any]":
-        """Rows of `parameters`: fields generation, mu (P,) and sigma (P,).
+        """Rows of `parameters`: generation, mu (P,), sigma (P,) and, of a run that normalises, normaliser (2, d).
 
         Raises:
           ConfigError: the file is missing or not one of this version.
@@ -187,11 +201,15 @@ class RunFolder:
         path = self.path / "parameters"
         head, offset = _read_head(path)
         body = path.read_bytes()[offset:]
-        kind = _row_type(head["parameters"])
-        return np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
+        kind = _row_type(head["parameters"], head.get("observation", 0))
+        rows = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
+        kept = rows["generation"]
+        if (kept[:1] <= 0).any() or (kept % head["every"]).any() or (np.diff(kept) != head["every"]).any():
+            raise ConfigError(f"{path} is damaged: its generations do not rise as its first line says; {_ASIDE}")
+        return rows
 
-    def mean(self, generation: int) -> FloatArray:
-        """The mean mu after a generation, (P,).
+    def mean(self, generation: int) -> tuple[FloatArray, FloatArray]:
+        """The mean mu after a generation, (P,), and the normaliser of its observations, (2, d) or (2, 0).
 
         Raises:
           ConfigError: it is not in `parameters`; says what is.
@@ -201,8 +219,8 @@ class RunFolder:
         found = np.flatnonzero(kept == generation)
         if not len(found):
             raise ConfigError(f"generation {generation} is not stored in {self.path}: {_offer(kept, generation)}")
-        mu: FloatArray = rows["mu"][found[0]]
-        return mu
+        row = rows[found[0]]
+        return row["mu"], row["normaliser"] if "normaliser" in row.dtype.names else _NONE
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Replace the checkpoint."""
@@ -217,22 +235,91 @@ class RunFolder:
         generation = checkpoint.state.get("generation")
         if type(generation) is not int:
             raise CheckpointError(f"{self.checkpoint} holds no generation")
-        kept = [p for p in self.progress() if p.generation <= generation]
-        lines = "".join(json.dumps(p.to_dict()) + "\n" for p in kept)
-        _replace(self.path / "progress.jsonl", lines)
+        size = np.asarray(checkpoint.state.get("mu")).size
+        whole = self._parameters_until(generation, size)  # or says why not
+        self._rewind_progress(generation)
+        if whole is not None:
+            with (self.path / "parameters").open("r+b") as file:
+                file.truncate(whole)
+
+    def _parameters_until(self, generation: int, size: int) -> int | None:
+        """The bytes of `parameters` up to a generation; None where there is none."""
         path = self.path / "parameters"
-        if path.exists():
-            rows = self.parameters()
-            head, offset = _read_head(path)
-            whole = int((rows["generation"] <= generation).sum()) * _row_type(head["parameters"]).itemsize
-            with path.open("r+b") as file:
-                file.truncate(offset + whole)
+        if not path.exists():
+            return None
+        rows, (head, offset) = self.parameters(), _read_head(path)
+        if head["parameters"] != size:
+            raise CheckpointError(f"{path} is of {head['parameters']} parameters, the checkpoint of {size}: {_ASIDE}")
+        if not len(rows) and generation >= head["every"] and path.stat().st_size > offset:
+            raise CheckpointError(f"{path} is damaged: it holds no row as its first line describes them; {_ASIDE}")
+        return offset + int((rows["generation"] <= generation).sum()) * rows.itemsize
+
+    def _rewind_progress(self, generation: int) -> None:
+        path = self.path / "progress.jsonl"
+        try:
+            read, lost, torn = self._lines()
+        except FileNotFoundError:
+            read, lost, torn = [], [], False
+        kept = [stats for _, stats in read if stats.generation <= generation]
+        if torn and (not read or read[-1][1].generation < generation):
+            lost.append(path.read_bytes().count(b"\n") + 1)  # else a crash tore off a generation beyond the checkpoint
+        if lost:
+            copy = _copy(path)
+            which = ", ".join(map(str, lost[:10])) + (", ..." if len(lost) > 10 else "")
+            log.warning(
+                "%s: %d damaged line(s) dropped (line %s), %d kept; all of it is in %s",
+                path, len(lost), which, len(kept), copy,
+            )  # fmt: skip
+        replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in kept))
 
 
-def every(parameters: int, generations: int) -> int:
+def every(parameters: int, generations: int, observation: int = 0) -> int:
     """Every how many generations are kept, so that the file stays below PARAMETERS_LIMIT."""
-    size = _row_type(parameters).itemsize * max(generations, 1)
+    size = _row_type(parameters, observation).itemsize * max(generations, 1)
     return max(1, math.ceil(size / PARAMETERS_LIMIT))
+
+
+def _in_the_way(path: Path) -> str:
+    """What is where a folder or one above it should be; empty where nothing is."""
+    for part in (*reversed(path.parents), path):
+        if part.is_symlink() and not os.path.isdir(part):  # noqa: PTH112
+            return f"{part} is a link to {part.readlink()}, which is no folder"
+        if os.path.isfile(part):  # noqa: PTH113
+            return f"{part} is a file: Not a directory"
+    return ""
+
+
+def _makes_sense(summary: dict[str, Any]) -> bool:
+    """Whether what is shown of a summary is of its type, where it is there."""
+    known = [(summary[name], kinds) for name, kinds in _SUMMARY.items() if name in summary]
+    return all(type(value) in kinds and (type(value) is not int or abs(value) < 2**63) for value, kinds in known)
+
+
+def _rising(numbers: list[int]) -> list[int]:
+    """Positions of a longest rising subsequence: a wrong number among them costs none of the others."""
+    ends: list[int] = []  # of the subsequences of each length, the one that ends lowest
+    before: list[int | None] = []
+    for i, number in enumerate(numbers):
+        length = bisect_left(ends, number, key=numbers.__getitem__)
+        before.append(ends[length - 1] if length else None)
+        ends[length : length + 1] = [i]
+    found, at = [], ends[-1] if ends else None
+    while at is not None:
+        found.append(at)
+        at = before[at]
+    return found[::-1]
+
+
+def _copy(path: Path) -> Path:
+    """Copy a damaged file beside it, where no older copy is."""
+    copies = (path.with_name(f"{path.name}.damaged{n if n > 1 else ''}") for n in itertools.count(1))
+    copy = next(each for each in copies if not os.path.lexists(each))
+    try:
+        shutil.copyfile(path, copy)
+    except OSError:
+        copy.unlink(missing_ok=True)
+        raise
+    return copy
 
 
 def _offer(kept: IntArray, wanted: int) -> str:
@@ -243,17 +330,20 @@ def _offer(kept: IntArray, wanted: int) -> str:
     return f"{len(kept)} from {kept[0]} to {kept[-1]} are, the nearest is {nearest}"
 
 
-def _row_type(parameters: int) -> "np.dtype[Any]":
-    return np.dtype([("generation", "<i8"), ("mu", "<f8", (parameters,)), ("sigma", "<f8", (parameters,))])
+def _row_type(parameters: int, observation: int) -> "np.dtype[Any]":
+    own: list[Any] = [("normaliser", "<f8", (2, observation))] if observation else []
+    return np.dtype([("generation", "<i8"), ("mu", "<f8", (parameters,)), ("sigma", "<f8", (parameters,)), *own])
 
 
-def _parameters_head(parameters: int, generations: int) -> str:
-    head = {
+def _parameters_head(parameters: int, generations: int, observation: int) -> str:
+    head: dict[str, Any] = {
         "version": _PARAMETERS_VERSION,
         "parameters": parameters,
-        "every": every(parameters, generations),
+        "every": every(parameters, generations, observation),
         "row": "<i8 generation, <f8[parameters] mu, <f8[parameters] sigma",
     }
+    if observation:
+        head |= {"observation": observation, "row": head["row"] + ", <f8[2, observation] normaliser"}
     return json.dumps(head) + "\n"
 
 
@@ -264,15 +354,19 @@ def _read_head(path: Path) -> tuple[dict[str, Any], int]:
         head = json.loads(line)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ConfigError(f"{path} has no readable first line") from None
     if not isinstance(head, dict) or head.get("version") != _PARAMETERS_VERSION:
         raise ConfigError(f"{path} is not of version {_PARAMETERS_VERSION}")
+    for name, least in (("parameters", 1), ("every", 1), ("observation", 0)):
+        count = head.get(name, 0)
+        if type(count) is not int or not least <= count < PARAMETERS_LIMIT:
+            raise ConfigError(f"{path} is damaged: its first line says {str(count)[:20]} for {name}; {_ASIDE}")
     return head, len(line)
 
 
-def _replace(path: Path, text: str) -> None:
-    """Write a whole file or leave the old one."""
+def replace_text(path: Path, text: str) -> None:
+    """Write a whole file, or (an OSError) leave the old one."""
     aside = path.with_name(path.name + ".new")
     try:
         aside.write_text(text, "utf-8")

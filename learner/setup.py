@@ -4,22 +4,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
+
+import numpy as np
 
 from farm import plugins, rollouts, seeds, settings
 from farm.arrays import FloatArray
 from farm.errors import CheckpointError, ConfigError
 from farm.net.messages import Spec
 from farm.policies.base import Policy
+from farm.policies.fourier import Kernel, Projected
 from farm.rollouts import Runner, build_task
 from farm.sim.scene import Scene
 from farm.tasks.base import Task, TaskSpec
+from farm.tasks.standard import nominal, standard
 from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.algorithms import SearchState
 from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
+
+MESSAGE_LIMIT: Final = 32 << 20
+"""What a mean may take in a message [bytes]; a chunk holds it and eps besides."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +37,6 @@ class Problem:
     task: Task
     spec: TaskSpec
     policy: Policy
-    code: Mapping[str, str]
-    """Digests of the code that decides its numbers."""
 
     @cached_property
     def scene(self) -> Scene:
@@ -41,27 +46,32 @@ class Problem:
     def specification(self, run: str) -> Spec:
         """What workers are told."""
         config = self.config
-        task, policy = plugins.find("tasks", config.task), plugins.find("policies", config.policy)
+        task, policy = self._plugins.values()
         return Spec(
             run=run, task=task.wire, task_config=settings.to_dict(config.task_config), release=task.release,
             policy=policy.wire, policy_config=settings.to_dict(config.policy_config), policy_release=policy.release,
-            task_release=self.spec.release, code=dict(self.code), files=dict(self.task.sources),
+            task_release=self.spec.release, code=self.code, files=dict(self.task.sources),
             constants=dict(self.policy.constants),
         )  # fmt: skip
 
     def runner(self) -> Runner:
-        """Simulate in this process.
-
-        Raises:
-          ConfigError: the task cannot be begun.
-        """
+        """Simulate in this process; a ConfigError where the task cannot be begun."""
         return Runner(self.task, self.policy)
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Files that its classes come from, which workers must be allowed to serve."""
-        found = (plugins.find("tasks", self.config.task), plugins.find("policies", self.config.policy))
-        return tuple(dict.fromkeys(plugin.file for plugin in found if plugin.file is not None))
+        return tuple(dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None))
+
+    @cached_property
+    def code(self) -> dict[str, str]:
+        """Digests of the code that decides its numbers."""
+        parts = {name: plugin.digest() for name, plugin in self._plugins.items()}
+        return parts | {"simulation": plugins.code_digest(rollouts.SIMULATION)}
+
+    @property
+    def _plugins(self) -> dict[str, plugins.Plugin]:
+        return {"task": plugins.find("tasks", self.config.task), "policy": plugins.find("policies", self.config.policy)}
 
 
 def problem(
@@ -70,7 +80,7 @@ def problem(
     """What a configuration says, with the constants and texts that a run carries; without: drawn and read now.
 
     Raises:
-      ConfigError: the task is not to be had here.
+      ConfigError: the task is not to be had here, or the policy is larger than a message.
     """
     task = build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), files)
     spec = task.spec()
@@ -79,15 +89,64 @@ def problem(
     kind = plugins.find("policies", config.policy).target
     if constants is None:
         constants = kind.draw(config.policy_config, spec, seeds.features(config.seed))
-    return Problem(config, task, spec, cast("Policy", kind(config.policy_config, spec, constants)), _code(config))
+        if kind.standardised:
+            own: Any = config.policy_config
+            constants = constants | standard(task, own.weight_scale)
+    found = Problem(config, task, spec, cast("Policy", kind(config.policy_config, spec, constants)))
+    _check_size(found)
+    return found
 
 
-def _code(config: RunConfig) -> dict[str, str]:
-    """Digests of what decides a run's numbers."""
-    found = {"task": plugins.find("tasks", config.task), "policy": plugins.find("policies", config.policy)}
-    return {name: plugin.digest() for name, plugin in found.items()} | {
-        "simulation": plugins.code_digest(rollouts.SIMULATION)
-    }
+def _check_size(found: Problem) -> None:
+    """See that a mean fits into a message.
+
+    Raises:
+      ConfigError: it does not; says the largest size that does.
+    """
+    size, most = found.policy.size, MESSAGE_LIMIT // 8
+    if size > most:
+        raise ConfigError(f"the policy has {size} parameters; at most {most} fit into a message")
+    constants = sum(values.nbytes for values in found.policy.constants.values())
+    if constants > MESSAGE_LIMIT:
+        raise ConfigError(
+            f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit into a message"
+        )
+
+
+def fitted(config: RunConfig) -> RunConfig:
+    """The configuration with the kernel's width h and the first sigma worked out, if it wants them fitted.
+
+    A Gaussian kernel of many numbers is zero nearly everywhere. Here the first mean mu acts a little at the nominal
+    start x0 (d,), and a sample moves the exponent by about one:
+
+        |mu - x0|^2 / (2 h^2) = 2,   d sigma^2 / (2 h^2) = 1:    h = |mu - x0| / 2,   sigma = h sqrt(2 / d)
+
+    Raises:
+      ConfigError: policy or algorithm have no such settings, mu is x0, or the task is not to be had here.
+    """
+    if config.start != "fitted":
+        return config
+    kind = plugins.find("policies", config.policy).target
+    policy: Any = config.policy_config
+    algorithm: Any = config.algorithm_config
+    if not issubclass(kind, Kernel | Projected):
+        raise ConfigError(f"--start fitted is for the policies kernel and projected, not {config.policy}")
+    if not (hasattr(algorithm, "initial_mu") and hasattr(algorithm, "initial_sigma")):
+        raise ConfigError(f"--start fitted needs --initial-mu and --initial-sigma, which {config.algorithm} has not")
+    if config.init_from is not None:
+        raise ConfigError("--start fitted and --init-from exclude each other: both say where the search begins")
+    if policy.normalise:
+        raise ConfigError("--start fitted and --normalise exclude each other: both fit the kernel to the observation")
+    x0 = nominal(build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), None))
+    difference = algorithm.initial_mu - x0
+    bandwidth = 0.5 * float(np.sqrt((difference * difference).sum()))
+    if bandwidth == 0.0:
+        raise ConfigError("--start fitted: --initial-mu is the observation at the start; take another")
+    return replace(
+        config,
+        policy_config=replace(policy, bandwidth=bandwidth),
+        algorithm_config=replace(algorithm, initial_sigma=bandwidth * float(np.sqrt(2.0 / len(x0)))),
+    )
 
 
 def start(config: RunConfig, run: str) -> tuple[Problem, Checkpoint]:
@@ -101,28 +160,38 @@ def start(config: RunConfig, run: str) -> tuple[Problem, Checkpoint]:
     state = config.algorithm_config.init(begun.policy.size)
     if other is not None:
         state = _taken_over(config, state, other)
+    moments = np.zeros(1 + 2 * begun.spec.observation if config.policy_config.normalise else 0)
     checkpoint = Checkpoint(
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
-        solved=0, best=None, best_generation=0, canary=None, replayed=True, code=dict(begun.code),
+        solved=0, best=None, best_generation=0, canary=None, replayed=True, code=begun.code,
         files=dict(begun.task.sources), constants=dict(begun.policy.constants),
+        moments=other.moments if other else moments,
     )  # fmt: skip
     return begun, checkpoint
 
 
-def resumed(config: RunConfig, at: Checkpoint, where: Path, *, mixed: bool = False) -> Problem:
+def resumed(folder: RunFolder, config: RunConfig, *, mixed: bool = False) -> tuple[Problem, Checkpoint]:
     """A run as its checkpoint left it.
 
     Raises:
-      CheckpointError: the code that decides its numbers is another now, and `mixed` does not allow it.
+      CheckpointError: it cannot be used, belongs to another configuration, or the code that decides the run's numbers
+        is another now and `mixed` does not allow it.
     """
+    at = checkpoints.load(folder.checkpoint)
+    for name, old, new in configs.other(configs.from_dict(at.config, str(folder.checkpoint)), config):
+        raise CheckpointError(
+            f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
+        )
     found = problem(config, at.constants, at.files)
+    if len(at.moments) != (1 + 2 * found.spec.observation if config.policy_config.normalise else 0):
+        raise CheckpointError(f"{folder.checkpoint}: its statistics are of other observations than its task's")
     changed = [name for name, digest in found.code.items() if at.code.get(name) != digest]
     if changed and not mixed:
         raise CheckpointError(
-            f"{where}: the code of its {' and '.join(changed)} has changed since the run began: put it back, begin a "
-            "new run with --init-from, or go on with --mixed and do without repeatable numbers"
+            f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back, "
+            "begin a new run with --init-from, or go on with --mixed and do without repeatable numbers"
         )
-    return found
+    return found, at
 
 
 def _other(config: RunConfig) -> Checkpoint:

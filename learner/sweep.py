@@ -22,17 +22,20 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from farm import plugins, rollouts
 from farm.errors import ConfigError, RunError
 from farm.net import keys, session
 from farm.net.session import check_endpoint, free_endpoint
-from farm.processes import Pool
+from farm.processes import Pool, end
 from farm.settings import Settings, setting
 from learner import config as configs
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from learner.commands.sweep import Runs
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +64,6 @@ class Sharing(Settings):
     """Record every run with Rerun."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if self.tls is not None and not self.connect:
             raise ConfigError("--tls is for a farm to --connect to: without one everything stays on this machine")
@@ -80,22 +82,6 @@ class Sharing(Settings):
         return self.workers if self.workers is not None else 0 if self.connect else os.cpu_count() or 1
 
 
-class Shown(Protocol):
-    """Told how the runs are doing."""
-
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
-        """A generation is over."""
-        ...
-
-    def said(self, run: str, line: str) -> None:
-        """A learner has something to say: that nobody answers, that there are no workers."""
-        ...
-
-    def ended(self, run: str, state: str, said: str) -> None:
-        """A run is over: finished, diverged, failed or interrupted; `said` is its reason, or how well it did."""
-        ...
-
-
 @dataclass
 class _Learner:
     """A learner's process, and what it said last."""
@@ -111,21 +97,13 @@ class _Learner:
         return self.path.name
 
 
-def over(folder: RunFolder) -> bool:
-    """Whether a run has ended in a way that running it again would not change."""
-    return (folder.read_summary() or {}).get("state") in _OVER
-
-
 def todo(runs: Iterable[Path]) -> list[Path]:
     """Those of these run folders whose runs are not over, in their order."""
-    return [path for path in runs if not over(RunFolder(path))]
+    return [path for path in runs if (RunFolder(path).read_summary() or {}).get("state") not in _OVER]
 
 
-def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: Shown, stopped: Callable[[], bool]) -> bool:
-    """Do those runs that are not over, in their order, each in its folder.
-
-    Returns:
-      whether all are over now; not, if it was stopped or runs failed.
+def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: "Runs", stopped: Callable[[], bool]) -> bool:
+    """Do those runs that are not over, in their order, each in its folder; return whether all are over now.
 
     Raises:
       RunError: no local worker keeps running.
@@ -139,7 +117,7 @@ def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: Shown, stopped:
         flags += ["--record" if sharing.record else "--no-record"]
         plans = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         running: list[_Learner] = []
-        stack.callback(_end, running)
+        stack.callback(lambda: end([learner.process for learner in running], _GRACE))
         while (waiting or running) and not stopped():
             while waiting and len(running) < sharing.parallel:
                 path = waiting.popleft()
@@ -150,7 +128,7 @@ def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: Shown, stopped:
             if pool and pool.tend() and not pool.pids:
                 raise RunError("no local worker keeps running; their own messages above say why")
             time.sleep(_LOOK)
-        _end(running)
+        end([learner.process for learner in running], _GRACE)
         for learner in running:
             _conclude(learner, shown)
         running.clear()
@@ -178,7 +156,7 @@ def _workers(sharing: Sharing, flags: Sequence[str], runs: Iterable[RunConfig], 
     return stack.enter_context(Pool(sharing.processes, own, dict(os.environ)))
 
 
-def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], shown: Shown) -> _Learner:
+def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], shown: "Runs") -> _Learner:
     plan = plans / f"{path.name}.json"
     plan.write_text(json.dumps(configs.to_dict(config)), "utf-8")
     command = [
@@ -198,13 +176,16 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], sho
     return learner
 
 
-def _listen(learner: _Learner, shown: Shown) -> None:
+def _listen(learner: _Learner, shown: "Runs") -> None:
     """Pass on what a learner says; a thread that ended would leave it stuck at a full pipe."""
     assert learner.process.stdout
     generations = 0
     for line in learner.process.stdout:
-        told = _event(line)
-        if told is None:
+        try:
+            told = json.loads(line)
+        except ValueError:
+            told = None
+        if not isinstance(told, dict) or "event" not in told:
             learner.said.append(line.strip())
             shown.said(learner.run, line.strip())
         elif told["event"] == "run":
@@ -213,17 +194,7 @@ def _listen(learner: _Learner, shown: Shown) -> None:
             shown.progress(learner.run, told["generation"], generations, told["mean_policy_return"])
 
 
-def _event(line: str) -> dict[str, Any] | None:
-    """A line of --json; None for any other."""
-    try:
-        told = json.loads(line)
-    except ValueError:
-        return None
-    return told if isinstance(told, dict) and "event" in told else None
-
-
-def _conclude(learner: _Learner, shown: Shown) -> None:
-    """Say how a learner's run ended."""
+def _conclude(learner: _Learner, shown: "Runs") -> None:
     learner.reader.join()
     summary, status = RunFolder(learner.path).read_summary() or {}, learner.process.returncode
     stopped = status in (130, -signal.SIGTERM)
@@ -235,19 +206,6 @@ def _conclude(learner: _Learner, shown: Shown) -> None:
         judged = {True: " and succeeds", False: " and does not succeed", None: ""}[summary["mean_policy_success"]]
         said = f"mean policy returns {summary['mean_policy_return']:.3f}{judged}"
     shown.ended(learner.run, state, said)
-
-
-def _end(learners: list[_Learner]) -> None:
-    """Have them save and leave; one that takes too long is killed."""
-    for learner in learners:
-        learner.process.terminate()
-    until = time.monotonic() + _GRACE
-    for learner in learners:
-        try:
-            learner.process.wait(max(0.0, until - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            learner.process.kill()
-            learner.process.wait()
 
 
 def _learn(words: Sequence[str]) -> int:

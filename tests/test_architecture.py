@@ -39,6 +39,8 @@ DOORS = {
     "matplotlib": ("learner/figure.py",),
     "rich": ("farm/commands/", "learner/commands/"),
     "cryptography": ("farm/commands/certificates.py",),
+    "onnx": ("learner/onnx.py",),
+    "cmaes": ("learner/algorithms/cma.py",),
     "PIL": ("farm/sim/video.py", "learner/commands/check.py"),
     "imageio_ffmpeg": ("farm/sim/video.py",),
 }
@@ -49,13 +51,15 @@ PURE = (
         "farm/arrays.py",
         "farm/errors.py",
         "farm/elementary.py",
+        "farm/moments.py",
         "farm/seeds.py",
         "farm/net/keys.py",
         "farm/net/work.py",
     ),
     *("farm/net/messages.py", "farm/net/stats.py", "farm/sim/channels.py", "farm/sim/trajectory.py", "farm/policies/"),
     *(f"farm/tasks/finger_gait/{name}.py" for name in ("hand", "observations", "rewards", "touch")),
-    *("learner/algorithms/", "learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
+    *(f"learner/algorithms/{name}.py" for name in ("ars", "gradients", "optimisers", "pgpe", "snes", "state")),
+    *("learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
     *("learner/scheduler/chunking.py", "learner/scheduler/membership.py", "learner/scheduler/round.py"),
 )
 """Modules without network, simulator, clock or file."""

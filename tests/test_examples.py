@@ -3,6 +3,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 LEARN = Path(__file__).parents[1] / "examples" / "learn.py"
 
 
@@ -34,6 +36,15 @@ def test_random_actions_play_episodes(tmp_path: Path) -> None:
     said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
     assert [line.split(":")[0] for line in said.splitlines()] == ["episode 0", "episode 1"]
     assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())
+
+
+def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path) -> None:
+    pytest.importorskip("cmaes")
+    command = [sys.executable, LEARN.parent / "cma_es.py"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    returns = [float(line.rpartition(" ")[2]) for line in said.splitlines()]
+    assert len(returns) == 10
+    assert returns[-1] > max(returns[0], -1.0), "standing still returns -5.4"
 
 
 _SCRIPT = """

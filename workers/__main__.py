@@ -8,7 +8,8 @@ import threading
 from dataclasses import dataclass
 
 from farm import settings as arguments
-from farm.errors import ConfigError, FarmError
+from farm.commands.logs import Formatter
+from farm.errors import ConfigError, FarmError, printable
 from workers.worker import WorkerConfig, work
 
 BROKEN = 70
@@ -33,16 +34,18 @@ def main() -> int:
         signal.signal(number, lambda *_: stop.set())
     try:
         process = arguments.parse(Process, sys.argv[1:], "python -m workers")
-        logging.basicConfig(level=process.log_level, format="%(levelname).1s worker %(process)d: %(message)s")
+        handler = logging.StreamHandler()
+        handler.setFormatter(Formatter("%(levelname).1s worker %(process)d: %(message)s"))
+        logging.basicConfig(level=process.log_level, handlers=[handler])
         if process.exit_with_parent:
             threading.Thread(target=_watch_parent, args=(stop,), daemon=True).start()
         work(process.worker, stop.is_set)
     except ConfigError as error:
-        sys.stderr.write(f"farm worker: {error}\n")
+        sys.stderr.write(printable(f"farm worker: {error}") + "\n")
         return 2
     except FarmError as error:
         if not stop.is_set():
-            sys.stderr.write(f"farm worker: {error}\n")
+            sys.stderr.write(printable(f"farm worker: {error}") + "\n")
             return 1
     except Exception:
         logging.exception("this worker failed")

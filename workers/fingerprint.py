@@ -6,6 +6,7 @@ every built-in policy's arithmetic.
 """
 
 import hashlib
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, Final
 
@@ -19,7 +20,10 @@ from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
 
 _FEATURES: Final = {"features": 300}
-_POLICIES: Final = {"direct": _FEATURES, "projected": _FEATURES, "kernel": {}, "cosine": _FEATURES}
+_SETTINGS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "direct": _FEATURES, "projected": _FEATURES, "cosine": _FEATURES, "mlp": {"layers": (16, 8)},
+}  # fmt: skip
+"""Of policies whose own defaults are not what is wanted here."""
 
 
 class Canary(Task):
@@ -58,14 +62,16 @@ class Canary(Task):
 
 @cache
 def digest() -> str:
-    """SHA-256 of what the rollouts gave; takes some tenths of a second, once per process."""
+    """SHA-256 of what the rollouts gave; takes less than a tenth of a second, once per process."""
     said = hashlib.sha256()
     task = Canary(TaskConfig())
     spec, runner = task.spec(), None
-    for name, settings in _POLICIES.items():
+    for name in plugins.BUILT_IN["policies"]:
         kind: Any = plugins.find("policies", name).target
-        config = kind.Config(**settings)
+        config = kind.Config(**_SETTINGS.get(name, {}))
         drawn = {key: _numbers(values.shape) for key, values in kind.draw(config, spec, seeds.features(0)).items()}
+        if kind.standardised:
+            drawn |= {"origin": _numbers((spec.observation,)), "spread": 1.5 + _numbers((spec.observation,))}
         policy: Policy = kind(config, spec, drawn)
         runner = runner or Runner(task, policy)
         runner.policy = policy

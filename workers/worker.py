@@ -39,8 +39,10 @@ _ASK: Final = 1.0  # [s] for an answer to a query
 _KEEP: Final = 32  # runs whose tasks are kept built: as many learners may share us
 _RUNS: Final = 1000  # that are served side by side
 _HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below
+_CREDITS: Final = 4  # times as many jobs of one run are held as were asked for: jobs are sent again, and cross others
 _TELL: Final = 1000  # different lines that are said once
 _MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
+_MUTE: Final = 9.0  # times as long as a question stayed without an answer no other is asked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +98,10 @@ class _Served:
     chunks: deque[Chunk] = field(default_factory=deque)
     busy: float = field(default_factory=time.monotonic)
     """When it last had work, or we said that it has none [s]."""
+    there: bool = False
+    """Its learner's token has been seen."""
+    mute: float = 0.0
+    """Until then its learner is asked nothing, because it did not answer [s]."""
 
 
 def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
@@ -125,6 +131,8 @@ class Worker:
         self._runners: OrderedDict[str, Runner | Exception] = OrderedDict()
         self._backend = rollouts.backend(config.backend)
         self._canary = fingerprint.digest()
+        self._credits = 2 * self._backend.capacity
+        self._mute = 0.0  # as _Served.mute, for all runs whose token was not seen
         self._spoke = time.monotonic()
         self._told: set[str] = set()
         self._ignored: Counter[str] = Counter()
@@ -170,14 +178,14 @@ class Worker:
             refusal = codec.decode(event.payload, Refusal)
             self._tell(logging.ERROR, f"run {refusal.run} does not take this worker: {refusal.reason}")
         else:
-            self._learner(keys.tail(event.key, keys.learner_token(self._config.farm, "")), there=event.alive)
+            self._learner(keys.run_in(event.key, keys.learner_token(self._config.farm, "")), there=event.alive)
 
     def _learner(self, run: str, *, there: bool) -> None:
         """A run's learner came or went."""
         if not there:
             self._runs.pop(run, None)
             return
-        self._served(run)
+        self._served(run).there = True
         self._want(idle=())
 
     def _tell_idle(self) -> None:
@@ -199,12 +207,13 @@ class Worker:
             self._told.add(text)
             log.log(level, "%s", text)
 
-    def _begin(self, header: RoundHeader) -> None:
-        """A new round: work of older ones is void."""
+    def _begin(self, header: RoundHeader, *, asked: bool = False) -> None:
+        """A new round: work of older ones is void. What was asked for holds, whatever was published before."""
         run = self._served(header.run)
         old = run.header
-        if old and old.incarnation == header.incarnation and old.round >= header.round:
-            return
+        if old and old.incarnation == header.incarnation:
+            if header.round == old.round or (header.round < old.round and not asked):
+                return
         self._make_room(header)
         run.header, run.busy = header, time.monotonic()
         run.chunks.clear()
@@ -212,14 +221,30 @@ class Worker:
     def _accept(self, chunk: Chunk) -> None:
         run = self._served(chunk.run)
         if not _belongs(chunk, run.header):
-            payload = self._session.ask(keys.generation(self._config.farm, chunk.run), _ASK)
+            payload = self._ask(run, keys.generation(self._config.farm, chunk.run))
             if payload is not None:
-                self._begin(codec.decode(payload, RoundHeader))
-        if _belongs(chunk, run.header) and len(run.chunks) < _HELD:
-            self._make_room(chunk)
-            run.chunks.append(chunk)
-        else:
+                self._begin(codec.decode(payload, RoundHeader), asked=True)
+        if not _belongs(chunk, run.header):
             self._ignored["stale"] += 1
+            if run.header is None or chunk.round > run.header.round:
+                self._tell(logging.WARNING, f"run {chunk.run} sends jobs of a round that its learner does not confirm")
+            return
+        jobs = len(chunk) + sum(map(len, run.chunks))
+        if jobs > _CREDITS * self._credits or len(run.chunks) >= _HELD:
+            raise MessageError(f"run {chunk.run} sends {jobs} jobs, {self._credits} were asked for", "large")
+        self._make_room(chunk)
+        run.chunks.append(chunk)
+
+    def _ask(self, run: _Served, key: str) -> bytes | None:
+        """An answer of a run's learner; one that does not come costs at most a tenth of our time."""
+        begun = time.monotonic()
+        if begun < (run.mute if run.there else self._mute):
+            return None
+        payload = self._session.ask(key, _ASK)
+        if payload is None:
+            now = time.monotonic()
+            run.mute = self._mute = now + _MUTE * (now - begun)
+        return payload
 
     def _served(self, run: str) -> _Served:
         """What we know of a run.
@@ -291,16 +316,16 @@ class Worker:
 
     def _do(self, chunk: Chunk, runner: Runner, header: RoundHeader, jobs: Jobs) -> None:
         """Run some of a chunk's jobs and say what they gave."""
-        given = runner.run(header.mu, jobs, header.traces)
+        given = runner.run(header.mu, jobs, header.traces, header.normaliser)
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
         self._answer(chunk, Results.carrying(given, jobs, **head))
 
     def _runner(self, header: RoundHeader) -> Runner | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
         if header.spec not in self._runners:
-            payload = self._session.ask(keys.spec(self._config.farm, header.run), _ASK)
+            payload = self._ask(self._runs[header.run], keys.spec(self._config.farm, header.run))
             if payload is None or hashlib.sha256(payload).hexdigest() != header.spec:
-                log.warning("run %s does not tell what it simulates; its jobs wait", header.run)
+                self._tell(logging.WARNING, f"run {header.run} does not tell what it simulates; its jobs wait")
                 return None
             try:
                 spec = codec.decode(payload, Spec)
@@ -330,7 +355,7 @@ class Worker:
         self._spoke = time.monotonic()
         message = WorkRequest(
             worker=self.id,
-            credits=2 * self._backend.capacity if credits is None else credits,
+            credits=self._credits if credits is None else credits,
             idle=idle,
             version=__version__,
             canary=self._canary,

@@ -4,9 +4,11 @@ import datetime
 import importlib.util
 import ipaddress
 import json
+import re
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -14,24 +16,34 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import tyro
 
 from farm import settings as arguments
-from farm.errors import ConfigError
-from farm.net import keys
+from farm.errors import ConfigError, writing
+from farm.net import keys, tls
 from farm.net.tls import Role
+from farm.settings import Settings, setting
 
-if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
-    from cryptography.x509 import Certificate
+_THERE: Final = importlib.util.find_spec("cryptography") is not None  # an extra
+
+if TYPE_CHECKING or _THERE:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 LEARNER: Final = "learner"
 """Common name of the learner's certificate."""
 
+_PARTS: Final = ("learners", "workers", "viewers")
+_COMMON_NAME: Final = 64  # characters (RFC 5280, ub-common-name)
+_LABEL: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
+
 
 @dataclass(frozen=True, kw_only=True)
-class CertificatesCommand:
+class CertificatesCommand(Settings):
     """A small certificate authority for a lab: makes one folder for each machine to copy there."""
 
-    action: tyro.conf.Positional[Literal["new", "add"]]
-    """new: an authority and its first certificates; add: more workers or viewers."""
+    action: tyro.conf.Positional[Literal["new", "add", "renew"]]
+    """new: an authority and its first certificates; add: more workers or viewers; renew: those named once more, or the
+    learner's where none is."""
     dir: tyro.conf.Positional[Path]
     """Folder of the authority; keep it on one machine."""
     learner: tuple[str, ...] = ()
@@ -40,31 +52,34 @@ class CertificatesCommand:
     """Name of a worker's host, repeatable; all processes of that host share its certificate."""
     viewer: tuple[str, ...] = ()
     """Name of somebody who may look but not work, repeatable."""
-    days: int = 825
+    days: int = setting(825, least=1, most=3650)
     """Validity of the certificates [days]; the authority's own is ten years."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
-        for kind in ("worker", "viewer"):
-            for name in getattr(self, kind):
-                keys.checked(kind, name)
+        super().__post_init__()
+        for role, name in self.others:
+            if len(keys.checked(role, name)) > _COMMON_NAME:
+                raise ConfigError(f"{role} {name} has {len(name)} characters; a certificate takes {_COMMON_NAME}")
+        for host in self.learner:
+            _check_host(host)
         names = [LEARNER, *self.worker, *self.viewer]
         twice = {name for name in names if names.count(name) > 1}
         if twice:
             raise ConfigError(f"{', '.join(sorted(twice))}: a name can be given to one certificate only")
-        if not 1 <= self.days <= 3650:
-            raise ConfigError(f"days is {self.days}; expected 1 to 3650")
+
+    @property
+    def others(self) -> list[tuple[Role, str]]:
+        """Roles and names of all but the learner."""
+        return [("worker", name) for name in self.worker] + [("viewer", name) for name in self.viewer]
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(CertificatesCommand, words, "farm certificates")
-    if importlib.util.find_spec("cryptography") is None:
+    if not _THERE:
         raise ConfigError("making certificates needs cryptography: pip install 'rolloutfarm[certificates]'")
-    try:
-        (_new if command.action == "new" else _add)(command)
-    except OSError as error:
-        raise ConfigError(f"cannot write to {command.dir}: {error.strerror}") from None
+    with writing(f"to {command.dir}", ConfigError):
+        {"new": _new, "add": _add, "renew": _renew}[command.action](command)
     return 0
 
 
@@ -73,107 +88,192 @@ def _new(command: CertificatesCommand) -> None:
         raise ConfigError(f"{command.dir} is not empty: take another folder, or farm certificates add {command.dir}")
     if not command.learner:
         raise ConfigError("--learner HOST is missing: the name or address at which workers dial the learner")
-    authority = _Authority.create(command.dir / "ca")
-    authority.issue(command.dir / LEARNER, "learner", LEARNER, command.days, command.learner)
-    _issue(command, authority)
-    _say(command, "new")
+    with _all_or_nothing(command.dir):
+        authority = _Authority.create(command.dir / "ca")
+        _issue(command, authority, [("learner", LEARNER), *command.others], {"learners": [LEARNER]})
+    sys.stdout.write(
+        f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {command.dir / LEARNER}\n"
+        f"workers: farm worker --connect tls/{command.learner[0]}:7447 --tls worker-NAME\n"
+        f"{command.dir / 'ca'} makes more of them: keep it where you are, and to yourself\n"
+    )
 
 
 def _add(command: CertificatesCommand) -> None:
     if command.learner:
-        raise ConfigError("--learner belongs to farm certificates new; another learner needs another authority")
-    if not (*command.worker, *command.viewer):
+        raise ConfigError("--learner belongs to farm certificates new and renew")
+    if not command.others:
         raise ConfigError("nothing to add: give --worker NAME or --viewer NAME")
-    there = [name for role in ("worker", "viewer") for name in getattr(command, role)]
-    known = [path.name.partition("-")[2] for path in command.dir.glob("*-*") if path.is_dir()]
-    if set(there) & set(known):
-        raise ConfigError(f"{', '.join(sorted(set(there) & set(known)))} has a certificate in {command.dir} already")
-    _issue(command, _Authority.load(command.dir / "ca"))
-    _say(command, "add")
+    authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
+    known = {name for names in roster.values() for name in names}
+    if twice := sorted({name for _, name in command.others if name in known or _folder(command, name)}):
+        raise ConfigError(f"{', '.join(twice)} has a certificate already: farm certificates renew makes it anew")
+    _issue(command, authority, command.others, roster)
+    sys.stdout.write(f"copy {command.dir}/ca/roster.json to the learner's bundle (or the router's) and restart it\n")
 
 
-def _issue(command: CertificatesCommand, authority: "_Authority") -> None:
-    roles: tuple[Role, ...] = ("worker", "viewer")
-    for role in roles:
-        for name in getattr(command, role):
-            authority.issue(command.dir / f"{role}-{name}", role, name, command.days, ())
-    roster = {f"{role}s": _names(command.dir, role) for role in roles}
-    text = json.dumps({"learners": [LEARNER], **roster}, indent=2) + "\n"
-    (command.dir / LEARNER / "roster.json").write_text(text, "utf-8")
+def _renew(command: CertificatesCommand) -> None:
+    authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
+    for role, name in command.others:
+        if name not in roster[f"{role}s"]:
+            raise ConfigError(f"no {role} {name} is known in {command.dir}: farm certificates add makes a new one")
+    learner: list[tuple[Role, str]] = [("learner", LEARNER)] if command.learner or not command.others else []
+    hosts = command.learner or (_hosts(command.dir / LEARNER) if learner else ())
+    _issue(command, authority, [*learner, *command.others], roster, hosts)
+    sys.stdout.write("restart who uses them; those they replace stay valid until their own end\n")
 
 
-def _names(folder: Path, role: Role) -> list[str]:
-    return sorted(path.parent.name.removeprefix(f"{role}-") for path in folder.glob(f"{role}-*/cert.pem"))
+def _issue(
+    command: CertificatesCommand,
+    authority: "_Authority",
+    wanted: list[tuple[Role, str]],
+    roster: dict[str, list[str]],
+    hosts: tuple[str, ...] | None = None,
+) -> None:
+    """Make bundles, all or none, list who may take part, and say what was made."""
+    with ExitStack() as undo:
+        made = []
+        for role, name in wanted:
+            folder = command.dir / (LEARNER if role == "learner" else f"{role}-{name}")
+            aside = command.dir / f".{folder.name}.new"
+            shutil.rmtree(aside, ignore_errors=True)
+            undo.callback(shutil.rmtree, aside, ignore_errors=True)
+            own = () if role != "learner" else command.learner if hosts is None else hosts
+            authority.issue(aside, role, name, command.days, own)
+            made.append((aside, folder))
+            roster[f"{role}s"] = sorted({name, *roster.get(f"{role}s", [])})
+        for aside, folder in made:
+            shutil.rmtree(folder, ignore_errors=True)
+            aside.rename(folder)
+    text = json.dumps({part: roster.get(part, []) for part in _PARTS}, indent=2) + "\n"
+    for folder in (command.dir / "ca", command.dir / LEARNER):
+        if folder.is_dir():  # the learner's may have been moved to its machine
+            (folder / "roster.json").write_text(text, "utf-8")
+    folders = "\n  ".join(str(folder) for _, folder in made)
+    sys.stdout.write(f"made, one folder for each machine to copy there:\n  {folders}\n")
 
 
-def _say(command: CertificatesCommand, action: str) -> None:
-    made = [f"{role}-{name}" for role in ("worker", "viewer") for name in getattr(command, role)]
-    lines = [f"{command.dir / name}" for name in (([LEARNER] if action == "new" else []) + made)]
-    sys.stdout.write("made, one folder for each machine to copy there:\n  " + "\n  ".join(lines) + "\n")
-    if action == "add":
-        sys.stdout.write(f"copy {command.dir / LEARNER}/roster.json to the learner (or router) and restart it\n")
-    else:
-        host = command.learner[0]
-        sys.stdout.write(
-            f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {command.dir / LEARNER}\n"
-            f"workers: farm worker --connect tls/{host}:7447 --tls worker-NAME\n"
-            f"{command.dir / 'ca'} makes more of them: keep it where you are, and to yourself\n"
+def _roster(folder: Path) -> dict[str, list[str]]:
+    """Who may take part, by role: the authority's own list, wherever bundles were moved to."""
+    for path in (folder / "ca" / "roster.json", folder / LEARNER / "roster.json"):
+        if path.exists():
+            try:
+                values = json.loads(path.read_text("utf-8"))
+                return {part: [keys.checked(part, name) for name in values[part]] for part in _PARTS}
+            except (ValueError, KeyError, TypeError, RecursionError, ConfigError):
+                raise ConfigError(f"{path} is damaged: expected lists of names: {', '.join(_PARTS)}") from None
+    found = {
+        f"{role}s": [path.parent.name.removeprefix(f"{role}-") for path in folder.glob(f"{role}-*/cert.pem")]
+        for role in ("worker", "viewer")
+    }
+    return {"learners": [LEARNER], **found}
+
+
+def _folder(command: CertificatesCommand, name: str) -> bool:
+    return any((command.dir / f"{role}-{name}").exists() for role in ("worker", "viewer"))
+
+
+def _hosts(folder: Path) -> tuple[str, ...]:
+    """The names in the learner's present certificate."""
+    try:
+        present = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
+        names = present.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except (OSError, ValueError, x509.ExtensionNotFound):
+        raise ConfigError(f"no certificate in {folder} to renew: say its names by --learner HOST") from None
+    return tuple(str(name.value) for name in names)
+
+
+@contextmanager
+def _all_or_nothing(folder: Path) -> Iterator[None]:
+    """Have a folder that could not be filled be as it was: not there, or empty."""
+    there = folder.exists()
+    try:
+        yield
+    except BaseException:
+        for path in folder.iterdir() if folder.exists() else ():
+            shutil.rmtree(path, ignore_errors=True)
+        if not there and folder.exists():
+            folder.rmdir()
+        raise
+
+
+def _check_host(host: str) -> None:
+    """See that a certificate can be for a host; else a ConfigError."""
+    if _is_address(host):
+        return
+    labels = host.split(".")
+    if len(host) > 253 or not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdecimal():
+        hint = "" if host.isascii() else "; names of other letters have a form in ASCII, xn--..."
+        raise ConfigError(
+            f"--learner {host[:100]!r} is no host; expected a name like learner.lab, or an address like 10.0.0.7, "
+            f"without port{hint}"
         )
 
 
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
 class _Authority:
     """A CA: its certificate, and the key that signs."""
 
-    def __init__(self, folder: Path, key: "EllipticCurvePrivateKey", certificate: "Certificate") -> None:
-        self._folder, self._key, self._certificate = folder, key, certificate
+    folder: Path
+    key: "ec.EllipticCurvePrivateKey"
+    certificate: "x509.Certificate"
 
     @classmethod
     def create(cls, folder: Path) -> "_Authority":
-        from cryptography.hazmat.primitives.asymmetric import ec
-
         folder.mkdir(parents=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = _certificate("rolloutfarm CA", key, None, key, 3650, _ca_extensions(key))
+        usage = x509.KeyUsage(
+            digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
+            data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+        )  # fmt: skip
+        constraints = x509.BasicConstraints(ca=True, path_length=0)
+        certificate = _certificate("rolloutfarm CA", key, None, key, 3650, [(constraints, True), (usage, True)])
         _write(folder, key, certificate)
         return cls(folder, key, certificate)
 
     @classmethod
     def load(cls, folder: Path) -> "_Authority":
-        from cryptography import x509
-        from cryptography.hazmat.primitives.serialization import load_pem_private_key
-
         try:
-            key: Any = load_pem_private_key((folder / "key.pem").read_bytes(), None)
+            key: Any = serialization.load_pem_private_key((folder / "key.pem").read_bytes(), None)
             certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
-        except (OSError, ValueError):
+            tls.private(folder / "key.pem")
+        except (OSError, ValueError, TypeError):
             raise ConfigError(f"{folder} holds no certificate authority: farm certificates new makes one") from None
         return cls(folder, key, certificate)
 
     def issue(self, folder: Path, role: Role, name: str, days: int, hosts: tuple[str, ...]) -> None:
         """Make a bundle."""
-        from cryptography.hazmat.primitives.asymmetric import ec
-
         folder.mkdir(mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
-        extensions = _leaf_extensions(role, hosts, key, self._key)
-        certificate = _certificate(name, key, self._certificate, self._key, days, extensions)
-        _write(folder, key, certificate)
-        shutil.copy(self._folder / "cert.pem", folder / "ca.pem")
+        # Workers connect to the learner, but behind a router the learner connects as well.
+        client, server = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH
+        extensions: list[tuple[Any, bool]] = [
+            (x509.BasicConstraints(ca=False, path_length=None), True),
+            (x509.ExtendedKeyUsage([server, client] if role == "learner" else [client]), False),
+            (x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), False),
+        ]
+        if hosts:
+            extensions.append((x509.SubjectAlternativeName([_host(host) for host in hosts]), False))
+        _write(folder, key, _certificate(name, key, self.certificate, self.key, days, extensions))
+        shutil.copy(self.folder / "cert.pem", folder / "ca.pem")
         (folder / "identity.json").write_text(json.dumps({"role": role, "name": name}) + "\n", "utf-8")
 
 
 def _certificate(
     name: str,
-    key: "EllipticCurvePrivateKey",
-    issuer: "Certificate | None",
-    signer: "EllipticCurvePrivateKey",
+    key: "ec.EllipticCurvePrivateKey",
+    issuer: "x509.Certificate | None",
+    signer: "ec.EllipticCurvePrivateKey",
     days: int,
-    extensions: "list[tuple[Any, bool]]",
-) -> "Certificate":
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.x509.oid import NameOID
-
+    extensions: list[tuple[Any, bool]],
+) -> "x509.Certificate":
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.UTC)
     builder = (
@@ -184,55 +284,19 @@ def _certificate(
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(minutes=5))  # machines' clocks differ
         .not_valid_after(now + datetime.timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
     for extension, critical in extensions:
         builder = builder.add_extension(extension, critical)
     return builder.sign(signer, hashes.SHA256())
 
 
-def _ca_extensions(key: "EllipticCurvePrivateKey") -> "list[tuple[Any, bool]]":
-    from cryptography import x509
-
-    usage = x509.KeyUsage(
-        digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
-        data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
-    )  # fmt: skip
-    identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
-    return [(x509.BasicConstraints(ca=True, path_length=0), True), (usage, True), (identifier, False)]
+def _host(host: str) -> "x509.GeneralName":
+    return x509.IPAddress(ipaddress.ip_address(host)) if _is_address(host) else x509.DNSName(host)
 
 
-def _leaf_extensions(
-    role: Role, hosts: tuple[str, ...], key: "EllipticCurvePrivateKey", signer: "EllipticCurvePrivateKey"
-) -> "list[tuple[Any, bool]]":
-    from cryptography import x509
-    from cryptography.x509.oid import ExtendedKeyUsageOID
-
-    # The learner is dialled, but behind a router it dials as well.
-    client, server = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH
-    uses = x509.ExtendedKeyUsage([server, client] if role == "learner" else [client])
-    out: list[tuple[Any, bool]] = [
-        (x509.BasicConstraints(ca=False, path_length=None), True),
-        (uses, False),
-        (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False),
-        (x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), False),
-    ]
-    if hosts:
-        out.append((x509.SubjectAlternativeName([_host(host) for host in hosts]), False))
-    return out
-
-
-def _host(host: str) -> Any:  # noqa: ANN401  one of cryptography's general names
-    from cryptography import x509
-
-    try:
-        return x509.IPAddress(ipaddress.ip_address(host))
-    except ValueError:
-        return x509.DNSName(host)
-
-
-def _write(folder: Path, key: "EllipticCurvePrivateKey", certificate: "Certificate") -> None:
-    from cryptography.hazmat.primitives import serialization as s
-
+def _write(folder: Path, key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate") -> None:
+    s = serialization
     private = key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, s.NoEncryption())
     path = folder / "key.pem"
     path.touch(mode=0o600)

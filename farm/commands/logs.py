@@ -2,22 +2,37 @@
 
 import logging
 import sys
-from typing import Final
+from typing import Any, Final
 
-from farm.errors import ConfigError
+from farm.errors import ConfigError, printable
 
 LEVELS: Final = ("DEBUG", "INFO", "WARNING", "ERROR")
 
 
-def set_up(level: str) -> None:
-    """Messages of that level and above to standard error.
+class Formatter(logging.Formatter):
+    """Messages of one line in which nothing moves a terminal's cursor, whoever sent what they tell of."""
 
-    Raises:
-      ConfigError: there is no such level.
-    """
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  logging's name
+        """The line; a traceback below it keeps its lines."""
+        record.message = printable(record.message)
+        return super().formatMessage(record)
+
+    def formatException(self, ei: Any) -> str:  # noqa: ANN401, N802  logging's name and type
+        """The traceback."""
+        return printable(super().formatException(ei), kept="\n")
+
+
+def set_up(level: str) -> None:
+    """Messages of that level and above to standard error; a ConfigError where there is no such level."""
     if level.upper() not in LEVELS:
         raise ConfigError(f"unknown log level {level!r}; known are {', '.join(LEVELS)}")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(Formatter("%(message)s"))
     handler.setLevel(level.upper())
     logging.basicConfig(level=min(logging.INFO, logging.getLevelName(level.upper())), handlers=[handler], force=True)
+
+
+def say(*lines: str) -> None:
+    """Write lines to standard output, at once also where that is a pipe."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()

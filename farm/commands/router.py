@@ -1,7 +1,6 @@
 """`farm router`: a standing rendezvous that outlives learners."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +34,6 @@ class RouterCommand:
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
     def __post_init__(self) -> None:
-        """Check the name."""
         keys.checked("farm", self.farm)
 
 
@@ -48,11 +46,10 @@ def main(words: Sequence[str]) -> int:
     trusted, dial = command.trust_network, command.connect
     if command.print_config:
         settings = router_settings(endpoint, command.farm, bundle, trusted=trusted, dial=dial)
-        sys.stdout.write(json.dumps(_nested(settings), indent=2) + "\n")
+        logs.say(json.dumps(_nested(settings), indent=2))
         return 0
     with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, dial=dial):
-        sys.stdout.write(f"router at {endpoint}; learners and workers dial it with --connect\n")
-        sys.stdout.flush()
+        logs.say(f"router at {endpoint}; learners and workers dial it with --connect")
         stop.wait()
     return 0
 

@@ -1,4 +1,4 @@
-"""Whether there is a screen, and drawing without one.
+"""Whether there is a screen, drawing without one, and tables that fit into 80 columns.
 
 Imports no MuJoCo, which looks at MUJOCO_GL once, when it is imported.
 """
@@ -6,6 +6,15 @@ Imports no MuJoCo, which looks at MUJOCO_GL once, when it is imported.
 import ctypes.util
 import os
 import sys
+from typing import Final
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from farm.errors import printable
+
+_WIDE: Final = 240  # columns of a file or a pipe, where nothing need be folded
 
 
 def display() -> bool:
@@ -17,3 +26,25 @@ def draw_offscreen() -> None:
     """Have MuJoCo draw without a window where there is no screen; a MUJOCO_GL of the user's stays as it is."""
     if not display():
         os.environ.setdefault("MUJOCO_GL", "osmesa" if ctypes.util.find_library("OSMesa") else "egl")
+
+
+def compact(title: str | None = None) -> Table:
+    """A table without lines."""
+    return Table(title=title, box=None, pad_edge=False, padding=(0, 2, 0, 0), title_justify="left")
+
+
+def plain(text: object) -> Text:
+    """Text as it is, whoever wrote it: a name in brackets is no style, and a control character moves no cursor."""
+    return Text(printable(str(text)))
+
+
+def wide() -> Console:
+    """Standard output: as wide as the terminal, or wide enough for all."""
+    console = _Console()
+    return console if console.is_terminal else _Console(width=_WIDE)
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to the front door, which knows how to end then."""
+        raise BrokenPipeError

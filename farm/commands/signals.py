@@ -5,8 +5,12 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Final
 
 log = logging.getLogger(__name__)
+
+INTERRUPTED: Final = 130
+"""Exit status after Ctrl-C or SIGTERM, as of a shell."""
 
 
 @contextmanager

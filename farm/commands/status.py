@@ -4,18 +4,17 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
-from rich.text import Text
 
 from farm import settings as arguments
 from farm.commands import logs
+from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import stop_flag
-from farm.commands.tables import compact, wide
 from farm.errors import FarmError, MessageError
 from farm.net import codec, keys
 from farm.net.session import LISTEN, Session, connect
@@ -67,16 +66,14 @@ def main(words: Sequence[str]) -> int:
         if not console.is_terminal:
             console.print(_tables(runs))
             return 0
-        _watch(console, lambda: ask(session, command.farm, run), runs, stop.wait)
+        with Live(_tables(runs), console=console, auto_refresh=False) as live:
+            while not stop.wait(1.0):
+                live.update(_tables(ask(session, command.farm, run)), refresh=True)
     return 0
 
 
 def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> None:
-    """See that who was named is there: what a health check wants to know.
-
-    Raises:
-      FarmError: the run's learner, or every worker of the name, is not.
-    """
+    """See that the named run and worker are there: a FarmError says which is not. For health checks."""
     if command.run and not runs:
         raise FarmError(f"no learner of run {command.run} answers on farm {command.farm}")
     token = keys.worker_token(command.farm, f"{command.worker}/*")
@@ -85,11 +82,7 @@ def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> N
 
 
 def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
-    """What the farm's learners say, by run; or one run's learner.
-
-    Raises:
-      FarmError: the only ones that answer are of another release.
-    """
+    """What the farm's learners say, by run, or one run's; a FarmError where all that answer are of another release."""
     runs, foreign = [], None
     for payload in session.ask_all(keys.status(farm, run), _ANSWER):
         try:
@@ -99,14 +92,6 @@ def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
     if foreign and not runs:
         raise FarmError(f"a learner answers, but what it says cannot be read: {foreign}")
     return sorted(runs, key=lambda run: run.run)
-
-
-def _watch(
-    console: Console, look: Callable[[], list[RunStatus]], runs: list[RunStatus], wait: Callable[[float], bool]
-) -> None:
-    with Live(_tables(runs), console=console, auto_refresh=False) as live:
-        while not wait(1.0):
-            live.update(_tables(look()), refresh=True)
 
 
 def _tables(runs: list[RunStatus]) -> Group:
@@ -124,11 +109,11 @@ def _tables(runs: list[RunStatus]) -> Group:
         figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
         what = run.run, generation, *figures, str(run.open), str(run.reissued), str(run.refused), ignored
-        table.add_row(*map(Text, what))  # as they are: a name in brackets is no style
+        table.add_row(*map(plain, what))
         for worker in run.workers:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
-            workers.add_row(*map(Text, (worker.worker, *machine, run.run, *did, _counts(worker.ignored))))
+            workers.add_row(*map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored))))
     return Group(table, workers)
 
 

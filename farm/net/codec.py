@@ -36,9 +36,12 @@ M = TypeVar("M")
 C = TypeVar("C", bound=Sized)
 
 
-def array(dtype: str, ndim: int) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
+def array(dtype: str, ndim: int, default: AnyArray | None = None) -> Any:  # noqa: ANN401  as dataclasses.field is typed
     """A dataclass field for an array of that dtype and number of dimensions; floats must be finite."""
-    return dataclasses.field(metadata={"dtype": np.dtype(dtype), "ndim": ndim})
+    kind = {"dtype": np.dtype(dtype), "ndim": ndim}
+    if default is None:
+        return dataclasses.field(metadata=kind)
+    return dataclasses.field(metadata=kind, default_factory=lambda: default)
 
 
 def encode(message: object, schema: int | None = None) -> bytes:
@@ -64,7 +67,7 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int |
         items = _Items()
         body = msgpack.unpackb(
             payload, ext_hook=_unpack, list_hook=items.count, object_hook=items.count, strict_map_key=True,
-            max_array_len=_LENGTH, max_map_len=_LENGTH,
+            timestamp=1, max_array_len=_LENGTH, max_map_len=_LENGTH,
         )  # fmt: skip
     except MessageError:
         raise
@@ -154,11 +157,11 @@ def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
         raise MessageError(f"a {type(value).__name__} where a {kind.__name__} was expected")
     fields = _fields(kind)
     unknown = value.keys() - fields.keys() - (extra or set())
-    missing = fields.keys() - value.keys()
+    missing = fields.keys() - value.keys() - _optional(kind)
     if unknown or missing:
         names = ", ".join(sorted(str(name)[:40] for name in unknown | missing))
         raise MessageError(f"{kind.__name__}: unknown or missing {names}")
-    made = {name: check(value[name]) for name, check in fields.items()}
+    made = {name: check(value[name]) for name, check in fields.items() if name in value}
     try:
         return kind(**made)
     except (ValueError, TypeError, ArithmeticError) as error:
@@ -177,6 +180,13 @@ def _fields(kind: type) -> dict[str, Check]:
         field.name: _check(f"{kind.__name__}.{field.name}", hints[field.name], field.metadata)
         for field in dataclasses.fields(kind)
     }
+
+
+@functools.cache
+def _optional(kind: type) -> frozenset[str]:
+    """Fields that may be missing, as they are where an older release wrote a file: they have a default."""
+    fields, none = dataclasses.fields(kind), dataclasses.MISSING
+    return frozenset(f.name for f in fields if f.default is not none or f.default_factory is not none)
 
 
 def _check(name: str, hint: Any, metadata: Mapping[str, Any]) -> Check:  # noqa: ANN401

@@ -4,6 +4,7 @@
 <farm>/live/learner/<run>          liveliness token of a learner
 <farm>/want/<worker>               a worker's credits
 <farm>/pairs/<worker>              a worker's inbox: chunks of jobs
+<farm>/run/<run>/claim             queryable: when the run's learner began
 <farm>/run/<run>/spec              queryable: what is simulated
 <farm>/run/<run>/generation        published and queryable: the round that is on
 <farm>/run/<run>/result/<worker>   results
@@ -52,6 +53,11 @@ def inbox(farm: str, worker: str) -> str:
     return f"{farm}/pairs/{worker}"
 
 
+def claim(farm: str, run: str) -> str:
+    """Where learners that start under one name find each other."""
+    return f"{farm}/run/{run}/claim"
+
+
 def spec(farm: str, run: str) -> str:
     """Where a run's specification is answered."""
     return f"{farm}/run/{run}/spec"
@@ -87,13 +93,26 @@ def refused(farm: str, worker: str) -> str:
     return f"{farm}/refused/{worker}"
 
 
-def tail(key: str, prefix: str) -> str:
-    """What follows the prefix in a key: `tail(key, worker_token(farm, ""))` is the worker.
+def worker_in(key: str, prefix: str) -> str:
+    """The worker, <name>/<instance>, that follows the prefix in a key: `worker_in(key, want(farm, ""))`.
 
     Raises:
-      MessageError: there are no names behind it; who publishes on a pattern speaks for nobody.
+      MessageError: something else follows it; a sender that publishes on a pattern speaks for nobody.
     """
-    behind = key.removeprefix(prefix)
-    if not key.startswith(prefix) or not all(_NAME.fullmatch(part) for part in behind.split("/")):
+    return _tail(key, prefix, 2)
+
+
+def run_in(key: str, prefix: str) -> str:
+    """The run that follows the prefix in a key.
+
+    Raises:
+      MessageError: something else follows it.
+    """
+    return _tail(key, prefix, 1)
+
+
+def _tail(key: str, prefix: str, parts: int) -> str:
+    names = key.removeprefix(prefix).split("/", parts)  # no more: a key may be 64 kB of names
+    if not key.startswith(prefix) or len(names) != parts or not all(map(_NAME.fullmatch, names)):
         raise MessageError("a key without a name", "foreign")
-    return behind
+    return "/".join(names)

@@ -14,6 +14,13 @@ _KINDS: Final = 20  # of messages that a worker ignores
 _RUNS: Final = 1000  # that a worker serves
 
 
+def check_counts(ignored: dict[str, int]) -> None:
+    """See that messages which did not count are a few numbers by kind; else a ValueError."""
+    kinds = len(ignored) <= _KINDS and all(type(kind) is str for kind in ignored)
+    if not kinds or any(len(kind) > _SHORT or type(n) is not int for kind, n in ignored.items()):
+        raise ValueError("ignored messages that are not a few numbers by kind")
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorkRequest:
     """A worker's credits, worker to learners."""
@@ -41,9 +48,7 @@ class WorkRequest:
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
         if len(self.idle) > _RUNS:
             raise ValueError(f"{len(self.idle)} runs")
-        kinds = len(self.ignored) <= _KINDS and all(type(kind) is str for kind in self.ignored)
-        if not kinds or any(len(kind) > _SHORT or type(n) is not int for kind, n in self.ignored.items()):
-            raise ValueError("ignored messages that are not a few numbers by kind")
+        check_counts(self.ignored)
         if not 0 <= self.credits <= 100_000:
             raise ValueError(f"{self.credits} credits")
 

@@ -29,6 +29,7 @@ _T = TypeVar("_T")
 _TOKENS: Final = 65_536  # that one question for them may bring; a router takes 4096 sessions
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _DESCRIPTORS: Final = 65_536
+_FEWEST: Final = 64  # files and connections of a run with two workers, and some more
 _OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
 _REMIND: Final = 60.0  # [s] between two lines about the same trouble
@@ -161,7 +162,8 @@ class Session:
     def ask_all(self, key: str, timeout: float) -> Iterator[bytes]:
         """Every answer to a query on the key that comes in time [s]."""
         with suppress(zenoh.ZError):
-            for reply in self._session.get(key, timeout=timeout):
+            # Not consolidated: two that answer on one key are two answers.
+            for reply in self._session.get(key, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE):
                 if reply.ok is not None:
                     yield reply.ok.payload.to_bytes()
 
@@ -242,7 +244,6 @@ def listen(
     Raises:
       ConfigError: an endpoint is malformed, open to other machines without certificates, or its port in use.
     """
-    _raise_descriptors()
     settings = router_settings(endpoint, farm, bundle, trusted=trusted, dial=dial)
     try:
         session = _open(settings)
@@ -255,11 +256,18 @@ def listen(
 
 
 def _raise_descriptors() -> None:
-    """Let this process have as many connections as the system allows it: the usual 1024 end at 1000 workers."""
+    """Let this process have as many connections as the system allows it: the usual 1024 end at 1000 workers.
+
+    Raises:
+      FarmError: they are too few for any: Zenoh would abort the process.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        soft = wanted
+    if soft != resource.RLIM_INFINITY and soft < _FEWEST:
+        raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
 
 
 @contextmanager
@@ -314,6 +322,7 @@ def _dial(
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:
+    _raise_descriptors()
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

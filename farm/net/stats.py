@@ -65,7 +65,8 @@ class GenerationStats:
         Raises:
           ValueError: another version, or a field is missing or of another type.
         """
-        if not isinstance(values, dict) or values.get("version") != VERSION:
+        version = values.get("version") if isinstance(values, dict) else None
+        if type(version) is not int or version != VERSION:
             raise ValueError(f"not a line of progress.jsonl, version {VERSION}: {str(values)[:80]}")
         missing = [f.name for f in fields(cls) if f.name not in values]
         if missing:

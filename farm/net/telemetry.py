@@ -5,7 +5,19 @@ from typing import Any
 
 from farm.arrays import AnyArray
 from farm.net.codec import array
+from farm.net.messages import check_counts
 from farm.net.work import WireTrajectory
+
+
+def _check_plain(values: Any) -> None:  # noqa: ANN401
+    """See that a table is as JSON has it: an array in it would be compared element by element. Else a ValueError."""
+    for name, value in values.items() if type(values) is dict else enumerate(values):
+        if type(values) is dict and type(name) is not str:
+            raise ValueError(f"a name that is a {type(name).__name__}")
+        if type(value) in (dict, list, tuple):
+            _check_plain(value)
+        elif not isinstance(value, str | int | float | None):
+            raise ValueError(f"a {type(value).__name__} where JSON has none")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +38,10 @@ class WorkerStatus:
     ignored: dict[str, int] = field(default_factory=dict)
     """Messages that it ignored, by kind."""
 
+    def __post_init__(self) -> None:
+        """Check the counts."""
+        check_counts(self.ignored)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunStatus:
@@ -41,9 +57,13 @@ class RunStatus:
     reissued: int
     refused: int
     """Workers that were refused."""
-    ignored: dict[str, Any]
+    ignored: dict[str, int]
     """Messages that did not count, by kind."""
     workers: tuple[WorkerStatus, ...]
+
+    def __post_init__(self) -> None:
+        """Check the counts."""
+        check_counts(self.ignored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +113,10 @@ class RunReport:
     replay_generation: int = 0
     """The generation that one came from."""
 
+    def __post_init__(self) -> None:
+        """Check the table."""
+        _check_plain(self.progress)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunEnd:
@@ -108,6 +132,10 @@ class RunEnd:
     """The generation it came from."""
     mean: WireTrajectory | None
     """The final mean policy's rollout at physics rate; None where the run diverged."""
+
+    def __post_init__(self) -> None:
+        """Check the table."""
+        _check_plain(self.summary)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,3 +155,8 @@ class RunHistory:
     reports: tuple[RunReport, ...]
     """In order; older ones without rollouts and traces."""
     end: RunEnd | None
+
+    def __post_init__(self) -> None:
+        """Check the tables."""
+        _check_plain(self.config)
+        _check_plain(self.files)

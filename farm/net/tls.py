@@ -2,6 +2,7 @@
 
 `farm certificates` makes a folder of bundles; each holds what one machine needs:
 
+    certs/ca/            cert.pem  key.pem  roster.json, which stay
     certs/learner/       ca.pem  cert.pem  key.pem  identity.json  roster.json
     certs/worker-NAME/   ca.pem  cert.pem  key.pem  identity.json
 
@@ -11,6 +12,8 @@ certificate, whatever it calls itself; a viewer may only look.
 """
 
 import json
+import os
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -106,7 +109,16 @@ def _read(folder: Path, role: Role) -> Bundle:
         raise ConfigError(f"{folder / 'identity.json'} is damaged") from None
     if bundle.role != role:
         raise ConfigError(f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here")
+    private(folder / "key.pem")
     return bundle
+
+
+def private(key: Path) -> None:
+    """See that nobody else can read a key of ours; as ssh does, a ConfigError refuses it."""
+    found = key.stat()
+    if found.st_uid == os.getuid() and found.st_mode & 0o077:
+        mode = stat.S_IMODE(found.st_mode)
+        raise ConfigError(f"{key} can be read by others (mode {mode:04o}), and serves nobody then: chmod 600 {key}")
 
 
 def access_control(farm: str, roster: Roster) -> dict[str, Any]:

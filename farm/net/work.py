@@ -1,7 +1,7 @@
 """Work on its way: rounds and jobs to workers, results back. Arrays all the way; pure; bytes by `farm.net.codec`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -21,6 +21,9 @@ The best rollout of a round (of equals the first) is the best of the message tha
 is never missed, whichever jobs travel together.
 """
 
+NOT_NORMALISED: Final = np.empty((2, 2, 0))
+"""What a RoundHeader has where observations are taken as they are."""
+
 _LINE: Final = 1000  # characters
 _CHANNELS: Final = 100  # of a trajectory
 
@@ -39,11 +42,16 @@ class RoundHeader:
     """Which traces results bring, one of TRACES."""
     mu: FloatArray = array("<f8", 1)
     """(P,)"""
+    normaliser: FloatArray = array("<f8", 3, NOT_NORMALISED)
+    """Mean and standard deviation (2, d) of observations, twice: of all jobs, and of a job at physics rate that is not
+    around the mean, which is a rollout of an earlier generation. d is 0 where observations are taken as they are."""
 
     def __post_init__(self) -> None:
-        """Check the name."""
+        """Check the name, and that what is divided by is positive."""
         if self.traces not in TRACES:
             raise ValueError(f"traces {self.traces[:40]!r}")
+        if self.normaliser.shape[:2] != (2, 2) or not (self.normaliser[:, 1] > 0.0).all():
+            raise ValueError(f"a normaliser of shape {self.normaliser.shape}, or not positive")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +108,11 @@ class Jobs:
     def indices(self) -> IntArray:
         """Of each job, (J,)."""
         return self.table[:, _INDEX]
+
+    @property
+    def around(self) -> BoolArray:
+        """Which jobs are around the mean, (J,)."""
+        return self.table[:, _AROUND] != 0
 
     @property
     def rollouts(self) -> IntArray:
@@ -185,10 +198,15 @@ class Simulated:
     """(S,)"""
     flags: BoolArray
     """success, ended, failed, clamped, (S, 4)"""
+    steps: IntArray
+    """Control steps, (S,)"""
     traces: AnyArray
     """Of those rollouts that `traced` names, float32, (K, T, N)"""
     trajectories: "tuple[WireTrajectory, ...]"
     """Of the jobs that are seen, in their order: of the first rollout of each"""
+    moments: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros of rollouts that failed or are seen. (0, 0) where
+    observations are not normalised"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,8 +229,12 @@ class Results:
     """(S,)"""
     flags: BoolArray = array("|b1", 2)
     """success, ended, failed, clamped, (S, 4)"""
+    steps: IntArray = array("<i8", 1)
+    """Control steps, (S,)"""
     traces: AnyArray = array("<f4", 3)
     """Traces that are wanted, (K, T, N)"""
+    moments: FloatArray = array("<f8", 2, np.empty((0, 0)))
+    """Of the observations (S, 1 + 2 d), or (0, 0)"""
 
     def __post_init__(self) -> None:
         """Check that all speak of as many rollouts, at least one a job."""
@@ -223,6 +245,14 @@ class Results:
             raise ValueError("jobs that do not rise")
         if self.flags.shape != (len(self.returns), 4):
             raise ValueError(f"flags of shape {self.flags.shape} of {len(self.returns)} rollouts")
+        if len(self.steps) != len(self.returns):
+            raise ValueError(f"steps of {len(self.steps)} of {len(self.returns)} rollouts")
+        if self.moments.shape != (0, 0):
+            half = self.moments.shape[1] // 2 + 1
+            if len(self.moments) != len(self.returns) or self.moments.shape[1] % 2 == 0:
+                raise ValueError(f"moments of shape {self.moments.shape} of {len(self.returns)} rollouts")
+            if (self.moments[:, :1] < 0.0).any() or (self.moments[:, half:] < 0.0).any():
+                raise ValueError("moments that are negative")
 
     @classmethod
     def carrying(
@@ -231,7 +261,8 @@ class Results:
         """What jobs gave, ready to send; the jobs' indices rise."""
         return cls(
             run=run, incarnation=incarnation, round=round, worker=worker, jobs=np.ascontiguousarray(jobs.indices),
-            returns=given.returns, flags=given.flags, traces=given.traces, trajectories=given.trajectories,
+            returns=given.returns, flags=given.flags, steps=given.steps, traces=given.traces,
+            trajectories=given.trajectories, moments=given.moments,
         )  # fmt: skip
 
 

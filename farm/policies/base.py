@@ -14,7 +14,10 @@ from farm.tasks.base import TaskSpec
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyConfig(Settings):
-    """Settings that every policy has: none. A policy's own `Config` adds to them."""
+    """Settings that every policy has; a policy's own `Config` adds to them."""
+
+    normalise: bool = False
+    """Standardise each number of the observation by its mean and spread over all generations before."""
 
 
 class Policy:
@@ -26,6 +29,8 @@ class Policy:
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     """The policy's own settings: flags, help and config.json follow from its fields."""
+    standardised: ClassVar[bool] = False
+    """Whether its constants have `origin` and `spread` (d,) of the task's observation, measured as a run begins."""
 
     def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
         """Take the settings, the task's sizes, and what `draw` gave."""

@@ -63,7 +63,7 @@ class Kernel(Policy):
             squares = (difference * difference).sum(axis=-1)
         exponents = squares * (-0.5 / self.config.bandwidth**2)
         # Number by number: of the few that one step has, numpy's calls for `elementary.exp` would take longer.
-        return np.array(list(map(math.exp, exponents.ravel().tolist()))).reshape(exponents.shape)
+        return np.fromiter(map(math.exp, exponents.ravel().tolist()), float, exponents.size).reshape(exponents.shape)
 
 
 class Direct(Policy):

@@ -47,7 +47,6 @@ class Channel:
     """Whether it travels with results: of the best and the worst rollout of a generation, or of all."""
 
     def __post_init__(self) -> None:
-        """Check the shape."""
         sizes = {"scalars": 1, "flags": 1, "images": 3, "arrows": 2, "points": 2}
         if self.kind not in sizes or len(self.shape) != sizes[self.kind]:
             raise ConfigError(f"channel {self.name}: kind {self.kind!r} of shape {self.shape}; see Channel.kind")

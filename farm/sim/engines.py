@@ -1,13 +1,14 @@
 """MuJoCo on this machine's processor: many simulations in mujoco.batch, or one in an MjData."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import mujoco
 import mujoco.batch
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.sim.sim import Rebound, failed_rows
+from farm.sim.sim import Rebound, failed_rows, own_value
 
 CAPACITY = 64
 """Rollouts that are stepped together."""
@@ -30,8 +31,7 @@ class BatchEngine:
         """A live array over all rows."""
         known = self._fields.get(name)
         if known is None:
-            if name not in mujoco.batch.DATA_FIELDS:
-                raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
+            _check_field(name)
             known = self._fields[name] = self._batch.bind(name)
             if not known.flags.writeable:
                 raise Rebound
@@ -42,23 +42,25 @@ class BatchEngine:
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def step(self, ids: IntArray, count: int) -> None:
-        """Advance rows; one in which MuJoCo itself raised counts as blown up, the others go on."""
-        try:
+        """Advance rows by physics steps."""
+        with self._surviving():
             self._batch.step(ids, nstep=count)
-        except mujoco.batch.SimulationError as error:
-            self._batch.state[error.ids] = np.nan
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:
         """Advance rows by one physics step for each of their controls."""
-        try:
+        with self._surviving():
             self._batch.rollout(controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids)
-        except mujoco.batch.SimulationError as error:
-            self._batch.state[error.ids] = np.nan
 
     def forward(self, ids: IntArray) -> None:
         """Compute outputs."""
-        try:
+        with self._surviving():
             self._batch.forward(ids)
+
+    @contextmanager
+    def _surviving(self) -> Iterator[None]:
+        """Rows in which MuJoCo itself raised count as blown up, the others go on."""
+        try:
+            yield
         except mujoco.batch.SimulationError as error:
             self._batch.state[error.ids] = np.nan
 
@@ -88,7 +90,6 @@ class DataEngine:
     size = 1
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Take the model."""
         self.model = model
         self.data = mujoco.MjData(model)
         self.pace: Callable[[], bool] | None = None
@@ -98,8 +99,7 @@ class DataEngine:
 
     def field(self, name: str) -> AnyArray:
         """A live array of one row."""
-        if name not in mujoco.batch.DATA_FIELDS:
-            raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
+        _check_field(name)
         values = np.asarray(getattr(self.data, name))[None]
         if name not in _STATE_FIELDS:
             values.flags.writeable = False
@@ -139,8 +139,7 @@ class DataEngine:
 
     def expand(self, name: str) -> AnyArray:
         """A field of the model, as one row."""
-        own = self.model.opt if name.startswith("opt.") else self.model
-        return np.asarray(getattr(own, name.removeprefix("opt.")))[None]
+        return np.asarray(own_value(self.model, name))[None]
 
     def set_const(self, ids: IntArray) -> None:  # noqa: ARG002
         """Have derived constants follow."""
@@ -150,9 +149,12 @@ class DataEngine:
         """Hold nothing that Python does not give back."""
 
 
-_STATE_FIELDS = frozenset(
-    (
+def _check_field(name: str) -> None:
+    if name not in mujoco.batch.DATA_FIELDS:
+        raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
+
+
+_STATE_FIELDS = (
         "time", "qpos", "qvel", "act", "history", "qacc_warmstart", "plugin_state", "ctrl", "qfrc_applied",
         "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata",
-    )
 )  # fmt: skip

@@ -64,7 +64,7 @@ def pictures(
                 _paint(model, channel, (values or {})[channel.name][frame])
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, _free(camera))
+            renderer.update_scene(data, aimed(mujoco.MjvCamera(), camera))
             _backdrop(renderer.scene, model)
             yield _halved(renderer.render())
 
@@ -78,10 +78,7 @@ def beside(scene: Scene) -> Camera:
 def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)) -> mujoco.MjModel:
     """A copy of a model with bright light, and fog of the background's colour; its physics is the same.
 
-    Args:
-      model: that is copied.
-      distance: of the camera from what it looks at [m].
-      size: of the pictures [pixels].
+    For a camera at that distance from what it looks at [m], and pictures of that size [pixels].
     """
     model = copy.copy(model)
     look = model.vis
@@ -109,11 +106,11 @@ def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
         ) from None
 
 
-def _free(camera: Camera) -> mujoco.MjvCamera:
-    free = mujoco.MjvCamera()
-    free.lookat[:] = camera.lookat
-    free.distance, free.azimuth, free.elevation = camera.distance, camera.azimuth, camera.elevation
-    return free
+def aimed(view: mujoco.MjvCamera, camera: Camera) -> mujoco.MjvCamera:
+    """MuJoCo's free camera, looking from this point of view."""
+    view.lookat[:] = camera.lookat
+    view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
+    return view
 
 
 def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:

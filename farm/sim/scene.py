@@ -11,9 +11,6 @@ import numpy as np
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError, brief
 
-STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-"""What a simulator state holds: everything that the next step depends on, as mujoco.batch keeps it."""
-
 BESIDE: Final = (106.0, -25.0)
 """Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots walk along x."""
 
@@ -104,11 +101,7 @@ class Scene:
         return sum(int(kind) not in _SHAPES for kind in self.model.geom_type)
 
     def index(self, body: str) -> int:
-        """Index among `bodies` of the body with this name in the model.
-
-        Raises:
-          ConfigError: no such body, or it has no geometry.
-        """
+        """Index among `bodies` of the body with this name in the model; a ConfigError where it has no geometry."""
         name = _name(body, body)
         if name not in self.bodies:
             raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
@@ -133,20 +126,20 @@ class Scene:
 
     def geometries(self) -> list[Geometry]:
         """Every primitive to draw; meshes and height fields are left out."""
-        names = dict(zip(self._drawn, self.bodies, strict=True))
-        return [self._geometry(i, names) for i in range(self.model.ngeom) if int(self.model.geom_type[i]) in _SHAPES]
-
-    def _geometry(self, i: int, bodies: dict[int, str]) -> Geometry:
-        geom = self.model.geom(i)
-        return Geometry(
-            name=_name(geom.name, f"geom_{i}"),
-            body=bodies[int(geom.bodyid[0])],
-            shape=_SHAPES[mujoco.mjtGeom(int(geom.type[0]))],
-            size=tuple(geom.size.tolist()),
-            position=tuple(geom.pos.tolist()),
-            quaternion=tuple(geom.quat.tolist()),
-            colour=tuple(self._colour(i).tolist()),
-        )
+        bodies = dict(zip(self._drawn, self.bodies, strict=True))
+        geoms = [self.model.geom(i) for i in range(self.model.ngeom) if int(self.model.geom_type[i]) in _SHAPES]
+        return [
+            Geometry(
+                name=_name(geom.name, f"geom_{geom.id}"),
+                body=bodies[int(geom.bodyid[0])],
+                shape=_SHAPES[mujoco.mjtGeom(int(geom.type[0]))],
+                size=tuple(geom.size.tolist()),
+                position=tuple(geom.pos.tolist()),
+                quaternion=tuple(geom.quat.tolist()),
+                colour=tuple(self._colour(geom.id).tolist()),
+            )
+            for geom in geoms
+        ]
 
     def _colour(self, i: int) -> FloatArray:
         """A geometry's own colour, else its material's, as MuJoCo's renderer has it (4,)."""

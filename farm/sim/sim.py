@@ -37,43 +37,33 @@ class Engine(Protocol):
 
         Raises Rebound where its values are there only after the next call, AttributeError where there is none.
         """
-        ...
 
     def reset(self, ids: IntArray) -> None:
         """Bring rows to the model's own start."""
-        ...
 
     def step(self, ids: IntArray, count: int) -> None:
         """Advance rows by physics steps."""
-        ...
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:
         """Advance rows by one physics step for each of their controls, (n, steps, nu)."""
-        ...
 
     def forward(self, ids: IntArray) -> None:
         """Compute the outputs of rows from their states."""
-        ...
 
     def copy(self, sources: IntArray) -> None:
         """Give row i the state of row sources[i]; rows are never copied downwards onto later sources."""
-        ...
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number, (n,)."""
-        ...
 
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row, live, (size, ...)."""
-        ...
 
     def set_const(self, ids: IntArray) -> None:
         """Have derived constants follow what was written into expanded fields."""
-        ...
 
     def close(self) -> None:
         """Give back what it holds."""
-        ...
 
 
 class Backend(Protocol):
@@ -84,7 +74,6 @@ class Backend(Protocol):
 
     def engine(self, model: mujoco.MjModel) -> Engine:
         """Make room for a model's simulations."""
-        ...
 
 
 _ATTRIBUTES = ("engine", "own", "t")
@@ -168,11 +157,13 @@ class Sim:
                 got = f"shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
                 raise TaskError(f"sim.own[{name!r}] is {got}; expected an array of shape ({len(self)}, ...)")
         self._dirty = bool(self._expanded)  # somebody may have written since outputs were read
-        self._constants()
+        shared = len(sources) != len(self._ids) or (sources != self._ids).any()
+        if not (shared and self._stepped):
+            self._constants()
         if not self._stepped:
             self.engine.forward(self._ids)
         self._live = False
-        if len(sources) == len(self._ids) and (sources == self._ids).all():
+        if not shared:
             return
         self._ids = np.arange(len(sources))
         self.engine.copy(sources)
@@ -180,13 +171,14 @@ class Sim:
             values[: len(sources)] = values[sources]
         if self._expanded:
             self.engine.set_const(self._ids)
+            self._dirty = False
         self.own = {name: values[sources] for name, values in self.own.items()}
         self._source = sources
 
     def expand(self, name: str) -> AnyArray:
         """A field of MjModel with a value for each rollout, (B, ...); read-only once they are prepared."""
         if name not in self._expanded:
-            self._nominal[name] = np.array(_own_value(self.model, name))
+            self._nominal[name] = np.array(own_value(self.model, name))
             self._expanded[name] = self.engine.expand(name)
         if not self._live:
             values = self._expanded[name][self._ids]
@@ -237,7 +229,8 @@ class Sim:
             self._dirty = False
 
 
-def _own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a number or an array
+def own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a number or an array
+    """A field of the model, or (opt.NAME) of its options."""
     return getattr(model.opt, name.removeprefix("opt.")) if name.startswith("opt.") else getattr(model, name)
 
 

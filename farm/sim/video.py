@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from farm.errors import ConfigError, RunError
+from farm.errors import ConfigError, writing
 from farm.sim.rendering import Picture
 
 FRAMES: Final = 30
@@ -21,11 +21,7 @@ _COLOURS: Final = 256  # of a gif
 
 
 def check(path: Path) -> None:
-    """Check that a video can be written there.
-
-    Raises:
-      ConfigError: unknown suffix, missing package, or no such folder.
-    """
+    """Check that a video can be written there: a ConfigError says what of suffix, package or folder is wrong."""
     if path.suffix not in _NEEDS:
         raise ConfigError(f"--video {path}: expected a name that ends in {' or '.join(_NEEDS)}")
     package, name = _NEEDS[path.suffix]
@@ -55,10 +51,8 @@ def write(path: Path, pictures: Iterable[Picture]) -> None:
     Raises:
       RunError: the file cannot be written.
     """
-    try:
+    with writing(path):
         (_gif if path.suffix == ".gif" else _mp4)(path, list(pictures))
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror or error}") from None
 
 
 def _gif(path: Path, pictures: list[Picture]) -> None:

@@ -12,6 +12,7 @@ import mujoco.viewer
 from farm.errors import RunError
 from farm.sim.channels import Camera
 from farm.sim.engines import DataEngine
+from farm.sim.rendering import aimed
 from farm.sim.sim import Sim
 
 _CLOSING: Final = 10.0  # [s]
@@ -51,8 +52,10 @@ def watch(
     engine = DataEngine(model)
     played = 0
     with mujoco.viewer.launch_passive(model, engine.data, show_left_ui=False, show_right_ui=False) as viewer:
-        _look(viewer, camera)
-        clock = _Clock(viewer, engine.data, wait, speed, float(model.opt.timestep))
+        if camera is not None:
+            with viewer.lock():
+                aimed(viewer.cam, camera)
+        clock = _Clock(viewer, engine.data, wait, float(model.opt.timestep) / speed)
         engine.pace = clock.step
         while clock.going:
             steps = play(Sim(engine))
@@ -67,31 +70,13 @@ def watch(
     return played
 
 
-def _look(viewer: mujoco.viewer.Handle, camera: Camera | None) -> None:
-    if camera is None:
-        return
-    with viewer.lock():
-        viewer.cam.lookat[:] = camera.lookat
-        viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = (
-            camera.distance,
-            camera.azimuth,
-            camera.elevation,
-        )
-
-
 class _Clock:
     """Steps the physics at the speed that is wanted, with the mouse's pushes."""
 
     def __init__(
-        self,
-        viewer: mujoco.viewer.Handle,
-        data: mujoco.MjData,
-        wait: Callable[[float], bool],
-        speed: float,
-        step: float,
+        self, viewer: mujoco.viewer.Handle, data: mujoco.MjData, wait: Callable[[float], bool], period: float
     ) -> None:
-        self._viewer, self._data, self._wait = viewer, data, wait
-        self._period = step / speed
+        self._viewer, self._data, self._wait, self._period = viewer, data, wait, period
         self._next = time.monotonic()
         self.going = True
 
@@ -110,11 +95,7 @@ class _Clock:
 
 
 def _check_window() -> None:
-    """Check that a window can be opened: the viewer's own thread would fail without a word.
-
-    Raises:
-      RunError: it cannot.
-    """
+    """Check that a window can be opened: the viewer's own thread would fail without a word."""
     import glfw
 
     with warnings.catch_warnings(record=True) as said:

@@ -30,6 +30,8 @@ class TaskConfig(Settings):
     """Discount factor of the return, per control step."""
     perturb: bool = True
     """Train on random starts and conditions (both rollouts of a pair alike)."""
+    reward_offset: float = setting(0.0, least=-1e6, most=1e6)
+    """Added to the reward of every control step that is learnt from: -1 takes off a bonus of 1 for not falling."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,6 +122,8 @@ class Task:
     """Settings that runs begin with, by preset and flag; the first is the one that is taken unless told otherwise."""
     return_scale: float = 1.0
     """Factor of the return."""
+    parts: tuple[int, ...] = ()
+    """Sizes of the observation's parts where they differ in kind; empty: it is one."""
     takes: ClassVar[str] = ""
     """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
 

@@ -1,12 +1,15 @@
 """MuJoCo environments of Gymnasium as tasks, by name: `--task gym:Swimmer-v5`. A door to gymnasium.
 
 Only registered names are taken: one that names a module to import (`module:Name-v0`) is refused. An environment
-steps its own simulation, so this task brings an engine of its own.
+steps its own simulation, so this task brings an engine of its own; those of `gymnasium_batched.py` are stepped in a
+batch by the backend, with the same numbers.
 """
 
+import json
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -17,7 +20,8 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.sim.scene import quiet
 from farm.sim.sim import Engine, MakeEngine, Sim
-from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec, rescaled
+from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec, rescaled
+from farm.tasks.gymnasium_batched import batched
 
 if TYPE_CHECKING:
     import gymnasium
@@ -26,6 +30,11 @@ NOMINAL: Final = 0
 """Seed of the reset under nominal conditions."""
 
 _NAME: Final = re.compile(r"([\w.-]{1,60}/)?[\w.-]{1,60}-v\d{1,4}", re.ASCII)
+_REFUSED: Final[Mapping[str, str]] = {
+    "render_mode": "farm replay and farm play show rollouts",
+    "xml_file": "a file does not travel to workers",
+    "max_episode_steps": "--steps shortens rollouts",
+}
 _LIMIT: Final = 100_000  # numbers of an observation
 _ROWS: Final = 16  # environments that are stepped in turn
 _UNSTABLE: Final = (
@@ -35,9 +44,48 @@ _UNSTABLE: Final = (
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentConfig(TaskConfig):
+    """Settings of an environment."""
+
+    env_arg: tuple[str, ...] = ()
+    """Keyword argument of the environment, repeatable: NAME=VALUE as in JSON (terminate_when_unhealthy=false)."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        names = [_argument(said)[0] for said in self.env_arg]
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigError(f"env-arg: {name} is given twice")
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Keyword arguments of the environment."""
+        return dict(_argument(said) for said in self.env_arg)
+
+
+def _argument(said: object) -> tuple[str, Any]:
+    """Name and value of NAME=VALUE."""
+    name, equals, text = said.partition("=") if isinstance(said, str) else ("", "", "")
+    if not (name.isidentifier() and equals):
+        raise ConfigError(
+            f"env-arg is {str(said)[:80]!r}; expected NAME=VALUE, for example terminate_when_unhealthy=false"
+        )
+    if name in _REFUSED:
+        raise ConfigError(f"env-arg {name} is not taken: {_REFUSED[name]}")
+    try:
+        return name, json.loads(text)
+    except (ValueError, RecursionError):
+        raise ConfigError(
+            f"env-arg {name} is {text[:80]!r}; expected a value of JSON (texts in double quotes)"
+        ) from None
+
+
 class Environment(Task):
     """A MuJoCo environment of Gymnasium: its own physics, observations and rewards."""
 
+    Config = EnvironmentConfig
     takes = "NAME"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
@@ -59,13 +107,15 @@ class Environment(Task):
         if not _NAME.fullmatch(variant):
             raise ConfigError(f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN")
         self.steps = self._horizon()
+        self.batched = batched(self._first)
+        if self.batched is not None:
+            self.substeps = self.batched.env.frame_skip
 
     @cached_property
     def _first(self) -> "gymnasium.Env[Any, Any]":
-        return make(self.variant)
+        return make(self.variant, **self.config.arguments)
 
     def _horizon(self) -> int:
-        """Control steps of a rollout."""
         wanted, _ = self.config.steps, self._first  # made first: it says what is wrong with the name
         import gymnasium
 
@@ -82,11 +132,7 @@ class Environment(Task):
         return model
 
     def mjcf(self) -> str:
-        """An environment has no text of its own.
-
-        Raises:
-          ConfigError: always.
-        """
+        """An environment has no text of its own: always a ConfigError."""
         raise ConfigError(f"gym:{self.variant} is made by gymnasium: there is no MJCF text to export")
 
     @property
@@ -110,37 +156,48 @@ class Environment(Task):
             release=f"gymnasium {gymnasium.__version__}",
         )  # fmt: skip
 
-    def engine(self, backend: MakeEngine) -> Engine:  # noqa: ARG002  an environment has its own physics
-        """Environments that step themselves."""
-        return EnvironmentEngine(self.variant)
+    def engine(self, backend: MakeEngine) -> Engine:
+        """The backend's, or environments that step themselves."""
+        if self.batched is not None:
+            return backend(self.model)
+        return EnvironmentEngine(self.variant, **self.config.arguments)
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
         """Reset each environment with a seed of its own."""
-        assert isinstance(sim.engine, EnvironmentEngine)
         for row, rng in enumerate(rngs):
-            sim.engine.seed(row, reset_seed(rng))
+            seed = reset_seed(rng)
+            if self.batched is None:
+                assert isinstance(sim.engine, EnvironmentEngine)
+                sim.engine.seed(row, seed)
+            else:  # Gymnasium makes its generators so
+                sim.qpos[row], sim.qvel[row] = self.batched.start(np.random.default_rng(seed))
 
     def observe(self, sim: Sim) -> FloatArray:
         """The environment's observation, (B, d)."""
-        values: FloatArray = sim.observation
+        values: FloatArray = sim.observation if self.batched is None else self.batched.observe(sim)
         return values
 
-    def act(self, sim: Sim, action: FloatArray) -> FloatArray:  # noqa: ARG002
-        """Actions rescaled to the environment's bounds, (B, A)."""
-        return rescaled(action, *self.limits)
+    def act(self, sim: Sim, action: FloatArray) -> FloatArray:
+        """Actions rescaled to the environment's bounds and rounded to its precision, (B, A)."""
+        if self.batched is not None:
+            sim.own["before"] = np.array(sim.qpos)
+        return rescaled(action, *self.limits).astype(self._first.action_space.dtype).astype(float)
 
     def reward(self, sim: Sim, action: FloatArray) -> FloatArray:  # noqa: ARG002
         """The environment's reward, (B,)."""
-        values: FloatArray = sim.reward
-        return values
+        if self.batched is None:
+            values: FloatArray = sim.reward
+            return values
+        with np.errstate(all="ignore"):  # of a state that has blown up
+            return self.batched.reward(sim, sim.own["before"])
 
     def ended(self, sim: Sim) -> BoolArray:
         """Where the environment terminated, (B,)."""
-        return np.asarray(sim.terminated)
+        return np.asarray(sim.terminated) if self.batched is None else self.batched.ended(sim)
 
 
-def make(name: str) -> "gymnasium.Env[Any, Any]":
-    """The environment of that name, without a time limit of its own.
+def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN401  whatever it takes
+    """The environment of that name, made with these arguments, without a time limit of its own.
 
     Raises:
       ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
@@ -154,7 +211,10 @@ def make(name: str) -> "gymnasium.Env[Any, Any]":
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is a newer version, mostly
-            env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True)
+            env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **arguments)
+            if arguments:  # a value that it cannot do with shows when it acts
+                env.reset(seed=NOMINAL)
+                env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
     except Exception as error:  # whatever an environment may raise
         raise ConfigError(f"task gym:{name}: {' '.join(str(error).split())}") from None
     space, actions = env.observation_space, env.action_space
@@ -171,11 +231,11 @@ def make(name: str) -> "gymnasium.Env[Any, Any]":
 class EnvironmentEngine:
     """Environments side by side, one for each row; each steps its own simulation."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, **arguments: Any) -> None:  # noqa: ANN401  whatever an environment takes
         """Make the first; others follow as they are needed."""
         self.size = _ROWS
-        self._name = name
-        self._envs = [make(name)]
+        self._name, self._arguments = name, arguments
+        self._envs = [make(name, **arguments)]
         first: Any = self._envs[0]
         self.model: mujoco.MjModel = first.unwrapped.model
         self._kind = first.action_space.dtype
@@ -198,7 +258,7 @@ class EnvironmentEngine:
     def reset(self, ids: IntArray) -> None:
         """Make as many environments as there are rows; `seed` resets them."""
         while len(self._envs) < len(ids):
-            self._envs.append(make(self._name))
+            self._envs.append(make(self._name, **self._arguments))
 
     def seed(self, row: int, seed: int) -> None:
         """Reset an environment to the start that a seed gives."""

@@ -6,13 +6,14 @@ order, or threads. They equal, bit for bit, those of one rollout at a time in a 
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, TaskError
+from farm.moments import Moments
 from farm.sim.channels import Camera
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import Scene, quiet
@@ -63,6 +64,8 @@ class Rollouts:
     """What was measured at the start, and qpos, (B, ...)."""
     frames: Mapping[str, FloatArray]
     """And in every frame, zero after the end, (B, F, ...)."""
+    moments: FloatArray
+    """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) where they were not asked for."""
 
     @property
     def flags(self) -> BoolArray:
@@ -115,18 +118,23 @@ class Batch:
         task, sim, t = self.task, self.sim, self.sim.t
         if self._actions is None:
             self._actions = np.zeros((len(self._steps), task.steps, action.shape[1]))
-        self._actions[self.active, t] = action
+        rows = self._rows()
+        self._actions[rows, t] = action
         sim.control(_array("act", task.act(sim, action), (len(sim), sim.model.nu)))
         for part in range(self._parts):
             sim.step(self._substeps)
             for name, values in self._measured().items():
-                self._frames[name][self.active, t * self._parts + part] = values
+                self._frames[name][rows, t * self._parts + part] = values
         sim.t += 1
         failed = sim.blown_up()
         self._reward(action, t, failed)
         ended = task.ended(sim)
         ended = np.zeros(len(sim), dtype=bool) if ended is None else _array("ended", ended, (len(sim),)).astype(bool)
         self._conclude(failed, ended & ~failed, t)
+
+    def _rows(self) -> slice | IntArray:
+        """The rollouts still going; a slice is the fastest where they are all."""
+        return slice(None) if len(self.active) == len(self._steps) else self.active
 
     def _measured(self) -> dict[str, FloatArray]:
         """What is kept of this frame, (n, ...) each."""
@@ -154,7 +162,7 @@ class Batch:
         if not np.isfinite(values).all():
             bad = next(n for n, column in zip(terms, values.T, strict=True) if not np.isfinite(column).all())
             raise TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine")
-        self._terms[self.active, t] = values
+        self._terms[self._rows(), t] = values
 
     def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
         """Let go of the rollouts that are over; the last step is the end of all."""
@@ -201,29 +209,51 @@ class Batch:
         return Rollouts(
             returns=returns, success=np.zeros(len(returns), dtype=bool) if success is None else success,
             ended=self._ended, failed=self._failed, clamped=clamped, steps=self._steps, terms=terms,
-            actions=record.actions, start=self._start, frames=self._frames,
+            actions=record.actions, start=self._start, frames=self._frames, moments=np.empty((len(returns), 0)),
         )  # fmt: skip
 
 
-def run(task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], every: int = 0) -> Rollouts:
-    """Run rollouts of parameters theta (B, P) to their ends; as many at a time as the engine takes."""
+def run(
+    task: Task,
+    policy: Acts,
+    sim: Sim,
+    theta: FloatArray,
+    seeds: Sequence[Seed],
+    every: int = 0,
+    *,
+    moments: bool = False,
+) -> Rollouts:
+    """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes; perhaps with the
+    moments of their observations."""  # noqa: D205, D209
     size, parts = sim.engine.size, []
     for first in range(0, len(theta), size):
         rows = slice(first, first + size)
-        parts.append(again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every)))
+        parts.append(again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every, moments)))
     return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
 
 
-def _run(task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], every: int) -> Rollouts:
-    batch = Batch(task, sim, seeds, every)
+def _run(
+    task: Task,
+    policy: Acts,
+    sim: Sim,
+    theta: FloatArray,
+    seeds: Sequence[Seed],
+    every: int,
+    moments: bool,
+) -> Rollouts:
+    batch, seen = Batch(task, sim, seeds, every), None
     all_prepared = prepared = policy.prepare(theta)
     while not batch.over:
         if len(batch.active) < len(prepared):
             prepared = all_prepared[batch.active]
-        action = policy.act(prepared, batch.observe())
+        x = batch.observe()
+        if moments:
+            seen = seen or Moments(len(seeds), x.shape[1])
+            seen.add(batch.active, x)
+        action = policy.act(prepared, x)
         columns = np.shape(action)[1:2] or (sim.model.nu,)
         batch.step(_array("act of the policy", action, (len(batch.active), *columns)))
-    return batch.rollouts()
+    return batch.rollouts() if seen is None else replace(batch.rollouts(), moments=seen.table)
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  what `doing` gives

@@ -7,7 +7,7 @@ handed to the algorithm, the recorder or a checkpoint is the same afterwards.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
@@ -112,6 +112,19 @@ def _scalar(name: str, value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, float | int) or not np.isfinite(value):
         raise ValueError(f"state: {name} must be a finite number or None, not {value!r}")
     return float(value)
+
+
+def moved(state: S, returns: FloatArray, **arrays: FloatArray) -> S:
+    """The state one generation on, with some of its arrays new, and the best of these returns noted.
+
+    Raises:
+      Diverged: an array is not finite, or a sigma is not positive.
+    """
+    for name, values in arrays.items():
+        if not np.isfinite(values).all() or (name == "sigma" and not (values > 0.0).all()):
+            raise Diverged(f"the update after generation {state.generation} is not finite")
+    best = float(returns.max()) if state.best is None else max(state.best, float(returns.max()))
+    return replace(state, **arrays, best=best, generation=state.generation + 1)
 
 
 def finite_rows(name: str, array: FloatArray, shape: tuple[int, ...]) -> FloatArray:

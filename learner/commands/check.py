@@ -1,23 +1,28 @@
 """`farm check`: tells the author of a task in seconds what is wrong with it."""
 
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
 
 from farm import plugins, seeds, settings
 from farm.arrays import FloatArray
+from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError, TaskError
 from farm.tasks.base import TaskConfig
 from learner import config as configs
 from learner.commands.replay import ReplayCommand
 from learner.commands.run import RunCommand
-from learner.config import RunConfig, plugin_path
+from learner.config import RunConfig
+
+if TYPE_CHECKING:
+    from farm.tasks.loop import Rollouts
+    from learner.setup import Problem
 
 ROWS = 8
 """Rollouts that are compared."""
@@ -39,15 +44,14 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
     name = _name(words)
-    own = None if name is None else configs.configure(plugin_path("tasks", name))
+    own = None if name is None else configs.configure(plugins.find("tasks", name).name)
     default = CheckCommand(name=tyro.MISSING, task=own.task_config if own else TaskConfig())
     command = settings.parse(CheckCommand, words, "farm check", default)
     assert own is not None
     settings.distinct(RunCommand(run=own), "farm run")
     settings.distinct(ReplayCommand(run=Path(), task=own.task_config), "farm replay")
     for line in checked(replace(own, task_config=command.task), command.picture):
-        sys.stdout.write(f"{line}\n")
-        sys.stdout.flush()
+        say(line)
     return 0
 
 
@@ -59,11 +63,7 @@ def _name(words: Sequence[str]) -> str | None:
 
 
 def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
-    """Lines about a task, as they are found out.
-
-    Raises:
-      TaskError: rollouts depend on their batch, or an array is wrong.
-    """
+    """Lines about a task, as they are found out; a TaskError where rollouts depend on their batch."""
     from learner.setup import problem
 
     found = problem(config)
@@ -96,20 +96,15 @@ def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
     yield _picture(found, together.start["qpos"][0], picture)
 
 
-def _arrays(rollouts: object) -> dict[str, FloatArray]:
+def _arrays(rollouts: "Rollouts") -> dict[str, FloatArray]:
     """Everything that must not depend on the batch, the earliest cause first."""
-    start, frames = (getattr(rollouts, name) for name in ("start", "frames"))
-    out = {f"{name} at the start": values for name, values in start.items()}
-    out |= {"actions": getattr(rollouts, "actions"), **frames}  # noqa: B009  by name like the others
+    out = {f"{name} at the start": values for name, values in rollouts.start.items()}
+    out |= {"actions": rollouts.actions, **rollouts.frames}
     return out | {name: getattr(rollouts, name) for name in ("terms", "returns", "success", "ended")}
 
 
 def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str) -> None:
-    """Compare arrays bit for bit.
-
-    Raises:
-      TaskError: names the first that differs.
-    """
+    """Compare arrays bit for bit."""
     for name, values in first.items():
         if values.tobytes() != np.ascontiguousarray(second[name]).tobytes():
             most = np.abs(np.asarray(values, float) - np.asarray(second[name], float)).max()
@@ -119,12 +114,10 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
             )
 
 
-def _picture(found: object, qpos: FloatArray, path: Path | None) -> str:
+def _picture(found: "Problem", qpos: FloatArray, path: Path | None) -> str:
     """Draw the start, and say where."""
     from farm.sim import rendering
-    from learner.setup import Problem
 
-    assert isinstance(found, Problem)
     target = path or Path(f"{type(found.task).__name__.lower()}.png")
     if target.suffix != ".png":
         raise ConfigError(f"--picture {target}: expected a name that ends in .png")

@@ -1,16 +1,18 @@
 """`farm compare`: several runs in one recording."""
 
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from farm import settings as arguments
-from farm.errors import ConfigError, RunError
-from learner import comparison
+from farm.commands.logs import say
+from farm.errors import ConfigError, writing
+from farm.net.stats import GenerationStats
 from learner.commands import recordings, view
+from learner.config import RunConfig, flat, preset_of
 from learner.replay import loaded
 from learner.run import check_rerun
 from learner.run_folder import RunFolder
@@ -33,24 +35,94 @@ def main(words: Sequence[str]) -> int:
     command = arguments.parse(CompareCommand, words, "farm compare")
     check_rerun()
     from learner.recording.comparison import COLOURS, Shown, record_comparison
+    from learner.recording.drawing import Drawing
 
     if not 2 <= len(command.runs) <= len(COLOURS):
         raise ConfigError(f"{len(command.runs)} runs to compare; expected 2 to {len(COLOURS)}")
     recordings.target(command.to)
     folders = [RunFolder.open(path) for path in command.runs]
-    runs = comparison.read(folders)
+    runs = read(folders)
     shown = []
     for folder, run in zip(folders, runs, strict=True):
         policy = loaded(folder)
-        found, final = policy.problem, policy.rollout().trajectory
-        shown.append(Shown(run.name, found.scene, found.spec, run.progress, final, found.task.camera))
-    try:
-        record_comparison(command.to, shown, comparison.table(runs))
-    except OSError as error:
-        raise RunError(f"cannot write {command.to}: {error.strerror}") from None
-    sys.stdout.write(f"written to {command.to}; look at it with: farm view {command.to}\n")
-    sys.stdout.flush()
+        shown.append(Shown(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
+    with writing(command.to):
+        record_comparison(command.to, shown, table(runs))
+    say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.view:
         view.check_display(str(command.to))
         return view.show([str(command.to)])
     return 0
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One of the runs."""
+
+    name: str
+    """Its own among them."""
+    config: RunConfig
+    progress: Sequence[GenerationStats]
+    summary: Mapping[str, Any]
+    """Empty as long as there is none."""
+
+
+def read(folders: Sequence[RunFolder]) -> list[Compared]:
+    """What the folders say; a ConfigError where one has no generation behind it."""
+    runs = []
+    for name, folder in zip(names([folder.path for folder in folders]), folders, strict=True):
+        progress = folder.progress()
+        if not progress:
+            raise ConfigError(f"the run in {folder.path} has no generation behind it: nothing to compare")
+        runs.append(Compared(name, folder.read_config(), progress, folder.read_summary() or {}))
+    return runs
+
+
+def names(paths: Sequence[Path]) -> list[str]:
+    """A name for each folder, once each: its own, with those of folders above it as long as two are alike."""
+    whole = [path.resolve() for path in paths]
+    for path, given in zip(whole, paths, strict=True):
+        if whole.count(path) > 1:
+            raise ConfigError(f"{given} is there twice; each run once")
+    depth = 1
+    while len({path.parts[-depth:] for path in whole}) < len(whole):
+        depth += 1
+    return ["/".join(path.parts[-depth:]) for path in whole]
+
+
+def table(runs: Sequence[Compared]) -> str:
+    """A table of the runs, Markdown: a column each; settings that are the same everywhere are left out."""
+    rows = [("", *(f"**{run.name}**" for run in runs)), *_results(runs), *_settings(runs)]
+    first, *rest = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([first, f"|{'---|' * (len(runs) + 1)}", *rest])
+
+
+def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
+    yield "preset", *(preset_of(run.config) for run in runs)
+    tables = [flat(run.config) for run in runs]
+    for name in dict.fromkeys(name for table in tables for name in table):
+        values = [table[name] for table in tables if name in table]
+        if any(value != values[0] for value in values):
+            yield name, *(str(table.get(name, "-")) for table in tables)
+
+
+def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
+
+    def said(key: str, form: str) -> tuple[str, ...]:
+        values = [run.summary.get(key) for run in runs]
+        return tuple("-" if value is None else format(value, form) for value in values)
+
+    yield "generations done", *(str(run.progress[-1].generation) for run in runs)
+    yield "rollouts", *(str(run.progress[-1].rollouts) for run in runs)
+    yield "return of the final policy", *said("mean_policy_return", ".3f")
+    success = {True: "yes", False: "no", None: "-"}
+    yield "it succeeds", *(success[run.summary.get("mean_policy_success")] for run in runs)
+    yield "robust success", *said("robust_success_rate", ".0%")
+    yield "first success, generation", *(_first_success(run.progress) for run in runs)
+    yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)
+    yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)
+
+
+def _first_success(progress: Sequence[GenerationStats]) -> str:
+    """After how many updates the mean policy first succeeded."""
+    return next((str(p.generation - 1) for p in progress if p.mean_policy_success), "-")

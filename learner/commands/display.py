@@ -2,7 +2,6 @@
 
 import json
 import logging
-import sys
 from collections.abc import Sequence
 from typing import Final, Literal
 
@@ -13,6 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from farm.commands.logs import Formatter, say
+from farm.commands.screen import plain
 from farm.net.telemetry import WorkerStatus
 from learner import config as configs
 from learner.run import Run
@@ -30,7 +31,6 @@ class Display:
     """Shows a run while it is entered, and how it ended after that; this one shows nothing before."""
 
     def __enter__(self) -> "Display":
-        """Begin."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -41,7 +41,7 @@ class Display:
 
     def conclude(self, lines: Sequence[str]) -> None:
         """The run is over; the lines say how it went and what to do next."""
-        _write(lines)
+        say(*lines)
 
 
 def display(run: Run, announcement: Sequence[str], style: Style) -> Display:
@@ -58,21 +58,18 @@ class PlainDisplay(Display):
     """One line per generation."""
 
     def __init__(self, run: Run, announcement: Sequence[str]) -> None:
-        """Say what begins."""
         self._generations = run.learner.config.generations
-        _write(announcement)
+        say(*announcement)
 
     def show(self, report: Report) -> None:
         """Write the line."""
         p, success = report.progress, ""
         if p.success_rate is not None:
             success = f" {'success' if p.mean_policy_success else '-':7}  success {p.success_rate:4.0%}"
-        _write(
-            [
-                f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
-                f"  return {p.return_mean:8.3f}  mean policy {p.mean_policy_return:8.3f}"
-                f"{success}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
-            ]
+        say(
+            f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
+            f"  return {p.return_mean:8.3f}  mean policy {p.mean_policy_return:8.3f}"
+            f"{success}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
         )
 
 
@@ -80,7 +77,6 @@ class JsonDisplay(Display):
     """One JSON object per line: the run, each generation as in progress.jsonl, at last the summary."""
 
     def __init__(self, run: Run) -> None:
-        """Say what begins."""
         self._run = run
         folder = str(run.learner.folder.path)
         self._say("run", {"folder": folder, "live": run.live, "config": configs.to_dict(run.learner.config)})
@@ -94,22 +90,22 @@ class JsonDisplay(Display):
         self._say("summary", self._run.summary)
 
     def _say(self, event: str, values: dict[str, object]) -> None:
-        _write([json.dumps({"event": event, **values})])
+        say(json.dumps({"event": event, **values}))
 
 
 class LiveDisplay(Display):
     """Returns, sigma, workers, recording and a progress bar, refreshed in place; messages scroll above."""
 
     def __init__(self, console: Console, run: Run, announcement: Sequence[str]) -> None:
-        """Say what begins, and prepare the screen."""
         self._run, self._console = run, console
-        _write(announcement)
+        say(*announcement)
         columns = BarColumn(None), MofNCompleteColumn(), TextColumn("time left"), TimeRemainingColumn()
         self._bar = Progress(TextColumn("generation"), *columns, console=console, expand=True)
         done = run.learner.state.generation
         self._task = self._bar.add_task("", total=run.learner.config.generations, completed=done)
         self._live = Live(self._screen(None), console=console, refresh_per_second=8)
         self._handler = RichHandler(console=console, show_path=False, show_level=False)
+        self._handler.setFormatter(Formatter("%(message)s"))
         self._returns: list[float] = []
         self._before: list[logging.Handler] = []
 
@@ -125,7 +121,6 @@ class LiveDisplay(Display):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the last state on the terminal."""
         self._live.stop()
         logging.getLogger().removeHandler(self._handler)
         for handler in self._before:
@@ -145,33 +140,33 @@ class LiveDisplay(Display):
         p = report.progress
         table = _grid()
         table.add_row("return", f"{p.return_mean:.3f}", f"{p.return_min:.3f} to {p.return_max:.3f}, best {p.best:.3f}")
-        succeeds = _success(p.mean_policy_success)
-        table.add_row("mean policy", f"{p.mean_policy_return:.3f}", succeeds)
+        said = {True: Text("succeeds", "green"), False: Text("does not succeed", "yellow"), None: Text()}
+        table.add_row("mean policy", f"{p.mean_policy_return:.3f}", said[p.mean_policy_success])
         low, high = min(self._returns), max(self._returns)
         table.add_row("  so far", f"{low:.3f}", Text.assemble((spark(self._returns, _SPARK), "cyan"), f" {high:.3f}"))
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:
-            said = f"of the rollouts; {p.ended} ended early, {p.failed} failed"
-            table.add_row("success", f"{p.success_rate:.0%}", said)
+            lost = f"of the rollouts; {p.ended} ended early, {p.failed} failed"
+            table.add_row("success", f"{p.success_rate:.0%}", lost)
         table.add_row("sigma", f"{p.sigma_mean:.3f}", f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}")
         return table
 
     def _farm(self, report: Report) -> Table:
-        p, workers = report.progress, self._run.workers
+        p, workers = report.progress, self._run.farm.census()
         table = _grid()
         extra = f"; {p.reissued} jobs given out again" if p.reissued else ""
-        dropped = self._run.dropped
         table.add_row("farm", f"{report.rate:.0f}", f"rollouts/s, {p.workers} workers{extra}")
         for worker in workers[:_WORKERS]:
-            table.add_row("", f"{worker.rate:.0f}", Text(name(worker)))
+            table.add_row("", f"{worker.rate:.0f}", plain(name(worker)))
         if len(workers) > _WORKERS:
             table.add_row("", f"{sum(w.rate for w in workers[_WORKERS:]):.0f}", f"{len(workers) - _WORKERS} more")
-        if self._run.recorded:
+        if self._run.recording is not None:
+            dropped = self._run.recording.thread.dropped
             left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
-            table.add_row("recording", "", Text(f"farm view {self._run.learner.folder.path}{left_out}"))
+            table.add_row("recording", "", plain(f"farm view {self._run.learner.folder.path}{left_out}"))
         if self._run.live is not None:
-            table.add_row("live", "", f"farm view {self._run.live}")
+            table.add_row("live", "", plain(f"farm view {self._run.live}"))
         return table
 
 
@@ -191,20 +186,9 @@ def spark(values: Sequence[float], width: int) -> str:
     return "".join(_BLOCKS[int((v - low) / span * (len(_BLOCKS) - 1))] for v in chosen)
 
 
-def _success(success: bool | None) -> Text:
-    if success is None:
-        return Text()
-    return Text("succeeds", "green") if success else Text("does not succeed", "yellow")
-
-
 def _grid() -> Table:
     table = Table.grid(padding=(0, 2))
     table.add_column(min_width=11, style="bold")
     table.add_column(min_width=7, justify="right")
     table.add_column(no_wrap=True, overflow="ellipsis")
     return table
-
-
-def _write(lines: Sequence[str]) -> None:
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
-    sys.stdout.flush()

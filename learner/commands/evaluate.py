@@ -1,7 +1,6 @@
 """`farm evaluate`: the learnt mean policy on perturbed starts."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from farm import settings
+from farm.commands.logs import say
 from farm.seeds import SEEDS
 from farm.settings import Settings, setting
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
@@ -38,7 +38,7 @@ def main(words: Sequence[str]) -> int:
     command = settings.parse(EvaluateCommand, words, "farm evaluate")
     figures = evaluate(RunFolder.open(command.run), command.rollouts, command.seed)
     if command.json:
-        sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+        say(json.dumps(figures, indent=2))
         return 0
     table = Table(title=f"{figures['run']}, mean policy after generation {figures['generation']}")
     for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "ended early"):

@@ -1,6 +1,5 @@
-"""`farm export`: a learnt policy as one file for plain MuJoCo and numpy."""
+"""`farm export`: a learnt policy as one file, for plain MuJoCo and numpy or as an ONNX model."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,36 +7,36 @@ from pathlib import Path
 import tyro
 
 from farm import settings as arguments
+from farm.commands.logs import say
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from learner import export
+from learner import export, onnx
 from learner.replay import loaded
 from learner.run_folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportCommand(Settings):
-    """A learnt policy as one file for plain MuJoCo and numpy; docs/export.md says how to run it."""
+    """A learnt policy as a file, for MuJoCo and numpy or as an ONNX model; see docs/export.md."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: tyro.conf.Positional[Path]
-    """File to write: a name that ends in .npz."""
+    """File to write: .npz, with the task, for MuJoCo and numpy; .onnx, the policy alone."""
     generation: int | None = setting(None, least=0)
     """Generation whose mean policy is written, 0 for the first; None: the last."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
-        if self.to.suffix != ".npz":
-            raise ConfigError(f"{self.to}: expected a name that ends in .npz")
+        if self.to.suffix not in (".npz", ".onnx"):
+            raise ConfigError(f"{self.to}: expected a name that ends in .npz or .onnx")
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ExportCommand, words, "farm export")
     policy = loaded(RunFolder.open(command.run), command.generation)
-    export.write(command.to, policy)
+    (onnx if command.to.suffix == ".onnx" else export).write(command.to, policy)
     size = command.to.stat().st_size
-    sys.stdout.write(f"mean policy after generation {policy.generation} written to {command.to}, {size >> 10} KiB\n")
+    say(f"mean policy after generation {policy.generation} written to {command.to}, {size >> 10} KiB")
     return 0

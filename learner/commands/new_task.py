@@ -1,6 +1,5 @@
 """`farm new-task`: writes a task of your own to start from."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -9,7 +8,8 @@ from pathlib import Path
 import tyro
 
 from farm import settings
-from farm.errors import ConfigError
+from farm.commands.logs import say
+from farm.errors import ConfigError, writing
 
 TEMPLATE = "task_template.py.txt"
 """The file it writes, in this package; `Pendulum` stands for the name."""
@@ -30,12 +30,9 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"{name!r} is no name of a task; expected letters, digits and _, a letter first")
     path, inside = Path(f"{name}.py"), "".join(part.capitalize() for part in name.split("_"))
     text = (files("learner.commands") / TEMPLATE).read_text("utf-8").replace("Pendulum", inside)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise ConfigError(f"{path} exists and is not overwritten: take another name") from None
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
-    sys.stdout.write(f"written to {path}; next:\n  farm check {path}:{inside}\n  farm run --task {path}:{inside}\n")
+    if path.exists():
+        raise ConfigError(f"{path} exists and is not overwritten: take another name")
+    with writing(path, ConfigError), path.open("x", encoding="utf-8") as file:
+        file.write(text)
+    say(f"written to {path}; next:", f"  farm check {path}:{inside}", f"  farm run --task {path}:{inside}")
     return 0

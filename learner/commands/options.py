@@ -9,9 +9,10 @@ from farm import plugins, settings
 from farm.errors import ConfigError
 from farm.net import keys
 from farm.net.session import check_endpoint
+from farm.settings import setting
 from learner import config as configs
 from learner.commands.display import Style
-from learner.config import RunConfig, changes, plugin_path
+from learner.config import RunConfig
 from learner.run_folder import RunFolder
 
 
@@ -45,6 +46,8 @@ class LearnerOptions:
     """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
     mixed: bool = False
     """Admit workers whose machines round differently, and resume although code has changed: not repeatable."""
+    audit: float = setting(0.02, least=0.0, most=1.0)
+    """Part of the jobs that a second host does as well, where there is one: hosts that lie are expelled; 0: none."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     quiet: bool = False
@@ -60,7 +63,7 @@ class LearnerOptions:
         return "json" if self.json else "quiet" if self.quiet else "auto"
 
     def __post_init__(self) -> None:
-        """Check every value."""
+        settings.check(self)
         keys.checked("farm", self.farm)
         if self.name:
             keys.checked("run", self.name)
@@ -77,11 +80,7 @@ class LearnerOptions:
 
 
 def address(serve: str) -> tuple[str, int]:
-    """Host and port of [HOST:]PORT.
-
-    Raises:
-      ConfigError: it has another form.
-    """
+    """Host and port of [HOST:]PORT; a ConfigError where it has another form."""
     host, _, port = serve.rpartition(":")
     if not port.isdigit() or not 0 < int(port) < 65536:
         raise ConfigError(f"--serve {serve!r} is not of the form [HOST:]PORT, for example 9876")
@@ -121,16 +120,11 @@ def _value(words: Sequence[str], flag: str) -> str | None:
 
 
 def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
-    """Whether a run may go on with this configuration.
-
-    Raises:
-      ConfigError: a setting other than the number of generations has changed, or that one is too small.
-    """
-    changed = [change for change in changes(saved, wanted) if change[0] != "generations"]
-    if changed:
+    """Check that a run may go on with this configuration: only the number of generations may have grown."""
+    if changed := list(configs.other(saved, wanted)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
         raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may grow")
-    done = len(folder.progress())
+    done = max((stats.generation for stats in folder.progress()), default=0)
     if wanted.generations < done:
         raise ConfigError(f"--generations {wanted.generations}: the run has {done} behind it")
 
@@ -154,10 +148,11 @@ def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[s
 def _with_names(words: Sequence[str]) -> list[str]:
     """The words, with plug-ins in files named by their whole paths: a run can then be repeated from anywhere."""
     out = list(words)
-    for flag, kind in (("--task", "tasks"), ("--policy", "policies"), ("--algorithm", "algorithms")):
-        for i, word in enumerate(out):
-            if word == flag and i + 1 < len(out):
-                out[i + 1] = plugin_path(kind, out[i + 1])
-            elif word.startswith(f"{flag}="):
-                out[i] = f"{flag}={plugin_path(kind, word.partition('=')[2])}"
+    kinds = {"--task": "tasks", "--policy": "policies", "--algorithm": "algorithms"}
+    for i, word in enumerate(words):
+        flag, equals, value = word.partition("=")
+        if flag in kinds and equals:
+            out[i] = f"{flag}={plugins.find(kinds[flag], value).name}"
+        elif flag in kinds and i + 1 < len(out):
+            out[i + 1] = plugins.find(kinds[flag], out[i + 1]).name
     return out

@@ -1,30 +1,26 @@
 """`farm play`: the learnt policy in MuJoCo's interactive viewer."""
 
 import copy
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
 from farm import settings
 from farm.commands import logs
+from farm.commands.logs import say
 from farm.commands.screen import display
-from farm.commands.signals import stop_flag
+from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
 from farm.sim.engines import DataEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskConfig
 from farm.tasks.loop import Batch
-from learner.commands.learning import INTERRUPTED
 from learner.commands.replay import task_of
+from learner.replay import LoadedPolicy, loaded
 from learner.run_folder import RunFolder
-
-if TYPE_CHECKING:
-    from learner.replay import LoadedPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +44,6 @@ def main(words: Sequence[str]) -> int:
     own = task_of(words)
     default = PlayCommand(run=tyro.MISSING, task=own or TaskConfig())
     command = settings.parse(PlayCommand, words, "farm play", default)
-    from learner.replay import loaded
-
     policy = loaded(RunFolder.open(command.run), command.generation, command.task)
     if not display():
         raise ConfigError(
@@ -58,19 +52,19 @@ def main(words: Sequence[str]) -> int:
     from farm.sim.viewer import watch
 
     logs.set_up("WARNING")
-    _say(f"mean policy after generation {policy.generation}; double-click a body, then push it by Ctrl and drag")
+    say(f"mean policy after generation {policy.generation}; double-click a body, then push it by Ctrl and drag")
     task = policy.problem.task
     task.setup(Sim(DataEngine(task.model)))
     with stop_flag("ending") as stop:
         played = watch(
-            copy.copy(task.model), rollout(policy), stop.wait, _say, camera=task.camera, speed=command.speed,
+            copy.copy(task.model), rollout(policy), stop.wait, say, camera=task.camera, speed=command.speed,
             hold=command.hold,
         )  # fmt: skip
-    _say(f"{played} control steps played")
+    say(f"{played} control steps played")
     return INTERRUPTED if stop.is_set() else 0
 
 
-def rollout(policy: "LoadedPolicy") -> Callable[[Sim], int]:
+def rollout(policy: LoadedPolicy) -> Callable[[Sim], int]:
     """One nominal rollout in a simulation that is shown; control steps that it lasted."""
     found = policy.problem
     prepared = found.policy.prepare(policy.mu[None])
@@ -82,8 +76,3 @@ def rollout(policy: "LoadedPolicy") -> Callable[[Sim], int]:
         return sim.t
 
     return play
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()

@@ -1,7 +1,6 @@
 """`farm record`: a run's recording made on any machine, over the network."""
 
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -10,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from farm import settings as arguments
 from farm.commands import logs
+from farm.commands.logs import say
 from farm.commands.screen import display
-from farm.commands.signals import stop_flag
+from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError
 from farm.net import keys, session
 from farm.net.session import LISTEN
 from farm.net.tls import find
 from learner.commands import options, recordings
-from learner.commands.learning import INTERRUPTED
 from learner.run import check_rerun
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ class RecordCommand:
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
     def __post_init__(self) -> None:
-        """Check names and addresses."""
         keys.checked("farm", self.farm)
         if self.run:
             keys.checked("run", self.run)
@@ -80,16 +78,17 @@ def main(words: Sequence[str]) -> int:
         remote = record(command, stop.is_set)
     where = "" if remote.folder is None else f" in {remote.folder.path}"
     if remote.end is None:
-        sys.stdout.write(f"recorded up to generation {remote.done}{where}; the same command goes on\n")
+        say(f"recorded up to generation {remote.done}{where}; the same command goes on")
         return INTERRUPTED
-    sys.stdout.write(f"run over after generation {remote.done}, all recorded{where}\n")
+    say(f"run over after generation {remote.done}, all recorded{where}")
     if remote.folder is not None:
-        sys.stdout.write(f"look at it with: farm view {remote.folder.path}\n")
+        say(f"look at it with: farm view {remote.folder.path}")
     return 0
 
 
 def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
     """Follow a run to its end, or until stopped."""
+    from learner.recording.drawing import Drawing
     from learner.recording.remote import open_remote
     from learner.setup import problem
     from learner.telemetry.subscriber import Subscriber, find_run
@@ -103,18 +102,9 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
             follower = Subscriber(link, command.farm, run, command.allow_file)
             name, config, files = follower.begin(stopped)
             path = command.out / run if command.file else None
-            shown = problem(config, files=files)
-            remote = kept.enter_context(
-                open_remote(
-                    path,
-                    name=name,
-                    config=config,
-                    serve=command.address,
-                    spec=shown.spec,
-                    scene=shown.scene,
-                    camera=shown.task.camera,
-                )  # fmt: skip
-            )
+            drawing = Drawing.of(problem(config, files=files))
+            opened = open_remote(path, name=name, config=config, serve=command.address, drawing=drawing)
+            remote = kept.enter_context(opened)
             _announce(run, remote, spawn=command.spawn)
             remote.follow(follower, stopped)
         return remote
@@ -123,13 +113,11 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
 def _announce(run: str, remote: "Remote", *, spawn: bool) -> None:
     done = f", going on after generation {remote.done}" if remote.done else ""
     into = "" if remote.folder is None else f" into {remote.folder.path}"
-    sys.stdout.write(f"recording run {run}{into}{done}\n")
-    if remote.recording.uri is not None:
-        sys.stdout.write("".join(f"{line}\n" for line in recordings.look_on(remote.recording.uri)))
-    sys.stdout.flush()
-    if spawn and remote.recording.uri is not None:
+    uri = remote.recording.uri
+    say(f"recording run {run}{into}{done}", *([] if uri is None else recordings.look_on(uri)))
+    if spawn and uri is not None:
         # In a session of its own: the window stays when this ends, whoever looks closes it. A viewer listens, too.
         flags = ("--bind", "127.0.0.1", "--port", "auto")
-        from learner.recording.viewing import program
+        from learner.recording.files import program
 
-        subprocess.Popen([program(), remote.recording.uri, *flags], start_new_session=True)
+        subprocess.Popen([program(), uri, *flags], start_new_session=True)

@@ -21,11 +21,7 @@ def look_on(uri: str) -> list[str]:
 
 
 def sources(what: str) -> list[str]:
-    """What a viewer opens for a run's folder, a recording, or the address of a live stream.
-
-    Raises:
-      ConfigError: it is none of them.
-    """
+    """What a viewer opens for a run's folder, a recording, or the address of a live stream; else a ConfigError."""
     from learner.recording.files import parts
 
     if urlsplit(what).scheme in ("rerun", "rerun+http", "rerun+https"):
@@ -47,11 +43,7 @@ def sources(what: str) -> list[str]:
 
 
 def target(path: Path) -> Path:
-    """A file that a recording may be written to.
-
-    Raises:
-      ConfigError: it does not end in .rrd, or is a recording that its run goes on with.
-    """
+    """A file that a recording may be written to: it ends in .rrd, and no run goes on with it. Else a ConfigError."""
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
     own = path.name == "replay.rrd" or path.name.startswith("run.")

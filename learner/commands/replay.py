@@ -1,6 +1,5 @@
 """`farm replay`: any policy that a run stored again, at physics rate, into a recording and a video."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -9,8 +8,9 @@ from typing import TYPE_CHECKING
 import tyro
 
 from farm import settings
+from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
-from farm.errors import RunError
+from farm.errors import writing
 from farm.settings import Settings, setting
 from farm.tasks.base import TaskConfig
 from learner.commands import recordings
@@ -49,6 +49,10 @@ def main(words: Sequence[str]) -> int:
     from learner.run import check_rerun
 
     check_rerun()
+    from learner.recording.drawing import Drawing
+    from learner.recording.replay import record_replay
+    from learner.recording.run import markdown
+
     if command.video is not None:
         video.check(command.video)
     folder = RunFolder.open(command.run)
@@ -56,13 +60,17 @@ def main(words: Sequence[str]) -> int:
     policy = loaded(folder, command.generation, command.task)
     shown = policy.rollout()
     changed = differing(own or command.task, command.task)
-    _record(policy, shown, folder, path, changed)
+    name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
+    with writing(path):
+        record_replay(
+            path, run=folder.name, drawing=Drawing.of(policy.problem), config=markdown(policy.problem.config),
+            rollouts=[(name, shown.trajectory)],
+        )  # fmt: skip
     success = {True: ", it succeeds", False: ", it does not succeed", None: ""}[shown.trajectory.success]
-    sys.stdout.write(f"return {shown.trajectory.value:.3f}{success}\n")
-    sys.stdout.write(f"written to {path}; look at it with: farm view {path}\n")
+    say(f"return {shown.trajectory.value:.3f}{success}", f"written to {path}; look at it with: farm view {path}")
     if command.video is not None:
         _film(policy, shown, command.video, command.speed)
-        sys.stdout.write(f"video: {command.video}\n")
+        say(f"video: {command.video}")
     return 0
 
 
@@ -78,21 +86,6 @@ def differing(own: TaskConfig, chosen: TaskConfig) -> str:
     """Settings that were changed, as a caption says them."""
     names = [f.name for f in fields(own) if getattr(own, f.name) != getattr(chosen, f.name)]
     return ", ".join(f"{name.replace('_', ' ')} {getattr(chosen, name)}" for name in names)
-
-
-def _record(policy: "LoadedPolicy", shown: "Replay", folder: RunFolder, path: Path, changed: str) -> None:
-    from learner.recording.recorder import record_replay
-    from learner.recording.run import markdown
-
-    found = policy.problem
-    name = ", ".join([f"mean policy after generation {policy.generation}", *([changed] if changed else [])])
-    try:
-        record_replay(
-            path, run=folder.name, scene=found.scene, spec=found.spec, camera=found.task.camera,
-            config=markdown(found.config), rollouts=[(name, shown.trajectory)],
-        )  # fmt: skip
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _film(policy: "LoadedPolicy", shown: "Replay", path: Path, speed: float) -> None:

@@ -7,7 +7,7 @@ from farm import rollouts
 from farm.errors import ConfigError
 from farm.net.session import free_endpoint
 from farm.settings import Settings, setting
-from learner.commands.learning import learn
+from learner.commands.learner import learn
 from learner.commands.options import LearnerOptions, parse
 from learner.config import RunConfig
 from learner.run import Placement
@@ -27,7 +27,6 @@ class RunCommand(Settings):
     """The run."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         rollouts.backend(self.backend)
 

@@ -1,7 +1,6 @@
 """`farm runs`: a table of the runs in a folder."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import Any
 import tyro
 
 from farm import settings as arguments
-from farm.commands.tables import compact, wide
+from farm.commands.logs import say
+from farm.commands.screen import compact, plain, wide
 from farm.errors import ConfigError
 from learner.run_folder import RunFolder
 
@@ -32,7 +32,7 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}")
     rows = [_row(RunFolder(path.parent)) for path in sorted(command.dir.glob("*/config.json"))]
     if command.json:
-        sys.stdout.write(json.dumps(rows, indent=2) + "\n")
+        say(json.dumps(rows, indent=2))
         return 0
     table = compact()
     for name in ("run", "state", "done", "return", "success", "robust", "hash"):
@@ -43,13 +43,14 @@ def main(words: Sequence[str]) -> int:
     for row in rows:
         robust = row["robust_success_rate"]
         value = row["mean_policy_return"]
-        table.add_row(
+        what = (
             row["run"], row["state"], str(row["generations"]),
             "" if value is None else f"{value:.3f}",
             {True: "yes", False: "no", None: ""}[row["mean_policy_success"]],
             "" if robust is None else f"{robust:.0%}",
             (row["parameters_sha256"] or "")[:8],
         )  # fmt: skip
+        table.add_row(*(plain(text or "") for text in what))
     wide().print(table)
     return 0
 
@@ -58,12 +59,11 @@ def _row(folder: RunFolder) -> dict[str, Any]:
     """A run's summary; of one that has none yet, what its progress says."""
     summary = folder.read_summary()
     progress = folder.progress()
-    if summary is not None and (not progress or summary.get("generations") == progress[-1].generation):
-        return summary
     last = progress[-1] if progress else None
-    return {
+    damaged = summary is None and (folder.path / "summary.json").exists()
+    row = {
         "run": folder.name,
-        "state": "running or killed",
+        "state": "summary.json is damaged" if damaged else "running or killed",
         "generations": last.generation if last else 0,
         "rollouts": last.rollouts if last else 0,
         "mean_policy_return": last.mean_policy_return if last else None,
@@ -71,3 +71,4 @@ def _row(folder: RunFolder) -> dict[str, Any]:
         "robust_success_rate": None,
         "parameters_sha256": None,
     }
+    return row | summary if summary and (not last or summary.get("generations") == last.generation) else row

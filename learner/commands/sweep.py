@@ -1,24 +1,25 @@
 """`farm sweep`: settings x seeds on one set of workers; a table and a figure."""
 
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
 from farm.commands import logs
-from farm.commands.signals import stop_flag
-from farm.commands.tables import compact, wide
-from farm.errors import ConfigError, RunError
+from farm.commands.logs import say
+from farm.commands.screen import compact, wide
+from farm.commands.signals import INTERRUPTED, stop_flag
+from farm.errors import ConfigError, writing
+from farm.net.tls import find
 from learner import config as configs
 from learner import figure, grid, outcomes, sweep
-from learner.commands.learning import INTERRUPTED
 from learner.commands.options import parse
-from learner.commands.side_by_side import Runs
-from learner.commands.side_by_side import check as check_sharing
 from learner.config import RunConfig
 from learner.grid import Setting, Sweep
-from learner.run import check_size
+from learner.run import check_rerun
 from learner.setup import problem
 
 
@@ -63,7 +64,7 @@ def main(words: Sequence[str]) -> int:
         table = outcomes.rows(chosen)
         outcomes.write_csv(chosen.path / "table.csv", chosen, table)
         if stop.is_set():
-            _say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command goes on with them")
+            say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command goes on with them")
             return INTERRUPTED
     _print(chosen, table)
     _draw(chosen)
@@ -71,7 +72,6 @@ def main(words: Sequence[str]) -> int:
 
 
 def _given(words: Sequence[str]) -> list[str]:
-    """What stands behind each --vary."""
     pairs = zip(words, [*words[1:], ""], strict=True)
     return [after if word == "--vary" else word[7:] for word, after in pairs if word.partition("=")[0] == "--vary"]
 
@@ -97,7 +97,6 @@ def _parts(values: dict[str, str]) -> list[str]:
 
 
 def _word(name: str, value: str) -> str:
-    """A setting's flag with its value."""
     flag = name.replace("_", "-")
     if value.lower() in ("true", "false"):
         return f"--{flag}" if value.lower() == "true" else f"--no-{flag}"
@@ -105,16 +104,11 @@ def _word(name: str, value: str) -> str:
 
 
 def _check_begins(chosen: Sweep) -> None:
-    """See that every setting's task can be begun: better now than hours later.
-
-    Raises:
-      ConfigError: one cannot; says which.
-    """
+    """See that every setting's task can be begun: better now than hours later."""
     begun: list[Any] = []
     for setting in chosen.settings:
         try:
             found = problem(setting.config)
-            check_size(found)
             if (task := (setting.config.task, setting.config.task_config)) not in begun:
                 found.runner().close()
                 begun.append(task)
@@ -138,7 +132,7 @@ def _print(chosen: Sweep, table: Sequence[dict[str, Any]]) -> None:
         minutes = sum(row["seconds"] or 0.0 for row in mine) / 60
         shown.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")
     wide().print(shown)
-    _say(f"mean ± standard deviation over seeds; untrained: the mean policy before learning; {chosen.path}/table.csv")
+    say(f"mean ± standard deviation over seeds; untrained: the mean policy before learning; {chosen.path}/table.csv")
 
 
 def _spread(found: tuple[float, float] | None, *, percent: bool) -> str:
@@ -148,23 +142,72 @@ def _spread(found: tuple[float, float] | None, *, percent: bool) -> str:
 
 
 def _draw(chosen: Sweep) -> None:
-    """The figure, where there is matplotlib and anything to draw.
-
-    Raises:
-      RunError: it cannot be written.
-    """
+    """The figure, where there is matplotlib and anything to draw."""
     if not figure.available():
-        _say(f"no figure: {figure.INSTALL}")
+        say(f"no figure: {figure.INSTALL}")
         return
     if found := outcomes.curves(chosen):
         path = chosen.path / "figure.svg"
-        try:
+        with writing(path):
             figure.draw(found, path)
-        except OSError as error:
-            raise RunError(f"cannot write {path}: {error.strerror}") from None
-        _say(f"figure {path}")
+        say(f"figure {path}")
 
 
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+def check_sharing(sharing: sweep.Sharing) -> None:
+    """See that there is what the runs need: Rerun to record with, certificates."""
+    if sharing.record:
+        check_rerun()
+    if sharing.tls is not None:
+        find(sharing.tls, "learner")
+
+
+class Runs:
+    """How runs side by side are doing: bars on a terminal, a line a run elsewhere."""
+
+    def __init__(self, paths: Iterable[Path], where: Path) -> None:
+        paths = list(paths)
+        self._left, self._all = len(sweep.todo(paths)), len(paths)
+        console = Console()
+        columns = TextColumn("{task.description}"), BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
+        self._bars = Progress(*columns, TextColumn("{task.fields[said]}"), console=console, expand=True)
+        self._live = console.is_terminal
+        self._tasks: dict[str, TaskID] = {}
+        self._heard: set[str] = set()
+        self._total = self._bars.add_task("runs", total=self._all, completed=self._all - self._left, said="")
+        say(f"{self._left} of {self._all} runs to do, into {where}")
+
+    def __enter__(self) -> "Runs":
+        if self._live:
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._bars.stop()
+
+    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+        """A generation is over."""
+        if run not in self._tasks:
+            self._tasks[run] = self._bars.add_task(run, total=of, said="")
+        self._bars.update(self._tasks[run], completed=generation, said=f"{returned:8.3f}")
+
+    def said(self, run: str, line: str) -> None:
+        """A learner has something to say, perhaps that nobody answers; the same is said once."""
+        if line not in self._heard:
+            self._heard.add(line)
+            self._print(f"{run}: {line}")
+
+    def ended(self, run: str, state: str, said: str) -> None:
+        """A run is over: finished, diverged, failed or interrupted; `said` is its reason, or how well it did."""
+        if run in self._tasks:
+            self._bars.remove_task(self._tasks.pop(run))
+        if state in ("finished", "diverged"):
+            self._left -= 1
+        self._bars.update(self._total, completed=self._all - self._left)
+        self._print(f"{run} {state}" + (f": {said}" if said else "") + f"  ({self._left} left)")
+
+    def _print(self, line: str) -> None:
+        if self._live:
+            self._bars.console.print(line, highlight=False, markup=False)
+        else:
+            say(line)

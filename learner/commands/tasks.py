@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from farm import plugins, settings
-from farm.commands.tables import compact, wide
+from farm.commands.screen import compact, wide
 from farm.errors import ConfigError
 from farm.policies.base import Policy
 from farm.tasks.base import Task
@@ -64,11 +64,7 @@ def _plugin(kind: str, name: str) -> plugins.Plugin:
 
 
 def described(name: str) -> str:
-    """Where a plug-in is from, its presets and settings.
-
-    Raises:
-      ConfigError: nothing has this name.
-    """
+    """Where a plug-in is from, its presets and settings; a ConfigError where nothing has this name."""
     kind = _kind(name)
     plugin = plugins.find(kind, name) if kind == "backends" else _plugin(kind, name)
     lines = [f"{_KINDS[kind]} {plugin.wire}, {plugin.origin}", _doc(plugin), ""]
@@ -82,11 +78,7 @@ def described(name: str) -> str:
 
 
 def _kind(name: str) -> str:
-    """What kind of plug-in has this name.
-
-    Raises:
-      ConfigError: none has.
-    """
+    """What kind of plug-in has this name."""
     if name.rpartition(":")[0].endswith(".py"):
         target = plugins.find("tasks", name).target
         return "tasks" if issubclass(target, Task) else "policies" if issubclass(target, Policy) else "algorithms"

@@ -13,6 +13,7 @@ from farm.commands import logs
 from farm.commands.screen import display
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, Interrupted, RunError
+from farm.processes import end
 from learner.commands import recordings
 from learner.run import check_rerun
 
@@ -47,11 +48,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def check_display(what: str) -> None:
-    """Whether a window can be opened.
-
-    Raises:
-      ConfigError: it cannot; says what to do.
-    """
+    """Check that a window can be opened: a ConfigError says what to do."""
     if not display():
         raise ConfigError(
             f"no display to open a window on: farm view {what} --web serves a browser, or copy the recording elsewhere"
@@ -59,18 +56,14 @@ def check_display(what: str) -> None:
 
 
 def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> int:
-    """Open recordings and wait until the viewer is closed.
-
-    Args:
-      sources: files of recordings, or addresses of live streams.
-      web: serve a browser instead of opening a window.
-      table: begin with the table of the recordings.
+    """Open files or live streams in a window or browser, with their table first if wanted, until that is closed.
 
     Raises:
       RunError: the viewer failed.
       Interrupted: Ctrl-C or SIGTERM, which end the viewer as well.
     """
-    from learner.recording.viewing import free_port, program, show_table
+    from learner.recording.files import program
+    from learner.recording.viewing import free_port, show_table
 
     port = free_port()
     command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
@@ -86,22 +79,10 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
             while viewer.poll() is None and not stop.wait(_LOOK):
                 pass
         finally:
-            _end(viewer)
+            end([viewer], _CLOSING)
     if stop.is_set():
         raise Interrupted("the viewer is closed")
+    hint = "see above" if web else "is the display there? --web serves a browser instead"
     if viewer.returncode:
-        raise RunError(f"Rerun's viewer ended with status {viewer.returncode}: {_hint(web=web)}")
+        raise RunError(f"Rerun's viewer ended with status {viewer.returncode}: {hint}")
     return 0
-
-
-def _hint(*, web: bool) -> str:
-    return "see above" if web else "is the display there? --web serves a browser instead"
-
-
-def _end(viewer: "subprocess.Popen[bytes]") -> None:
-    """End a viewer that has not ended by itself."""
-    viewer.terminate()
-    try:
-        viewer.wait(_CLOSING)
-    except subprocess.TimeoutExpired:
-        viewer.kill()

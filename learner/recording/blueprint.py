@@ -46,16 +46,6 @@ class Eye:
         tracked = None if camera or scene.mover is None else f"/world/{scene.mover.body}"
         return cls(np.array(view.lookat), -_NEARER * view.distance * ahead, tracked)
 
-    def controls(self) -> rrb.EyeControls3D:
-        """Return it as a part of a 3D view."""
-        return rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=self.target + self.away,
-            look_target=self.target,
-            eye_up=(0, 0, 1),
-            tracking_entity=self.tracked,
-        )
-
 
 def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
     """Layout of a run."""
@@ -78,22 +68,9 @@ def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
 
 
 def comparison(roots: Sequence[str], eye: Eye, compared: Channel | None, *, success: bool) -> rrb.Blueprint:
-    """Layout of several runs, each below its root.
-
-    Args:
-      roots: entities that the runs are below.
-      eye: where all scenes together are looked at from.
-      compared: scalars that all runs have, drawn label by label.
-      success: whether any of the runs knows success.
-    """
-    scenes = rrb.Spatial3DView(
-        origin="/",
-        contents=[f"+ {root}/{part}" for root in roots for part in ("world/**", "label")],
-        name="Final policies: play the timeline sim_time",
-        background=_BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye.controls(),
-    )
+    """Layout of several runs, each below its root; `compared` are scalars that all have, drawn label by label."""
+    drawn = [f"+ {root}/{part}" for root in roots for part in ("world/**", "label")]
+    scenes = _scene("Final policies: play the timeline sim_time", eye, "/", drawn)
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))  # also after a change of the timeline
     left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs")]
@@ -140,13 +117,21 @@ def _beside(
     return rrb.Horizontal(column, right, column_shares=[share, 1.0 - share])
 
 
-def _scene(name: str, eye: Eye) -> rrb.View:
+def _scene(name: str, eye: Eye, origin: str = "/world", contents: Sequence[str] = ("$origin/**",)) -> rrb.View:
+    controls = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=eye.target + eye.away,
+        look_target=eye.target,
+        eye_up=(0, 0, 1),
+        tracking_entity=eye.tracked,
+    )
     return rrb.Spatial3DView(
-        origin="/world",
+        origin=origin,
+        contents=list(contents),
         name=name,
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=eye.controls(),
+        eye_controls=controls,
     )
 
 
@@ -171,6 +156,7 @@ def _config() -> rrb.View:
 
 def _learning(*, success: bool) -> rrb.Container:
     bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
+    log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
     return rrb.Vertical(
         _plot("Return", "/learning/return", "/learning/return_std", legend=bottom),
         rrb.Horizontal(
@@ -183,7 +169,7 @@ def _learning(*, success: bool) -> rrb.Container:
             _plot("Rollouts a second", "/farm/rollouts_per_s", legend=None),
             _plot("Lost rollouts", "/learning/lost", legend=top),
         ),
-        _log(),
+        rrb.TextLogView(origin="/log", name="Log", columns=log),
         row_shares=[2.4, 1.1, 1.1, 1],
         name="Learning",
     )
@@ -197,11 +183,6 @@ def _plot(
 ) -> rrb.View:
     shown = rrb.PlotLegend(legend, visible=legend is not None)
     return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=shown, axis_x=axis_x)
-
-
-def _log() -> rrb.View:
-    columns = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
-    return rrb.TextLogView(origin="/log", name="Log", columns=columns)
 
 
 def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:

@@ -57,7 +57,9 @@ class ChannelDrawing:
             for entity, colour in zip(entities(channel), colours, strict=True):
                 yield entity, rr.StateConfiguration(values=STATES, colors=[_OFF, colour])
         elif channel.kind == "images":
-            style = _image_style(channel)
+            _, height, width = channel.shape
+            size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
+            style = rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)
             yield from ((entity, style) for entity in entities(channel))
             for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
                 yield entity, rr.Points3D.from_fields(positions=places, radii=_POINT_RADIUS * self._size)
@@ -118,7 +120,6 @@ class ChannelDrawing:
             yield Columns(entity, colours.partition(np.full(len(pixels), pixels.shape[1])))
 
     def _arrows(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
-        """Arrows that are not zero."""
         origins, vectors = self.arrows(values, bodies)
         drawn = (vectors != 0).any(axis=-1)
         colours = [pack(colour) for colour in self._channel.colours or [_ARROW] * values.shape[1]]
@@ -185,9 +186,3 @@ _STYLE: Final = {
     "colormap": rr.components.Colormap.Viridis,
     "magnification_filter": rr.components.MagnificationFilter.Nearest,
 }
-
-
-def _image_style(channel: Channel) -> rr.DepthImage:
-    _, height, width = channel.shape
-    size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
-    return rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)

@@ -19,17 +19,15 @@ import rerun as rr
 
 from farm.arrays import FloatArray
 from farm.net.stats import GenerationStats
-from farm.sim.channels import Camera, Channel
+from farm.sim.channels import Channel
 from farm.sim.rendering import beside
-from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
-from farm.tasks.base import TaskSpec
 from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.channels import entities
 from learner.recording.curves import PALETTE, Colour, lines
 from learner.recording.drawing import Drawing
-from learner.recording.rows import begin, flush, log_static, markdown
+from learner.recording.rows import begin, flush, log_static, markdown, times
 
 COLOURS: Final = PALETTE
 """One a run."""
@@ -45,20 +43,13 @@ class Shown:
     """A run and its final policy's rollout."""
 
     name: str
-    scene: Scene
-    spec: TaskSpec
+    drawing: Drawing
     progress: Sequence[GenerationStats]
     rollout: Trajectory
-    camera: Camera | None = None
 
 
 def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
-    """Write the recording; it may replace one.
-
-    Args:
-      path: of the recording.
-      runs: at most as many as there are COLOURS.
-      table: of the runs, Markdown.
+    """Write the recording of at most as many runs as there are COLOURS, with their table (Markdown).
 
     Raises:
       OSError: the file cannot be written.
@@ -67,26 +58,25 @@ def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
     roots = [f"/runs/{rr.escape_entity_path_part(run.name)}" for run in runs]
     step, eye = _arrangement(runs)
     compared = _compared(runs)
-    success = any(run.spec.success for run in runs)
+    success = any(run.drawing.spec.success for run in runs)
     layout = blueprint.comparison(roots, eye, compared, success=success)
     stream = begin("comparison", [rr.FileSink(path)], layout, _APPLICATION)
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log("/table", markdown(table), static=True)
     for number, (root, run, colour) in enumerate(zip(roots, runs, COLOURS, strict=False)):
-        drawing = Drawing(run.scene, run.spec)
-        world = [(root + entity, value) for entity, value in drawing.static() if entity.startswith("/world/")]
+        world = [(root + entity, value) for entity, value in run.drawing.static() if entity.startswith("/world/")]
         names = [(root + entity, value) for entity, value in _names(run, colour, compared)]
         log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
         _send_curves(stream, root, run.progress)
-        _send_rollout(stream, root, drawing, run.rollout, compared)
+        _send_rollout(stream, root, run, compared)
     flush(stream)
     stream.disconnect()
 
 
 def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
     """From each scene to the next [m] (3,), across what the eye looks along; and the eye, before all of them."""
-    sizes = [run.scene.radius for run in runs]
-    largest = runs[int(np.argmax(sizes))]
+    sizes = [run.drawing.scene.radius for run in runs]
+    largest = runs[int(np.argmax(sizes))].drawing
     camera = largest.camera or replace(beside(largest.scene), azimuth=_VIEW[0], elevation=_VIEW[1])
     eye = Eye.of(largest.scene, camera)
     along_y = abs(eye.away[0]) >= abs(eye.away[1])
@@ -98,15 +88,15 @@ def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
 
 def _compared(runs: Sequence[Shown]) -> Channel | None:
     """The first channel of scalars, if all runs have one of its name and labels."""
-    first = next((channel for channel in runs[0].spec.channels if channel.kind == "scalars"), None)
-    known = [{(c.name, c.kind, c.names) for c in run.spec.channels} for run in runs]
+    first = next((channel for channel in runs[0].drawing.spec.channels if channel.kind == "scalars"), None)
+    known = [{(c.name, c.kind, c.names) for c in run.drawing.spec.channels} for run in runs]
     return first if first and all((first.name, first.kind, first.names) in names for names in known) else None
 
 
 def _names(run: Shown, colour: Colour, compared: Channel | None) -> Iterator[tuple[str, Any]]:
     """What never changes but the scene: names and the run's colour."""
-    size = run.scene.radius
-    above = Eye.of(run.scene, run.camera).target + (0.0, 0.0, size)
+    size = run.drawing.scene.radius
+    above = Eye.of(run.drawing.scene, run.drawing.camera).target + (0.0, 0.0, size)
     point = rr.Points3D([above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True)
     yield "/label", point
     yield "/return", lines((run.name,), (colour,), width=2.5)
@@ -131,26 +121,16 @@ def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[Gener
     stream.send_columns(f"{root}/band", at, rr.Measurements.columns(values=means, variances=spreads))
 
 
-def _send_rollout(
-    stream: rr.RecordingStream, root: str, drawing: Drawing, rollout: Trajectory, compared: Channel | None
-) -> None:
-    at = _times(rollout.times)
-    for part in drawing.columns(rollout):
+def _send_rollout(stream: rr.RecordingStream, root: str, run: Shown, compared: Channel | None) -> None:
+    """The rollout's frames; on the timelines of the curves all are there from the beginning."""
+    rollout = run.rollout
+    before = np.zeros(len(rollout.times), dtype=np.int64)
+    at = [*times("generation", before, rollout.times), rr.TimeColumn("rollouts", sequence=before)]
+    for part in run.drawing.columns(rollout):
         if part.entity.startswith("/world/"):
             stream.send_columns(root + part.entity, at, part.columns)
     curves = {"/reward": rollout.terms.sum(axis=-1)}
     if compared is not None:
         curves |= dict(zip(entities(compared), rollout.channels[compared.name].T, strict=True))
     for entity, values in curves.items():
-        stream.send_columns(root + entity, at[:1], rr.Scalars.columns(scalars=values))
-
-
-def _times(times: FloatArray) -> list[rr.TimeColumn]:
-    """Frames in the simulation's time; on the other timelines all are there from the beginning."""
-    before = np.zeros(len(times), dtype=np.int64)
-    sim = np.rint(times * 1e9).astype("timedelta64[ns]")
-    return [
-        rr.TimeColumn("sim_time", duration=sim),
-        rr.TimeColumn("generation", sequence=before),
-        rr.TimeColumn("rollouts", sequence=before),
-    ]
+        stream.send_columns(root + entity, at[1:2], rr.Scalars.columns(scalars=values))

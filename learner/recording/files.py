@@ -7,9 +7,10 @@ optimize` has repaired it. So a run that goes on repairs what is there and begin
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
-import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,17 @@ log = logging.getLogger(__name__)
 
 COMPACTING: Final = 600.0
 """How long merging may take [s]; 30 MiB take about one."""
+
+_ENDS_WITH_PARENT: Final = """
+import ctypes, os, signal, sys
+if sys.platform == "linux":
+    PR_SET_PDEATHSIG = 1
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(sys.argv[1]):  # it ended before that
+        sys.exit(1)
+os.execvp(sys.argv[2], sys.argv[2:])
+"""
+"""Becomes the program in its arguments, which ends when its parent, named first, is killed."""
 
 
 def parts(path: Path) -> list[Path]:
@@ -26,6 +38,13 @@ def parts(path: Path) -> list[Path]:
     return [path, *further] if path.exists() else further
 
 
+def program() -> str:
+    """Path of Rerun's program itself: `python -m rerun` would only be its parent, and end without it."""
+    import rerun_cli  # an extra
+
+    return os.environ.get("RERUN_CLI_PATH") or str(Path(rerun_cli.__file__).with_name("rerun"))
+
+
 def compact(path: Path) -> bool:
     """Merge a recording's parts into one compact file, repairing an end that a crash tore off.
 
@@ -33,29 +52,41 @@ def compact(path: Path) -> bool:
       whether it worked; where not, every part is as it was.
     """
     found = parts(path)
-    merged = path.with_name(f"{path.stem}.merging{path.suffix}")
+    merged, home = _left_behind(path)
     try:
-        _optimise(found, merged)
+        tidy(path)
+        optimize = [program(), "rrd", "optimize", *map(str, found), "-o", str(merged)]
+        command = [sys.executable, "-ISc", _ENDS_WITH_PARENT, str(os.getpid()), *optimize]
+        subprocess.run(command, env=_quiet(home.absolute()), check=True, capture_output=True, timeout=COMPACTING)
         merged.replace(path)
         for old in found:
             if old != path:
                 old.unlink()
     except (OSError, subprocess.SubprocessError) as error:
         log.warning("the recording %s stays as it is, not merged or compacted: %s", path, error)
-        merged.unlink(missing_ok=True)
         return False
+    finally:
+        tidy(path)
     return True
 
 
-def _optimise(found: list[Path], merged: Path) -> None:
-    command = [sys.executable, "-m", "rerun_cli", "rrd", "optimize", *map(str, found), "-o", str(merged)]
-    with tempfile.TemporaryDirectory() as home:
-        subprocess.run(command, env=_quiet(home), check=True, capture_output=True, timeout=COMPACTING)
+def tidy(path: Path) -> None:
+    """Remove what a process that was killed while it compacted a recording left beside it."""
+    merged, home = _left_behind(path)
+    with suppress(OSError):
+        merged.unlink(missing_ok=True)
+    shutil.rmtree(home, ignore_errors=True)
+
+
+def _left_behind(path: Path) -> tuple[Path, Path]:
+    """The file that a recording is merged into, and the folder that Rerun's command takes for a home."""
+    return path.with_name(f"{path.stem}.merging{path.suffix}"), path.with_name(f"{path.stem}.merging")
 
 
 def next_part(path: Path) -> Path:
     """Where a run goes on recording; what is there becomes one file first, if it can."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    tidy(path)
     if not parts(path):
         return path
     compact(path)
@@ -69,10 +100,10 @@ def _number(path: Path, part: Path) -> int:
     return int(digits) if digits.isdecimal() else 0
 
 
-def _quiet(home: str) -> dict[str, str]:
+def _quiet(home: Path) -> dict[str, str]:
     """An environment in which Rerun's command sends no usage data and writes no settings."""
-    settings = Path(home, "rerun")
-    settings.mkdir()
+    settings = home / "rerun"
+    settings.mkdir(parents=True)
     values = {"analytics_enabled": False, "analytics_id": "none"}
     (settings / "analytics.json").write_text(json.dumps(values), encoding="utf-8")
-    return {**os.environ, "HOME": home, "XDG_CONFIG_HOME": home, "RUST_LOG": "warn"}
+    return {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": str(home), "RUST_LOG": "warn"}

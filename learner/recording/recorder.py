@@ -15,7 +15,7 @@ import logging
 import shutil
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,28 +27,14 @@ import rerun as rr
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
-from farm.sim.channels import Camera
-from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory, joined
-from farm.tasks.base import TaskSpec
 from learner.recording import blueprint, curves
 from learner.recording.blueprint import Eye
 from learner.recording.channels import trace
 from learner.recording.drawing import Drawing
 from learner.recording.files import compact
 from learner.recording.replay import record_replay
-from learner.recording.rows import (
-    begin,
-    file_sink,
-    flush,
-    log_static,
-    markdown,
-    row,
-    rows,
-    send,
-    send_properties,
-    times,
-)
+from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, send_properties, times
 
 log = logging.getLogger(__name__)
 
@@ -69,22 +55,18 @@ class Recorder:
         path: Path | None,
         *,
         run: str,
-        scene: Scene,
-        spec: TaskSpec,
-        camera: Camera | None = None,
+        drawing: Drawing,
         config: str,
         serve: tuple[str, int] | None = None,
         done: int = 0,
         properties: Mapping[str, object] | None = None,
     ) -> None:
-        """Open the file and the server.
+        """Open the file, its next part where it is there already, and the server.
 
         Args:
-          path: of the recording; where it is there already, its next part is begun.
-          run: name of the run.
-          scene: what is drawn.
-          spec: of the task.
-          camera: where the scene is looked at from; None: from beside what moves.
+          path: of the recording.
+          run: its name.
+          drawing: what is drawn, and how.
           config: the resolved configuration, Markdown.
           serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
@@ -96,31 +78,29 @@ class Recorder:
         """
         if path is None and serve is None:
             raise ConfigError("a recording without a file and without an address to serve; give one")
+        spec, scene = drawing.spec, drawing.scene
         self._path, self._horizon, self._generation = path, spec.steps * spec.period, done
         self._last = time.time() - self._horizon
         self._held: list[_Held] = []
         self._broken = False
-        self._spec = spec
-        self._replay = partial(record_replay, run=run, scene=scene, spec=spec, camera=camera, config=config)
-        self._drawing = Drawing(scene, spec)
+        self._drawing = drawing
+        self.replay = partial(record_replay, run=run, drawing=drawing, config=config)
+        """Records named rollouts into a file of their own."""
         if scene.left_out:
             log.info("%d meshes or height fields of the scene are not drawn", scene.left_out)
-        self._server = None if serve is None else (serve[0], _free_port(*serve))
-        sinks: list[Any] = [] if self._server is None else [rr.GrpcServerSink(*self._server)]
+        self.uri: str | None = None
+        """Address that a viewer opens: `rerun URI`; None where nothing is served."""
+        sinks: list[Any] = []
+        if serve is not None:
+            host, port = serve[0], _free_port(*serve)
+            self.uri = f"rerun+http://{f'[{host}]' if ':' in host else host}:{port}/proxy"
+            sinks.append(rr.GrpcServerSink(host, port))
         if path is not None:
             sinks.append(file_sink(path))
-        self._stream = begin(run, sinks, blueprint.learning(spec, Eye.of(scene, camera)))
+        self._stream = begin(run, sinks, blueprint.learning(spec, Eye.of(scene, drawing.camera)))
         send_properties(self._stream, "run", properties or {})
         static = [*self._drawing.static(), *curves.static(success=spec.success), ("/config", markdown(config))]
         log_static(self._stream, static)
-
-    @property
-    def uri(self) -> str | None:
-        """Address that a viewer opens: `rerun URI`; None where nothing is served."""
-        if self._server is None:
-            return None
-        host, port = self._server
-        return f"rerun+http://{f'[{host}]' if ':' in host else host}:{port}/proxy"
 
     def generation(
         self,
@@ -146,8 +126,8 @@ class Recorder:
         if sample is not None:
             self._drawing.check(sample)
         self._generation = stats.generation
-        start, now = self._start, time.time()
-        at = times("generation", np.array([stats.generation]), np.array([start]), np.array([now]))
+        start, now = self._generation * self._horizon, time.time()
+        at = self._at(now)
         for entity, values in curves.statistics(stats, rate):
             self._stream.send_columns(entity, at, row(values))
         for name, values in traces.items():
@@ -173,22 +153,14 @@ class Recorder:
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a line; levels are those of the standard library."""
-        at = times("generation", np.array([self._generation]), np.array([self._start]), np.array([time.time()]))
-        self._stream.send_columns("/log", at, row(rr.TextLog(text, level=_LEVELS.get(level, level))))
+        self._stream.send_columns("/log", self._at(time.time()), row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
     def result(self, values: Mapping[str, object]) -> None:
         """Record the run's results, as properties of the recording."""
         send_properties(self._stream, "result", values)
 
-    def replay(self, path: Path, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
-        """Record named rollouts at physics rate into a file of their own; see `record_replay`."""
-        self._replay(path, rollouts=rollouts)
-
     def close(self, *, merge: bool = True) -> None:
-        """Write everything out, merge the parts and compact them; a broken recording is left as it is.
-
-        Args:
-          merge: false leaves the parts as they are, which is quicker.
+        """Write everything out, merge the parts and compact them if wanted; a broken recording is left as it is.
 
         Raises:
           OSError: the file takes no more.
@@ -203,10 +175,11 @@ class Recorder:
 
     def _trace(self, name: str, values: AnyArray) -> Any:  # noqa: ANN401  (archetypes have no public base)
         """A trace as an archetype; see `generation`."""
-        if values.ndim != 2 + (name == "all") or values.shape[-2:] != self._spec.trace:
-            raise ValueError(f"trace {name} of shape {values.shape}, expected {self._spec.trace} for each rollout")
+        spec = self._drawing.spec
+        if values.ndim != 2 + (name == "all") or values.shape[-2:] != spec.trace:
+            raise ValueError(f"trace {name} of shape {values.shape}, expected {spec.trace} for each rollout")
         if name != "all":
-            return trace(values, self._spec.traced[0].top)
+            return trace(values, spec.traced[0].top)
         return rr.Tensor(np.ascontiguousarray(values, dtype=np.float32), dim_names=("rollout", "step", "value"))
 
     def _draw(self) -> None:
@@ -218,7 +191,7 @@ class Recorder:
         numbers = np.repeat([one.generation for one in held], lengths)
         sim, wall = np.concatenate([one.sim for one in held]), np.concatenate([one.wall for one in held])
         columns = self._drawing.columns(joined([one.rollout for one in held]))
-        send(self._stream, columns, rows("generation", numbers, sim, wall))
+        send(self._stream, columns, "generation", numbers, sim, wall)
 
     def _flush(self) -> None:
         """Wait until every row is in the file: a kill loses only what is held back or waits to be recorded."""
@@ -237,10 +210,10 @@ class Recorder:
             text = f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are needed"
             raise OSError(errno.ENOSPC, text)
 
-    @property
-    def _start(self) -> float:
-        """Where the generation begins on sim_time [s]."""
-        return self._generation * self._horizon
+    def _at(self, now: float) -> list[rr.TimeColumn]:
+        """Where the generation begins, recorded now [s since the epoch]."""
+        numbers = np.array([self._generation])
+        return times("generation", numbers, numbers * self._horizon, np.array([now]))
 
 
 @dataclass(frozen=True)

@@ -4,24 +4,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from rerun.chunk import RrdReader
 
-from farm.errors import ConfigError, MessageError, RunError
-from farm.net.telemetry import RunEnd, RunReport
-from farm.sim.channels import Camera
-from farm.sim.scene import Scene
-from farm.tasks.base import TaskSpec
+from farm.errors import ConfigError, MessageError, RunError, writing
+from farm.net.telemetry import RunEnd
+from learner import config as configs
 from learner.config import RunConfig
+from learner.recording.drawing import Drawing
 from learner.recording.files import compact, parts
 from learner.recording.run import RunRecording
 from learner.run_folder import RunFolder
 from learner.telemetry.report import unpacked
-from learner.telemetry.subscriber import other
-
-if TYPE_CHECKING:
-    from learner.telemetry.subscriber import Subscriber
+from learner.telemetry.subscriber import Subscriber
 
 _STATISTICS: Final = "/learning/return"  # an entity that has one row a generation
 
@@ -38,7 +34,7 @@ class Remote:
     end: RunEnd | None = None
     """How the run ended, once it has."""
 
-    def follow(self, subscriber: "Subscriber", stopped: Callable[[], bool]) -> None:
+    def follow(self, subscriber: Subscriber, stopped: Callable[[], bool]) -> None:
         """Record until the run is over.
 
         Raises:
@@ -50,26 +46,21 @@ class Remote:
             if isinstance(message, RunEnd):
                 self._end(message)
             else:
-                self._generation(message)
-            if not self.recording.settled():
+                try:
+                    self.recording.generation(unpacked(message))
+                except MessageError as error:
+                    raise RunError(f"the learner cannot be understood: {error}") from None
+                self.done = message.generation
+            if not self.recording.thread.settled():
                 raise RunError("the recording ended before its time; the line above says why")
-
-    def _generation(self, message: RunReport) -> None:
-        try:
-            self.recording.generation(unpacked(message))
-        except MessageError as error:
-            raise RunError(f"the learner cannot be understood: {error}") from None
-        self.done = message.generation
 
     def _end(self, end: RunEnd) -> None:
         self.end = end
         mean, best = (None if part is None else part.trajectory() for part in (end.mean, end.best))
         self.recording.end(self.done, mean, best, end.best_generation)
         if self.folder is not None:
-            try:
+            with writing(f"to {self.folder.path}"):
                 self.folder.write_summary(end.summary)
-            except OSError as error:
-                raise RunError(f"cannot write to {self.folder.path}: {error.strerror}") from None
 
 
 @contextmanager
@@ -79,20 +70,9 @@ def open_remote(
     name: str,
     config: RunConfig,
     serve: tuple[str, int] | None,
-    spec: TaskSpec,
-    scene: Scene,
-    camera: Camera | None = None,
+    drawing: Drawing,
 ) -> Iterator[Remote]:
-    """Begin a recording in a folder, or continue the one that is there.
-
-    Args:
-      path: the folder; None to serve only.
-      name: the recording's id.
-      config: the run's configuration.
-      serve: host and port for viewers.
-      spec: of the task.
-      scene: what is drawn.
-      camera: where the scene is looked at from; None: from beside what moves.
+    """Begin a recording in a folder (None: serve only), or continue the one that is there; `name` is its id.
 
     Raises:
       ConfigError: the folder is another run's or the learner's, or the address is taken.
@@ -101,8 +81,8 @@ def open_remote(
     with nullcontext() if folder is None else folder.held():
         done = 0 if folder is None else _recorded(folder.recording)
         recording = RunRecording(
-            None if folder is None else folder.recording, replay=None if folder is None else folder.replay, run=name,
-            config=config, scene=scene, spec=spec, camera=camera, done=done, serve=serve,
+            None if folder is None else folder.recording, replay=None if path is None else path / "replay.rrd",
+            run=name, config=config, drawing=drawing, done=done, serve=serve,
         )  # fmt: skip
         try:
             yield Remote(recording, folder, done)
@@ -111,11 +91,7 @@ def open_remote(
 
 
 def _recorded(path: Path) -> int:
-    """The last generation that a recording's files hold, 0 where there are none; torn files are repaired first.
-
-    Raises:
-      ConfigError: a file cannot be read.
-    """
+    """The last generation that a recording's files hold, 0 where there are none; torn files are repaired first."""
     if parts(path):
         compact(path)
     try:
@@ -133,10 +109,10 @@ def _folder(path: Path, config: RunConfig) -> RunFolder:
     folder = RunFolder(path)
     if folder.checkpoint.exists():
         raise ConfigError(f"{path} is the learner's own folder, which it records itself: choose another --out")
-    try:
+    with writing(f"to {path}", ConfigError):
         path.mkdir(parents=True, exist_ok=True)
         if (path / "config.json").exists():
-            for setting, old, new in other(folder.read_config(), config):
+            for setting, old, new in configs.other(folder.read_config(), config):
                 raise ConfigError(
                     f"{path} holds another run of that name, with --{setting} {old} instead of {new}: "
                     "choose another --out"
@@ -144,6 +120,4 @@ def _folder(path: Path, config: RunConfig) -> RunFolder:
         elif any(path.iterdir()):
             raise ConfigError(f"{path} is no recording's folder, and not empty: choose another --out")
         folder.write_config(config)
-    except OSError as error:
-        raise ConfigError(f"cannot write to {path}: {error.strerror}") from None
     return folder

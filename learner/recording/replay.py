@@ -7,15 +7,12 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
-from farm.sim.channels import Camera
-from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
-from farm.tasks.base import TaskSpec
 from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.drawing import Drawing
 from learner.recording.files import compact
-from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, rows, send, times
+from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, times
 
 PAUSE: Final = 0.1
 """Between two rollouts of a replay [s]."""
@@ -25,40 +22,30 @@ def record_replay(
     path: Path,
     *,
     run: str,
-    scene: Scene,
-    spec: TaskSpec,
-    camera: Camera | None = None,
+    drawing: Drawing,
     config: str,
     rollouts: Sequence[tuple[str, Trajectory]],
 ) -> None:
     """Write rollouts into a file of their own; it may replace one.
 
-    Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1.
-
-    Args:
-      path: of the recording.
-      run: name of the run; the recording's id is `<run>-replay`.
-      scene: what is drawn.
-      spec: of the task.
-      camera: where the scene is looked at from; None: from beside what moves.
-      config: the resolved configuration, Markdown.
-      rollouts: names and rollouts, at any rate.
+    Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1. The recording's id is
+    `<run>-replay`; config is the resolved configuration, Markdown.
 
     Raises:
       OSError: the file cannot be written; one that was there stays.
     """
-    drawing = Drawing(scene, spec)
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
     aside = path.with_name(f"{path.stem}.new{path.suffix}")
     aside.unlink(missing_ok=True)
-    stream = begin(f"{run}-replay", [file_sink(aside)], blueprint.replay(spec, Eye.of(scene, camera), longest))
+    layout = blueprint.replay(drawing.spec, Eye.of(drawing.scene, drawing.camera), longest)
+    stream = begin(f"{run}-replay", [file_sink(aside)], layout)
     log_static(stream, [*drawing.static(), ("/config", markdown(config))])
     start = 0.0
     for number, (name, rollout) in enumerate(rollouts, 1):
         at = times("rollout", np.array([number]), np.array([start]))
         stream.send_columns("/rollout", at, row(_caption(name, rollout)))
         numbers = np.full(len(rollout.times), number)
-        send(stream, drawing.columns(rollout), rows("rollout", numbers, start + rollout.times))
+        send(stream, drawing.columns(rollout), "rollout", numbers, start + rollout.times)
         start += float(rollout.times[-1]) + PAUSE
     flush(stream)
     stream.disconnect()

@@ -1,6 +1,6 @@
 """A Rerun recording, and how rows get into it: several at once, on timelines of our own."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,6 @@ from learner.recording.files import next_part
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
 APPLICATION: Final = "rolloutfarm"
-Times = list[rr.TimeColumn]
 
 
 def begin(
@@ -31,11 +30,7 @@ def begin(
 
 
 def file_sink(path: Path) -> rr.FileSink:
-    """Open a recording's next file.
-
-    Raises:
-      OSError: it cannot be written.
-    """
+    """Open a recording's next file; an OSError where it cannot be written."""
     part = next_part(path)
     part.touch()  # fails with an errno; Rerun's own error has none
     return rr.FileSink(part)
@@ -88,7 +83,7 @@ def row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no publi
     return [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
 
 
-def times(counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None) -> Times:
+def times(counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None) -> list[rr.TimeColumn]:
     """Timelines of n rows: numbers (n,), times in the simulation and since the epoch (n,) [s]."""
     columns = [
         rr.TimeColumn(counter, sequence=numbers),
@@ -104,21 +99,18 @@ def _nanoseconds(seconds: FloatArray) -> IntArray:
     return np.rint(seconds * 1e9).astype(np.int64)
 
 
-def rows(
-    counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None
-) -> Callable[[IntArray | None], Times]:
-    """Timelines of some of n rows, of all where None."""
+def send(
+    stream: rr.RecordingStream,
+    columns: Iterable[Columns],
+    counter: str,
+    numbers: IntArray,
+    sim: FloatArray,
+    wall: FloatArray | None = None,
+) -> None:
+    """Send entities' rows; timelines are those of `times`, of all their frames."""
     whole = times(counter, numbers, sim, wall)
-
-    def some(chosen: IntArray | None) -> Times:
-        if chosen is None:
-            return whole
-        return times(counter, numbers[chosen], sim[chosen], None if wall is None else wall[chosen])
-
-    return some
-
-
-def send(stream: rr.RecordingStream, columns: Iterable[Columns], at: Callable[[IntArray | None], Times]) -> None:
-    """Send entities' rows; `at` is what `rows` made of their frames."""
     for part in columns:
-        stream.send_columns(part.entity, at(part.rows), part.columns)
+        at, some = whole, part.rows
+        if some is not None:
+            at = times(counter, numbers[some], sim[some], None if wall is None else wall[some])
+        stream.send_columns(part.entity, at, part.columns)

@@ -7,22 +7,18 @@ import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from farm.arrays import AnyArray
-from farm.errors import ConfigError
+from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
-from farm.sim.channels import Camera
-from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
-from farm.tasks.base import TaskSpec
 from learner import config as configs
 from learner.config import RunConfig
+from learner.recording.drawing import Drawing
 from learner.recording.files import COMPACTING
 from learner.recording.recorder import Recorder
-
-if TYPE_CHECKING:
-    from learner.telemetry.report import Report
+from learner.telemetry.report import Report
 
 log = logging.getLogger(__name__)
 
@@ -45,17 +41,13 @@ class RecorderThread:
     def __init__(self, recorder: Recorder, waiting: int = WAITING) -> None:
         self._recorder, self._waiting = recorder, waiting
         self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._failed = threading.Event()
+        self.failed = False
+        """Whether the recording ended before its time."""
         self._merge = True
         self.dropped = 0
         """Generations recorded without their rollout and traces, because too many waited."""
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
-
-    @property
-    def failed(self) -> bool:
-        """Whether the recording ended before its time."""
-        return self._failed.is_set()
 
     def put(self, call: Callable[[], None]) -> None:
         """Queue a call of one of the recorder's methods."""
@@ -81,15 +73,7 @@ class RecorderThread:
         return not self.failed
 
     def close(self, timeout: float | None = None, *, merge: bool = True) -> bool:
-        """Record what waits and end the recording.
-
-        Args:
-          timeout: how long that may take [s]; None for as long as it takes.
-          merge: whether to compact the file as well.
-
-        Returns:
-          whether everything is recorded.
-        """
+        """Record what waits within a timeout [s], compact the file if wanted; return whether everything is recorded."""
         self._merge = merge
         self._queue.put(None)
         self._thread.join(timeout)
@@ -104,7 +88,7 @@ class RecorderThread:
                 call()
             self._recorder.close(merge=self._merge)
         except Exception as error:
-            self._failed.set()
+            self.failed = True
             log.error("the recording ends here, learning goes on: %s", error)
             self._abandon()
 
@@ -133,47 +117,27 @@ class RunRecording(logging.Handler):
         replay: Path | None,
         run: str,
         config: RunConfig,
-        scene: Scene,
-        spec: TaskSpec,
-        camera: Camera | None = None,
+        drawing: Drawing,
         done: int,
         serve: tuple[str, int] | None,
     ) -> None:
-        """Open the file and, if wanted, the server.
-
-        Args:
-          path: of the recording, None for none.
-          replay: of the recording at physics rate, None for none.
-          run: name that the run began with, the recording's id.
-          config: the run's configuration.
-          scene: what is drawn.
-          spec: of the task.
-          camera: where the scene is looked at from; None: from beside what moves.
-          done: generations that were recorded before.
-          serve: host and port for viewers.
+        """Open the file and, if wanted, the server; see `Recorder`. `replay` is of the recording at physics rate.
 
         Raises:
           ConfigError: the address is taken, or the file cannot be written.
         """
         super().__init__(logging.INFO)
         self._replay = replay
-        try:
+        with writing(path, ConfigError):
             self._recorder = Recorder(
-                path, run=run, scene=scene, spec=spec, camera=camera, config=markdown(config), serve=serve, done=done,
+                path, run=run, drawing=drawing, config=markdown(config), serve=serve, done=done,
                 properties=configs.properties(config),
             )  # fmt: skip
-        except OSError as error:
-            raise ConfigError(f"cannot write {path}: {error.strerror}") from None
         self.uri = self._recorder.uri
-        self._thread = RecorderThread(self._recorder)
+        self.thread = RecorderThread(self._recorder)
         self._best: tuple[str, Trajectory] | None = None
         self._ended = False
         logging.getLogger().addHandler(self)
-
-    @property
-    def dropped(self) -> int:
-        """Generations recorded without their rollout and traces."""
-        return self._thread.dropped
 
     def emit(self, record: logging.LogRecord) -> None:
         """Record a message of the log."""
@@ -181,11 +145,11 @@ class RunRecording(logging.Handler):
 
     def line(self, level: str, text: str) -> None:
         """Record a line; levels are those of the standard library."""
-        self._thread.put(lambda: self._recorder.log(text, level))
+        self.thread.put(lambda: self._recorder.log(text, level))
 
-    def generation(self, report: "Report") -> None:
+    def generation(self, report: Report) -> None:
         """Record a generation; the best rollout at physics rate goes into replay.rrd when there is a new one."""
-        self._thread.generation(report.progress, report.sample, report.traces, report.rate)
+        self.thread.generation(report.progress, report.sample, report.traces, report.rate)
         if report.progress.return_max >= report.progress.best:
             self.line("INFO", f"new best rollout: return {report.progress.best:.3f}")
         if report.replay is not None:
@@ -193,13 +157,9 @@ class RunRecording(logging.Handler):
             self._write_replay([self._best])
 
     def end(self, generation: int, mean: Trajectory | None, best: Trajectory | None, best_generation: int) -> None:
-        """Record a run's end, and write replay.rrd once more.
+        """Record a run's end after so many updates, and write replay.rrd once more; no best where it was there before.
 
-        Args:
-          generation: updates done.
-          mean: the final mean policy's rollout.
-          best: the best rollout, None where `generation` has had it.
-          best_generation: the generation it came from.
+        The rollouts are of the final mean policy, and the best one with the generation it came from.
         """
         self._ended = True
         if best is not None:
@@ -207,24 +167,20 @@ class RunRecording(logging.Handler):
         rollouts = [] if self._best is None else [self._best]
         if mean is not None:
             result = {"generations": generation, "return": mean.value, "success": mean.success}
-            self._thread.put(lambda: self._recorder.result(result))
+            self.thread.put(lambda: self._recorder.result(result))
             rollouts.append((f"mean policy after generation {generation}", mean))
         if rollouts:
             self._write_replay(rollouts)
 
-    def settled(self) -> bool:
-        """Wait until everything so far is recorded; return whether it is."""
-        return self._thread.settled()
-
     def finish(self) -> None:
         """Write out what waits, and close; an interrupted run's parts are merged only when it goes on."""
         logging.getLogger().removeHandler(self)
-        self._thread.close(_CLOSE + (COMPACTING if self._ended else 0.0), merge=self._ended)
+        self.thread.close(_CLOSE + (COMPACTING if self._ended else 0.0), merge=self._ended)
 
     def _write_replay(self, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
         path = self._replay
         if path is not None:
-            self._thread.put(lambda: self._recorder.replay(path, rollouts))
+            self.thread.put(lambda: self._recorder.replay(path, rollouts=rollouts))
 
 
 def markdown(config: RunConfig) -> str:

@@ -1,26 +1,18 @@
 """The viewer's program, and the table of recordings in a running viewer."""
 
 import logging
-import os
 import socket
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-import rerun_cli
 from rerun.experimental import ViewerClient
 
 log = logging.getLogger(__name__)
 
 _LOADING: Final = 60.0  # [s]
 _PERIOD: Final = 0.2  # [s] between two questions to a viewer that starts
-
-
-def program() -> str:
-    """Path of the viewer itself: `python -m rerun` would only be its parent, and end without it."""
-    return os.environ.get("RERUN_CLI_PATH") or str(Path(rerun_cli.__file__).with_name("rerun"))
 
 
 def free_port(rather: int = 0) -> int:

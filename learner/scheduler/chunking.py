@@ -28,6 +28,8 @@ class SchedulerConfig(Settings):
     """Workers that may hold one job at once; 1 means no copies."""
     max_errors: int = setting(3, least=1)
     """Different workers that answer an error for one job before the run stops."""
+    audit: float = setting(0.02, least=0.0, most=1.0)
+    """Part of the jobs that a second host does as well, where there is one; 0: no spot checks."""
 
 
 class Chunking:

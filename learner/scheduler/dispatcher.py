@@ -8,7 +8,7 @@ import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -22,10 +22,11 @@ from farm.net.messages import Refusal, Spec, WorkRequest
 from farm.net.session import Session
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import RunStatus, WorkerStatus
-from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
+from farm.net.work import NOT_NORMALISED, Chunk, Failure, Jobs, Results, RoundHeader
+from learner.scheduler.audit import Audit, host
 from learner.scheduler.membership import Admission, Attendance, Census
 from learner.scheduler.round import RoundResults
-from learner.scheduler.scheduler import Scheduler, SchedulerConfig
+from learner.scheduler.scheduler import Scheduler, SchedulerConfig, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -72,10 +73,14 @@ class Dispatcher:
         """
         self.run = spec.run
         self.ignored: Counter[str] = Counter()
-        """Messages not counted, by kind: stale, doubled, foreign, absent, refused, bad, large, version, flood."""
+        """Messages not counted, by kind: stale, doubled, unasked, foreign, absent, refused, bad, large, version,
+        flood."""
         self.admission = admission
         self._session, self._farm, self._stopped = session, farm, stopped
-        self._scheduler = Scheduler(scheduler or SchedulerConfig())
+        scheduler = scheduler or SchedulerConfig()
+        self._scheduler = Scheduler(scheduler)
+        self._audit = Audit(0.0 if admission.mixed else scheduler.audit)
+        self._expelled: dict[str, str] = {}  # hosts, and why
         self._how_to_join = how_to_join
         self._trace, self._shapes = sizes
         self._incarnation = secrets.token_hex(8)
@@ -121,7 +126,14 @@ class Dispatcher:
         """Jobs given out again since the start."""
         return self._scheduler.reissued
 
-    def begin(self, generation: int, mu: FloatArray, jobs: Jobs, traces: str = "none") -> None:
+    def begin(
+        self,
+        generation: int,
+        mu: FloatArray,
+        jobs: Jobs,
+        traces: str = "none",
+        normaliser: FloatArray = NOT_NORMALISED,
+    ) -> None:
         """Announce a round and hand out its first jobs.
 
         Args:
@@ -129,14 +141,16 @@ class Dispatcher:
           mu: (P,).
           jobs: all of them, by index.
           traces: which traces of the exploring rollouts are wanted, one of TRACES.
+          normaliser: of the observations, as a RoundHeader has it, (2, 2, d).
         """
         self._header = RoundHeader(
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
-            generation=generation, spec=self._header.spec, traces=traces, mu=mu,
+            generation=generation, spec=self._header.spec, traces=traces, mu=mu, normaliser=normaliser,
         )  # fmt: skip
         self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
-        self._round = RoundResults(jobs, traces, self._trace, self._shapes)
+        self._round = RoundResults(jobs, traces, self._trace, self._shapes, normaliser.shape[-1])
         self._scheduler.begin(len(jobs))
+        self._audit.begin(len(jobs))
         self._issue()
 
     def collect(self) -> RoundResults:
@@ -147,7 +161,14 @@ class Dispatcher:
           Stopped: the user asked to end.
         """
         assert self._round is not None
-        while not self._scheduler.complete:
+        for _ in self.progress():
+            pass
+        return self._round
+
+    def progress(self) -> Iterator[RoundResults]:
+        """The round that has begun, each time that something came, until all its jobs are done and checked."""
+        assert self._round is not None
+        while not self._over():
             for event in self._events():
                 self._take(event)
             self._issue()
@@ -155,7 +176,26 @@ class Dispatcher:
             self._tell_status()
             if self._stopped():
                 raise Stopped
-        return self._round
+            yield self._round
+
+    def _over(self) -> bool:
+        """Whether all jobs are done and checked; asks for the checks that are open."""
+        assert self._round is not None
+        if not self._scheduler.complete:
+            return False
+        willing = self._scheduler.willing
+        if self._audit.passed(self._round, willing):
+            return True
+        asked = self._audit.assign(willing, time.monotonic(), self._scheduler.patience)
+        for worker, indices in asked.items():
+            self._scheduler.lend(worker, indices)
+            self._send(worker, indices)
+        if self._audit.disputed:
+            self._warn(
+                f"{self._audit.disputed} give different numbers for the same job, and no third host is there to say "
+                "which is right: the run waits for a worker on one more machine"
+            )
+        return False
 
     def _events(self) -> list[Event]:
         """What came, after waiting for it until the next deadline."""
@@ -174,7 +214,7 @@ class Dispatcher:
             self._ignore(error.kind, f"on {event.key}: {error}")
 
     def _asked(self, event: Event) -> None:
-        sender = keys.tail(event.key, keys.want(self._farm, ""))
+        sender = keys.worker_in(event.key, keys.want(self._farm, ""))
         try:
             want = _decode(event, WorkRequest)
         except MessageError as error:
@@ -189,7 +229,7 @@ class Dispatcher:
             self._admit(want)
 
     def _admit(self, want: WorkRequest) -> None:
-        refusal = self.admission.refusal(want)
+        refusal = self._expelled.get(host(want.worker)) or self.admission.refusal(want)
         if refusal is not None:
             self._refuse(want.worker, refusal)
             return
@@ -200,6 +240,8 @@ class Dispatcher:
             log.info("worker %s joined (release %s)", want.worker, want.version)
         now = time.monotonic()
         self._scheduler.want(want.worker, want.credits, now, idle=self.run in want.idle)
+        if self.run in want.idle:
+            self._audit.lost(want.worker)
         self._census.asked(want, now)
 
     def _refuse(self, worker: str, reason: str) -> None:
@@ -211,7 +253,7 @@ class Dispatcher:
         self._session.publish(keys.refused(self._farm, worker), message, block=False)
 
     def _liveliness(self, event: Event) -> None:
-        worker = keys.tail(event.key, keys.worker_token(self._farm, ""))
+        worker = keys.worker_in(event.key, keys.worker_token(self._farm, ""))
         if event.alive:
             self._came(worker)
             return
@@ -239,7 +281,7 @@ class Dispatcher:
             self._ignore("absent", f"of {worker}, whose liveliness token is not there")
 
     def _result(self, event: Event) -> None:
-        sender = keys.tail(event.key, keys.result(self._farm, self.run, ""))
+        sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
         try:
             message: Results | Failure = _decode(event, Results)
         except MessageError as first:
@@ -270,9 +312,51 @@ class Dispatcher:
         new = np.array([verdict == "new" for verdict in verdicts])
         self._round.put(message, place, new)
         if new.any():
-            self.admission.counted()
+            self._audit.counted(message.worker, message.jobs[new])
+            self._decide_numbers(message.worker)
+        if "doubled" in verdicts:
+            self._compare(message, verdicts)
         self.ignored.update(verdict for verdict in verdicts if verdict != "new")
+        if "unasked" in verdicts:
+            self._warn(f"worker {message.worker} answers jobs that it was not given; they do not count")
         self._census.did(message.worker, len(message.returns), time.monotonic())
+
+    def _decide_numbers(self, worker: str) -> None:
+        """The first result that counts says which machines' numbers are the run's: others leave."""
+        canaries = self._census.canaries()
+        if worker not in canaries or not self.admission.counted(canaries[worker]):
+            return
+        for want in self._census.requests():
+            refusal = self.admission.refusal(want)
+            if refusal is not None:
+                self._forget(want.worker)
+                self._refuse(want.worker, refusal)
+
+    def _compare(self, message: Results, verdicts: list[Verdict]) -> None:
+        """Two hosts did the same jobs, asked to or by chance: they must agree to the bit."""
+        assert self._round is not None
+        for at, (job, verdict) in enumerate(zip(message.jobs.tolist(), verdicts, strict=True)):
+            if verdict == "doubled":
+                asked = self._audit.answered(
+                    message.worker, job, self._round.answer(job), self._round.given(message, job)
+                )
+                verdicts[at] = "new" if asked else verdict
+        for name, job in self._audit.settle().items():
+            self._expel(name, job)
+
+    def _expel(self, name: str, job: int) -> None:
+        """A host's numbers are wrong: its jobs of this round are done again, and it takes part no longer."""
+        assert self._round is not None
+        reason = f"host {name} gave other numbers than two other hosts for job {job} of round {self._header.round}"
+        self._expelled[name] = reason
+        for worker in self.workers:
+            if host(worker) == name:
+                self._forget(worker)
+                self._refuse(worker, reason)
+        jobs = self._audit.expel(name)
+        self._scheduler.reopen(jobs, name)
+        self._round.forget(jobs)
+        log.error("%s; it is expelled, and %d of its jobs are done again", reason, len(jobs))
 
     def _failed(self, failure: Failure) -> None:
         if failure.index is None:
@@ -300,19 +384,24 @@ class Dispatcher:
         """It takes part no longer; how many of its jobs go to others."""
         again = self._scheduler.lost(worker)
         self._census.left(worker)
-        if not self._scheduler.workers:
-            self.admission.deserted()
+        self._audit.lost(worker)
         return again
 
     def _issue(self) -> None:
+        now = time.monotonic()
+        for worker, indices in self._scheduler.assign(now):
+            self._send(worker, indices)
+
+    def _send(self, worker: str, indices: Sequence[int]) -> None:
+        """Jobs into a worker's inbox."""
         assert self._round is not None
-        for worker, indices in self._scheduler.assign(time.monotonic()):
-            # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
-            head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
-            most = max(1, _CHUNK // max(1, self._header.mu.nbytes))
-            for first in range(0, len(indices), most):
-                chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices[first : first + most]), **head))
-                self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
+        # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
+        head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
+        size = self._header.mu.nbytes + self._header.normaliser.nbytes  # of eps, and of what comes back
+        most = max(1, _CHUNK // max(1, size))
+        for first in range(0, len(indices), most):
+            chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices[first : first + most]), **head))
+            self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
     def report(self, progress: GenerationStats) -> None:
         """Take in how the last generation went, for people who ask."""
@@ -344,8 +433,11 @@ class Dispatcher:
 
     def _tell_when_alone(self) -> None:
         now = time.monotonic()
-        if self._scheduler.workers or self._how_to_join is None:
+        if self._scheduler.workers:
             self._alone = now
+        elif now - self._alone > _PATIENCE and self._how_to_join is None:
+            if self._refused:  # those that the run was started with, and nobody else knows where it listens
+                raise RunError(f"no worker takes part: {next(iter(self._refused.values()))}")
         elif now - self._alone > _PATIENCE:
             log.warning("no workers; start some with: %s", self._how_to_join)
             self._alone = float("inf")

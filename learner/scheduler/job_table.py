@@ -47,6 +47,7 @@ class JobTable:
         # Jobs that are not done, and who is expected to answer, in the order of issue.
         self.open: dict[int, list[str]] = {index: [] for index in range(jobs)}
         self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)  # answers to a job, by worker
+        self.given: defaultdict[str, set[int]] = defaultdict(set)  # what each worker was ever given, gone or not
         self._pending = list(range(jobs))  # a heap; jobs done meanwhile leave it at the top
         # Job and since when [s]; oldest first, as the clock is monotonic.
         self.out: dict[int, float] = {}  # may have one more copy
@@ -77,6 +78,7 @@ class JobTable:
                 taken.append(index)
                 self.open[index].append(worker)  # the first: who is pending has none, and is in no queue
                 held[index] = queue[index] = now
+        self.given[worker].update(taken)
         return tuple(taken)
 
     def give(self, index: int, worker: str, now: float) -> None:
@@ -86,6 +88,7 @@ class JobTable:
         if len(holders) >= self.copies:  # given up at the oldest, which keeps it as held
             del holders[0]
         holders.append(worker)
+        self.given[worker].add(index)
         self.workers[worker].held[index] = now
         queue = self.full if len(holders) >= self.copies else self.out
         queue[index] = now
@@ -94,9 +97,9 @@ class JobTable:
         """Note results of jobs of this round; return for each whether it was not done before."""
         held: dict[int, float] = {}
         known = self.workers.get(worker)
-        if known is not None and indices:
-            held = known.held
-            known.proven, known.benched = True, False
+        if known is not None:
+            held, known.benched = known.held, False
+            known.proven |= bool(indices)
         done: list[bool] = []
         for index in indices:
             held.pop(index, None)
@@ -107,7 +110,7 @@ class JobTable:
     def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
         """Note an error; return whether it counts, and whether nobody holds the job any more."""
         known = self.workers.get(worker)
-        if known is None:
+        if known is None or index not in self.given[worker]:
             return False, False
         known.benched = True
         held = known.held.pop(index, None) is not None
@@ -118,6 +121,14 @@ class JobTable:
             return True, False
         self.failed[index] = now
         return True, True
+
+    def reopen(self, indices: Sequence[int], host: str) -> None:
+        """Jobs that are done are pending again, and nothing counts any more of that host's workers."""
+        for index in indices:
+            self.open[index] = []
+            heapq.heappush(self._pending, index)
+        for name in [name for name in self.given if name.partition("/")[0] == host]:
+            del self.given[name]
 
     def release(self, worker: str, now: float) -> int:
         """Take everything off a worker that will not answer; return how many are pending again."""

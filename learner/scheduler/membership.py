@@ -1,6 +1,6 @@
 """Which workers may join a run, which are connected, and what is known of each. Pure: time is an argument [s]."""
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
@@ -10,6 +10,7 @@ from farm.net.messages import WorkRequest
 from farm.net.telemetry import WorkerStatus
 
 _MOST: Final = 10_000  # tokens; more workers than a learner feeds
+_MOST_OF_ONE: Final = 1000  # tokens of one name: nobody keeps others out by showing many of its own
 _ASKING: Final = 1000  # that ask before their token came
 _SOON: Final = 3.0  # [s] within which it does: token and request take different ways
 _WINDOW: Final = 10.0  # [s] over which a worker's rate is taken
@@ -22,32 +23,26 @@ class Admission:
         """Know the run.
 
         Args:
-          canary: digest of the numbers that the run's machines give; None until the first worker says it.
+          canary: digest of the numbers that the run's machines give; None until the first result counts.
           mixed: admit machines whose numbers differ: the run is then not reproducible.
         """
-        self._mixed, self._settled = mixed, canary is not None
-        self.canary = canary
-        """The digest that the run's numbers belong to, None as long as nobody has worked."""
+        self.mixed, self.canary = mixed, canary
 
     def refusal(self, want: WorkRequest) -> str | None:
-        """Why this worker may not take part, None if it may; the first one decides whose numbers count."""
-        if self.canary is None:
-            self.canary = want.canary
-        if want.canary != self.canary and not self._mixed:
-            return (
-                "its machine rounds differently from those the run began with (another processor or library): "
-                "take a machine like them, or start the learner with --mixed and do without repeatable numbers"
-            )
-        return None
+        """Why this worker may not take part, None if it may."""
+        if self.canary in (None, want.canary) or self.mixed:
+            return None
+        return (
+            "its machine rounds differently from those the run began with (another processor or library): "
+            "take a machine like them, or start the learner with --mixed and do without repeatable numbers"
+        )
 
-    def counted(self) -> None:
-        """A result counted: the run has its numbers for good."""
-        self._settled = True
-
-    def deserted(self) -> None:
-        """Nobody is left; as long as no result counted, whoever comes next decides."""
-        if not self._settled:
-            self.canary = None
+    def counted(self, canary: str) -> bool:
+        """A result of such a machine counted; say whether it was the first, which decides whose numbers the run has."""
+        if self.canary is not None:
+            return False
+        self.canary = canary
+        return True
 
 
 class Attendance:
@@ -55,6 +50,7 @@ class Attendance:
 
     def __init__(self) -> None:
         self._there: set[str] = set()
+        self._names: Counter[str] = Counter()
         self._early: dict[str, tuple[WorkRequest, float]] = {}
 
     def came(self, worker: str) -> WorkRequest | None:
@@ -63,9 +59,12 @@ class Attendance:
         Raises:
           MessageError: there are too many.
         """
-        if worker not in self._there and len(self._there) >= _MOST:
-            raise MessageError(f"{_MOST} workers are there already", "absent")
-        self._there.add(worker)
+        if worker not in self._there:
+            name = worker.partition("/")[0]
+            if len(self._there) >= _MOST or self._names[name] >= _MOST_OF_ONE:
+                raise MessageError(f"{_MOST} workers, or {_MOST_OF_ONE} of its name, are there already", "absent")
+            self._there.add(worker)
+            self._names[name] += 1
         return self._early.pop(worker, (None, 0.0))[0]
 
     def early(self, most: int) -> list[str]:
@@ -77,7 +76,9 @@ class Attendance:
 
     def left(self, worker: str) -> None:
         """A token is gone."""
-        self._there.discard(worker)
+        if worker in self._there:
+            self._there.remove(worker)
+            self._names[worker.partition("/")[0]] -= 1
         self._early.pop(worker, None)
 
     def asked(self, want: WorkRequest, now: float) -> bool:
@@ -129,6 +130,14 @@ class Census:
             known.recent.append((now, rollouts))
             while known.recent[0][0] < now - _WINDOW:
                 known.recent.popleft()
+
+    def canaries(self) -> dict[str, str]:
+        """The digests of the workers' numbers."""
+        return {name: known.want.canary for name, known in self._known.items()}
+
+    def requests(self) -> list[WorkRequest]:
+        """What each worker asked for last."""
+        return [known.want for known in self._known.values()]
 
     def left(self, worker: str) -> None:
         """A worker is gone."""

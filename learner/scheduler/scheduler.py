@@ -22,7 +22,7 @@ from learner.scheduler.job_table import JobTable, Worker
 
 __all__ = ["Assignment", "Scheduler", "SchedulerConfig", "Verdict"]
 
-Verdict: TypeAlias = Literal["new", "doubled", "stale"]
+Verdict: TypeAlias = Literal["new", "doubled", "stale", "unasked"]
 
 # A job whose copies are all out is given up at its oldest holder after this many times the
 # straggler's patience: workers that hang but stay connected must not keep a round for ever.
@@ -62,6 +62,11 @@ class Scheduler:
     def workers(self) -> Set[str]:
         """Names of the known workers."""
         return self._table.workers.keys()
+
+    @property
+    def willing(self) -> list[str]:
+        """Names of the workers that take jobs, sorted."""
+        return sorted(name for name, known in self._table.workers.items() if known.credits)
 
     @property
     def reissued(self) -> int:
@@ -108,14 +113,36 @@ class Scheduler:
     def results(self, worker: str, indices: Sequence[int], now: float) -> list[Verdict]:
         """Note the results that came in one message; return for each whether it counts.
 
-        "new" counts, "doubled" came before, "stale" is no job of this round. Results of a worker
-        we do not know count too. Messages of other rounds are the caller's to sort out.
+        "new" counts, "doubled" came before, "stale" is no job of this round, "unasked" was never given to that
+        worker in this round. A worker that left meanwhile still counts. Messages of other rounds are the caller's to
+        sort out.
         """
         self._tick(now)
         self._learn(worker, indices)
-        ours = [0 <= index < self._table.size for index in indices]
-        new = iter(self._table.finish(worker, [index for index, our in zip(indices, ours, strict=True) if our]))
-        return ["stale" if not our else "new" if next(new) else "doubled" for our in ours]
+        given = self._table.given.get(worker, ())
+        new = iter(self._table.finish(worker, [index for index in indices if index in given]))
+        return [
+            "stale" if not 0 <= index < self._table.size
+            else "unasked" if index not in given
+            else "new" if next(new)
+            else "doubled"
+            for index in indices
+        ]  # fmt: skip
+
+    def reopen(self, indices: Sequence[int], host: str) -> None:
+        """Have jobs that a host did done again by others; nothing that its workers say of this round counts."""
+        self._seen = -math.inf
+        self._reissued += len(indices)
+        self._table.reopen(indices, host)
+
+    def lend(self, worker: str, indices: Sequence[int]) -> None:
+        """Note that a worker is asked for jobs that are done: its answers are "doubled"."""
+        self._table.given[worker].update(indices)
+
+    @property
+    def patience(self) -> float:
+        """Time after which a worker that does not answer counts as late [s]."""
+        return self._chunking.patience
 
     def error(self, worker: str, index: int, now: float) -> bool:
         """Note that a worker answered an error; return whether the run has to stop.

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Final
 
@@ -118,19 +119,10 @@ class Publisher(logging.Handler):
         return replace(report, traces=traces)
 
 
-def _before(progress: list[GenerationStats], run: str, incarnation: str) -> list[RunReport]:
+def _before(progress: list[GenerationStats], run: str, incarnation: str) -> Iterator[RunReport]:
     """Reports of the generations that the folder knows, without rollouts."""
-    reports, rollouts, seconds = [], 0, 0.0
+    rollouts, seconds = 0, 0.0
     for p in progress:
         rate = (p.rollouts - rollouts) / max(p.seconds - seconds, 1e-3)  # seconds are written to the millisecond
         rollouts, seconds = p.rollouts, p.seconds
-        reports.append(
-            RunReport(
-                run=run,
-                incarnation=incarnation,
-                generation=p.generation,
-                progress=p.to_dict(),
-                rate=rate,
-            )  # fmt: skip
-        )
-    return reports
+        yield RunReport(run=run, incarnation=incarnation, generation=p.generation, progress=p.to_dict(), rate=rate)

@@ -49,11 +49,7 @@ def packed(report: Report, run: str, incarnation: str, lines: tuple[Line, ...]) 
 
 
 def unpacked(message: RunReport) -> Report:
-    """A report as it was.
-
-    Raises:
-      MessageError: its progress makes no sense.
-    """
+    """A report as it was; a MessageError where its progress makes no sense."""
     try:
         progress = GenerationStats.from_dict(message.progress)
     except ValueError as error:

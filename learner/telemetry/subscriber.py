@@ -31,7 +31,7 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
     """
     token, told = keys.learner_token(farm, "*"), False
     while not stopped():
-        runs = sorted(keys.tail(key, keys.learner_token(farm, "")) for key in session.tokens(token, _ANSWER))
+        runs = sorted(keys.run_in(key, keys.learner_token(farm, "")) for key in session.tokens(token, _ANSWER))
         if len(runs) > 1:
             raise ConfigError(f"farm {farm} has several runs: {', '.join(runs)}; choose one with --run")
         if runs:
@@ -147,7 +147,7 @@ class Subscriber:
         """See that a learner that comes back goes on with the run we know."""
         config = self._read(page)
         if self._config is not None:
-            for name, old, new in other(self._config, config):
+            for name, old, new in configs.other(self._config, config):
                 raise RunError(f"run {self._run} began anew: --{name} was {old} and is {new}; start a recorder anew")
         if self._incarnation:
             log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
@@ -159,11 +159,7 @@ class Subscriber:
 
 
 def localised(config: dict[str, Any], files: tuple[Path, ...]) -> dict[str, Any]:
-    """A configuration whose classes in files are looked for in these files.
-
-    Raises:
-      ConfigError: one is in a file that is none of them.
-    """
+    """A configuration whose classes in files are looked for in these files; a ConfigError where one is in no such."""
     out = dict(config)
     for part in ("task", "policy", "algorithm"):
         table = config.get(part)
@@ -175,8 +171,3 @@ def localised(config: dict[str, Any], files: tuple[Path, ...]) -> dict[str, Any]
                 raise ConfigError(f"the run's {part} is a class in {name}: copy it here, and give --allow-file {name}")
             out[part] = {**table, "name": f"{here[0].resolve()}:{inside}"}
     return out
-
-
-def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Settings by which two configurations are of different runs: all but the number of generations."""
-    return (change for change in configs.changes(old, new) if change[0] != "generations")

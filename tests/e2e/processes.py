@@ -70,8 +70,10 @@ class Farm:
         return json.loads((self.folder / path).read_text())
 
     def progress(self, run: str) -> list[dict[str, Any]]:
+        """A run's generations so far; a line that is being written while this looks does not count yet."""
         path = self.folder / "runs" / run / "progress.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        whole = path.read_text().rpartition("\n")[0] if path.exists() else ""
+        return [json.loads(line) for line in whole.splitlines()]
 
     def wait_for(self, event: Callable[[], object], seconds: float = 60) -> None:
         """Look for an event until it is there."""

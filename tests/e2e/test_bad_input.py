@@ -2,8 +2,11 @@
 
 import json
 import logging
+import re
 import shutil
+import signal
 import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,11 +21,21 @@ MISTAKES = [
     (("run", "--preset", "best"), "unknown preset 'best' of task finger-gait; known are default, thesis"),
     (("run", "--state", "smell"), "unknown state base 'smell'; known are joints, joints+contacts, tactile"),
     (("run", "--algorithm", "guess"), "unknown algorithm 'guess'; known are pgpe"),
+    (("run", "--algorithm", "ars", "--top", "17"), "top is 17; expected 1 to 16 (pairs)"),
+    (("run", "--algorithm", "snes", "--pairs", "0"), "pairs is 0; expected 1 or more"),
+    (("run", "--algorithm", "sep-cma", "--population", "3"), "population is 3; expected 4 or more"),
+    (("run", "--algorithm", "cma-es", "--policy", "mlp"), "parameters; cma-es takes 1 to 1000"),
     (("run", "--backend", "gpu"), "unknown backend 'gpu'; known are cpu"),
     (("run", "--object", "cat"), "unknown object 'cat'; known are bar"),
-    (("run", "--policy", "pid"), "unknown policy 'pid'; known are direct, projected, kernel, cosine, or FILE.py:CLASS"),
+    (("run", "--policy", "pid"), "unknown policy 'pid'; known are direct, projected, kernel, cosine"),
+    (("run", "--policy", "mlp", "--layers", "0"), "layers has 0; expected 1 to 10000 units in each"),
+    (("run", "--policy", "mlp", *("--layers", "9999") * 2), "100159991 parameters; at most 4194304 fit into a message"),
+    (("run", "--policy", "rbf", "--centres", "0"), "centres is 0; expected 1 to 100000"),
     (("run", "--goal-grip", "fist"), "unknown grip 'fist'; known are index+thumb"),
-    (("run", "--task", "juggling"), "unknown task 'juggling'; known are finger-gait, gym, or FILE.py:CLASS"),
+    (
+        ("run", "--task", "juggling"),
+        "unknown task 'juggling'; known are finger-gait, fragile-bar, gym, or",
+    ),
     (
         ("run", "--task", "gym:Swimmr-v5"),
         "task gym:Swimmr-v5: Environment `Swimmr` doesn't exist. Did you mean: `Swimmer`?",
@@ -95,6 +108,59 @@ def test_mistakes(
 def test_a_mistake_of_a_program(farm: Farm) -> None:
     said = farm.call("run", "--seed", "-1", status=2, timeout=60)
     assert said == "farm: seed is -1; expected 0 to 4294967295\n"
+
+
+SHELL = [
+    ("{farm} --help > /dev/full", 1, "No space left on device; make room|cannot write to standard output: No space"),
+    ("{farm} tasks > /dev/full", 1, "No space left on device; make room|cannot write to standard output: No space"),
+    ("{farm} runs >&-", 1, "standard output is closed; > /dev/null discards it"),
+    ("{farm} runs 2>&- >&-", 1, ""),
+    ("mkfifo p; exec 3<>p 4>p 3<&-; {farm} --help >&4", 141, ""),
+    ("mkfifo p; exec 3<>p 4>p 3<&-; {farm} tasks >&4", 141, ""),
+    ("mkdir d; cd d; rmdir ../d; {farm} new-task T", 2, "cannot write"),
+    ("mkdir d; cd d; rmdir ../d; {farm} run", 1, "No such file or directory; the working folder is gone, change to an"),
+    ("unset MUJOCO_GL; ulimit -n 5; {farm} tasks", 1, "Too many open files; allow more of them: ulimit -n 1024"),
+    ("ulimit -n 20; {farm} run --no-record", 1, "a process may open 20 files here, 64 are needed: ulimit -n 1024"),
+    ("ulimit -n 20; {farm} status", 1, "a process may open 20 files here, 64 are needed: ulimit -n 1024"),
+    ("ln -s nowhere/x l; {farm} run --out l", 2, "l is a link to nowhere/x, which is no folder"),
+    ("touch f; {farm} run --out f/x", 2, "f is a file"),
+]
+
+
+@pytest.mark.parametrize(("line", "status", "words"), SHELL, ids=[line for line, _, _ in SHELL])
+def test_a_place_where_little_is_possible(line: str, status: int, words: str, farm: Farm) -> None:
+    process = farm.start_program("bash", "-c", line.format(farm=f"{sys.executable} -P -m farm"))
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == status, said
+    assert len(said.splitlines()) == bool(words), said
+    assert re.search(words, said), said
+    assert not (farm.folder / "runs").exists()
+
+
+INTERRUPTED = """
+import os, signal, sys
+
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, signal.SIG_DFL)  # these tests may run in the background, where Ctrl-C is ignored
+
+def hook(event, arguments):
+    if event == "import" and arguments[0] == MODULE:
+        os.kill(os.getpid(), NUMBER)
+
+sys.addaudithook(hook)
+from farm.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("module", ["farm.plugins", "numpy", "rich.console", "mujoco"])
+def test_ended_among_imports(module: str, number: int, farm: Farm) -> None:
+    """When it begins to import that; the last one is imported by the command itself."""
+    code = INTERRUPTED.replace("MODULE", repr(module)).replace("NUMBER", str(int(number)))
+    process = farm.start_python("-P", "-c", code, "tasks")
+    said, _ = process.communicate(timeout=60)
+    assert (said, process.returncode) in [("", -number), ("farm: stopped before the end\n", 130)]
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ def test_a_run_that_starts_from_another(farm: Farm, sigma: str) -> None:
     farm.call("run", "--name", "c", "--generations", "1", "--seed", "7", "--init-from", "runs/a", *flags)
     a, b, c = (checkpoints.load(RunFolder(farm.folder / "runs" / name).checkpoint) for name in "abc")
     assert np.array_equal(b.state["mu"], a.state["mu"])
-    expected = a.state["sigma"] if sigma == "run" else np.full_like(a.state["sigma"], 0.8)
+    expected = a.state["sigma"] if sigma == "run" else np.full_like(a.state["sigma"], 0.3)
     assert np.array_equal(b.state["sigma"], expected)
     assert np.array_equal(b.constants["frequencies"], a.constants["frequencies"])
     assert np.array_equal(c.constants["phases"], a.constants["phases"]), "they belong to the parameters"

@@ -32,6 +32,7 @@ from learner.replay import LoadedPolicy, Replay, load
 from learner.run_folder import RunFolder
 
 GENERATIONS = 6
+FOURIER = ("direct", "projected", "cosine")
 PLAY_POLICY = Path(__file__).parents[2] / "examples" / "play_policy.py"
 
 
@@ -290,12 +291,25 @@ def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, na
     assert returned(bare(done, path)) == done.summary(name)["mean_policy_return"]
 
 
+def test_a_policy_is_exported_for_other_runtimes(done: Farm, tmp_path: Path) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    done.call("export", "runs/a", str(tmp_path / "p.onnx"))
+    session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
+    policy, mu = load(folder(done).path).problem.policy, stored(done).mu
+    x = np.full((1, policy.spec.observation), 0.5)
+    (action,) = session.run(None, {"observation": x})
+    np.testing.assert_allclose(action, policy.act(policy.prepare(mu[None]), x), rtol=1e-11, atol=1e-12)
+
+
+EXPORTED = [(policy, "joints+tactile") for policy in (*FOURIER, "mlp", "rbf", "weighted-kernel", "linear")]
+EXPORTED += [("kernel", state) for state in STATES]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("policy", ["direct", "projected", "kernel", "cosine"])
+@pytest.mark.parametrize(("policy", "state"), EXPORTED)
 def test_every_policy_and_state_can_be_exported(farm: Farm, policy: str, state: str) -> None:
     settings = ("--policy", policy, "--state", state, "--initial-sigma", "0.3")
-    settings += () if policy == "kernel" else ("--features", "40")
+    settings += ("--features", "40") if policy in FOURIER else ()
     farm.call("run", "--name", "r", "--pairs", "3", "--generations", "2", "--no-record", *settings)
     farm.call("export", "runs/r", "p.npz")
     assert returned(bare(farm, farm.folder / "p.npz")) == farm.summary("r")["mean_policy_return"]
@@ -419,7 +433,7 @@ MISTAKES = [
     (("compare", "runs/a", "runs/b", "--to", "/proc/c.rrd"), 1, "cannot write /proc/c.rrd"),
     (("view", "runs/a", "nowhere"), 2, "no recording in nowhere"),
     (("export", "nowhere", "p.npz"), 2, "nowhere is not a run's folder"),
-    (("export", "runs/a", "p.zip"), 2, "p.zip: expected a name that ends in .npz"),
+    (("export", "runs/a", "p.zip"), 2, "p.zip: expected a name that ends in .npz or .onnx"),
     (("export", "runs/a", "no/p.npz"), 1, "cannot write no/p.npz: No such file or directory"),
     (("export", "runs/a", "p.npz", "--generation", "99"), 2, "generation 99 is not stored"),
     (("play", "nowhere"), 2, "nowhere is not a run's folder"),

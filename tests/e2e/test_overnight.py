@@ -12,7 +12,7 @@ from processes import Farm, children
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
-RUN = ("--name", "r", "--generations", "400", "--seed", "5", "--no-record")
+RUN = ("--name", "r", "--generations", "1200", "--seed", "5", "--no-record")
 EVERY = 10.0
 """Between two deaths [s]."""
 

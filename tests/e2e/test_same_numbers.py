@@ -154,8 +154,14 @@ PROCESSORS = {
         ("--generations", "6"),
         ("--generations", "3", "--policy", "projected", "--features", "500", "--state", "joints+tactile"),
         ("--generations", "3", "--policy", "cosine", "--features", "100", "--optimiser", "adam", "--perturb"),
+        ("--generations", "3", "--policy", "mlp", "--normalise", "--state", "joints+contacts"),
+        ("--generations", "3", "--policy", "rbf", "--normalise"),
+        ("--generations", "3", "--policy", "weighted-kernel", "--state", "joints+tactile"),
+        ("--generations", "3", "--start", "fitted", "--state", "tactile"),
+        ("--generations", "4", "--policy", "weighted-kernel", "--algorithm", "snes"),
+        ("--generations", "4", "--policy", "linear", "--algorithm", "ars", "--normalise"),
     ],
-    ids=["kernel", "projected", "cosine"],
+    ids=["kernel", "projected", "cosine", "mlp", "rbf", "weighted-kernel", "fitted", "snes", "ars"],
 )
 def test_any_processor(farm: Farm, monkeypatch: pytest.MonkeyPatch, settings: tuple[str, ...]) -> None:
     monkeypatch.setenv("PYTHONWARNINGS", "ignore")  # numpy's, that a processor has no such features anyway

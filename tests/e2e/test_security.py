@@ -61,7 +61,7 @@ def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Res
     """Splendid returns for every pair."""
     eps = np.zeros((count, 1))
     flags = np.tile([True, False, False, False], (2 * count, 1))
-    given = Simulated(np.full(2 * count, 1000.0), flags, np.zeros((2, 15, 54), dtype="<f4"), ())
+    given = Simulated(np.full(2 * count, 1000.0), flags, np.full(2 * count, 15), np.zeros((2, 15, 54), dtype="<f4"), ())
     jobs = Jobs.exploring(eps, (1, -1), None)
     return Results.carrying(given, jobs, run=run, incarnation=incarnation, round=round_, worker=worker)
 

@@ -3,20 +3,25 @@
 import logging
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from farm.errors import ConfigError
-from farm.net.session import free_endpoint
+from farm.net.session import connect, free_endpoint, listen
+from farm.net.work import Chunk, Failure, Results
 from learner import checkpoint as checkpoints
+from learner.commands.evaluate import evaluate
 from learner.config import RunConfig, configure
 from learner.replay import load
 from learner.run import Placement, open_run
 from learner.run_folder import RunFolder
-from workers.worker import WorkerConfig, work
+from learner.scheduler.scheduler import SchedulerConfig
+from workers.worker import Worker, WorkerConfig
 
 TASK = '''
 import numpy as np
@@ -50,12 +55,31 @@ def cart(tmp_path: Path) -> Path:
     return path
 
 
+class Liar(Worker):
+    """Its returns are too high by their last bit."""
+
+    def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
+        if isinstance(message, Results):
+            message = replace(message, returns=np.nextafter(message.returns, np.inf))
+        super()._answer(chunk, message)
+
+
 @contextmanager
-def workers(endpoint: str, count: int, *files: Path) -> Iterator[None]:
-    """Workers on threads of this process; ended by an event."""
+def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
+    """Workers on threads of this process, some of which lie; ended by an event."""
     stop = threading.Event()
     configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
-    threads = [threading.Thread(target=work, args=(config, stop.is_set)) for config in configs]
+
+    def serve(config: WorkerConfig, kind: type[Worker]) -> None:
+        with connect(config.connect, None, stop.is_set) as session:
+            worker = kind(config, session)
+            worker.join()
+            while not stop.is_set():
+                worker.turn()
+
+    threads = [
+        threading.Thread(target=serve, args=(config, Liar if i < liars else Worker)) for i, config in enumerate(configs)
+    ]
     try:
         for thread in threads:
             thread.start()
@@ -66,10 +90,15 @@ def workers(endpoint: str, count: int, *files: Path) -> Iterator[None]:
             thread.join(20)
 
 
-def learnt(config: RunConfig, path: Path, count: int, *files: Path, resume: bool = False) -> dict[str, Any]:
+def learnt(
+    config: RunConfig, path: Path, count: int, *files: Path, resume: bool = False, liars: int = 0, audit: float = 0.02
+) -> dict[str, Any]:
     """A run by so many workers; what its summary says."""
-    place = Placement(listen=free_endpoint(), record=False)
-    with open_run(config, path, place, resume=resume) as run, workers(place.listen, count, *files):
+    place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
+    with (
+        open_run(config, path, place, resume=resume) as run,
+        workers(place.listen, count, *files, liars=liars),
+    ):
         for _ in run.learn():
             pass
     return run.summary
@@ -87,6 +116,49 @@ def test_a_task_in_a_file_is_learnt_alike_by_any_workers_and_resumed(cart: Path,
     policy = load(tmp_path / "half")
     assert policy.rollout().trajectory.value == one["mean_policy_return"]
     assert policy.rollout().trajectory.channels["place"][0, 0] == 0.5
+
+
+def test_a_host_that_lies_by_a_last_bit_changes_nothing(
+    cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = configure(f"{cart}:Cart", **{**SMALL, "generations": 40})  # long enough for all three to join
+    honest = learnt(config, tmp_path / "honest", 1, cart)
+    shaded = learnt(config, tmp_path / "shaded", 3, cart, liars=1, audit=0.5)
+    assert "host w0 gave other numbers than two other hosts" in caplog.text
+    assert shaded["parameters_sha256"] == honest["parameters_sha256"]
+
+
+def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(cart: Path, tmp_path: Path) -> None:
+    config = configure(f"{cart}:Cart", **SMALL, policy="linear", normalise=True)
+    runs = [learnt(config, tmp_path / str(count), count, cart) for count in (1, 2, 3)]
+    place = Placement(listen=free_endpoint(), record=False)
+    with open_run(config, tmp_path / "death", place) as run, ExitStack() as others:
+        mortal = others.enter_context(ExitStack())
+        mortal.enter_context(workers(place.listen, 1, cart))
+        for report in run.learn():
+            if report.progress.generation == 2:
+                mortal.close()  # with what it holds, and without a word
+                others.enter_context(workers(place.listen, 1, cart))
+    half = learnt(replace(config, generations=3), tmp_path / "half", 2, cart)
+    resumed = learnt(config, tmp_path / "half", 1, cart, resume=True)
+    assert half["parameters_sha256"] != runs[0]["parameters_sha256"]
+    every = [*runs, run.summary, resumed]
+    assert len({each["parameters_sha256"] for each in every}) == 1
+    assert len({(each["mean_policy_return"], each["robust_return"]) for each in every}) == 1
+    policy = load(tmp_path / "half")
+    assert policy.rollout().trajectory.value == runs[0]["mean_policy_return"]
+    assert evaluate(RunFolder.open(tmp_path / "3"), 100, 0)["perturbed"]["return_mean"] == runs[0]["robust_return"]
+
+
+def test_a_fitted_start_is_kept_and_repeated(cart: Path, tmp_path: Path) -> None:
+    config = configure(f"{cart}:Cart", policy="kernel", start="fitted", initial_mu=1.0, generations=2, pairs=3)
+    first = learnt(config, tmp_path / "a", 1, cart)
+    kept = RunFolder.open(tmp_path / "a").read_config()
+    assert kept.policy_config.bandwidth == pytest.approx(0.5 * 1.25**0.5)  # type: ignore[attr-defined]
+    assert kept.algorithm_config.initial_sigma == kept.policy_config.bandwidth  # type: ignore[attr-defined]  # d = 2
+    assert learnt(kept, tmp_path / "b", 1, cart)["parameters_sha256"] == first["parameters_sha256"]
+    longer = replace(kept, generations=3)
+    assert learnt(longer, tmp_path / "a", 1, cart, resume=True)["generations"] == 3
 
 
 def test_a_file_is_served_only_where_it_is_allowed(
@@ -148,3 +220,32 @@ def test_an_error_in_a_task_of_ones_own_is_named(cart: Path, tmp_path: Path) -> 
     cart.write_text(TASK.replace("import numpy", "import nunpy"))
     with pytest.raises(ConfigError, match=r"cart.py cannot be imported: line 2: ModuleNotFoundError"):
         configure(f"{cart}:Cart")
+
+
+@pytest.mark.parametrize("_", range(3))
+def test_of_two_learners_of_one_name_that_start_together_one_gives_way(cart: Path, tmp_path: Path, _: int) -> None:
+    config = configure(f"{cart}:Cart", **{**SMALL, "generations": 1})
+    place = Placement(connect=(free_endpoint(),), record=False)
+    together, told, refused, done = threading.Barrier(2), threading.Event(), [], []
+
+    def begin(folder: Path) -> None:
+        together.wait(20)
+        try:
+            with open_run(config, folder / "same", place) as run:
+                done.extend(run.learn())
+        except ConfigError as error:
+            refused.append((folder, str(error)))
+            told.set()
+
+    with listen(place.connect[0], "farm"):
+        threads = [threading.Thread(target=begin, args=(tmp_path / name,)) for name in "ab"]
+        for thread in threads:
+            thread.start()
+        assert told.wait(30)
+        with workers(place.connect[0], 1, cart):
+            for thread in threads:
+                thread.join(30)
+    assert len(done) == 1
+    ((folder, said),) = refused
+    assert said == "a learner of run same is on farm farm already: take another --name"
+    assert not (folder / "same").exists()

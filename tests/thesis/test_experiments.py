@@ -33,7 +33,7 @@ from farm.net.stats import GenerationStats
 from learner.config import RunConfig, configure, to_dict
 from learner.run_folder import RunFolder
 from learner.setup import problem
-from learner.sweep import over, todo
+from learner.sweep import todo
 
 
 def made(returns: np.ndarray, success: np.ndarray | None = None, **changes: object) -> Series:
@@ -290,8 +290,8 @@ def test_an_unknown_experiment_names_the_known_ones():
 
 def test_runs_that_are_over_are_not_repeated_and_failed_ones_are(tmp_path):
     for state, expected in (("finished", True), ("diverged", True), ("failed", False), ("interrupted", False)):
-        assert over(folder_with(tmp_path / state, 3, state)) is expected
-    assert not over(RunFolder(tmp_path / "none"))
+        assert (not todo([folder_with(tmp_path / state, 3, state).path])) is expected
+    assert todo([tmp_path / "none"])
 
 
 # ---------------------------------------------------------------- figures

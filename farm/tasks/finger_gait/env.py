@@ -14,11 +14,13 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from farm.arrays import AnyArray, FloatArray
+from farm.sim.channels import Camera
 from farm.sim.engines import DataEngine
+from farm.sim.rendering import aimed
 from farm.sim.scene import quiet
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS, LOWER, UPPER
-from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import TERMS
 from farm.tasks.finger_gait.task import CONTROL_PERIOD, FingerGait, FingerGaitConfig
 from farm.tasks.finger_gait.touch import TAXELS
@@ -37,6 +39,7 @@ FORCE_BOUND: Final = 1000.0
 """A taxel's force is clipped here [N]."""
 
 _SIZE: Final = (480, 640)  # height and width of a picture
+_CAMERA: Final = Camera(lookat=(0.025, 0.009, -0.006), distance=0.4, azimuth=158.0, elevation=-12.0)
 
 
 class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
@@ -54,12 +57,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         action: Literal["offset", "absolute", "increment"] = "offset",
         **task: Any,  # noqa: ANN401  fields of TaskConfig, checked there
     ) -> None:
-        """Close the grips once.
-
-        Args:
-          render_mode: rgb_array, or None for no pictures.
-          action: what an action is, see PolicyConfig.
-          task: settings of TaskConfig.
+        """Close the grips once; action and others are settings of the task.
 
         Raises:
           ConfigError: a setting makes no sense.
@@ -111,10 +109,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         data = mujoco.MjData(model)
         data.qpos[:] = self._sim.engine.field("qpos")[0]
         mujoco.mj_forward(model, data)
-        camera = mujoco.MjvCamera()
-        camera.lookat[:] = (0.025, 0.009, -0.006)
-        camera.distance, camera.azimuth, camera.elevation = 0.4, 158.0, -12.0
-        self._renderer.update_scene(data, camera)
+        self._renderer.update_scene(data, aimed(mujoco.MjvCamera(), _CAMERA))
         return self._renderer.render()
 
     def close(self) -> None:
@@ -134,7 +129,7 @@ def _observed(config: FingerGaitConfig) -> tuple[FloatArray, FloatArray]:
         joints = np.full((1, len(JOINTS)), joint * config.joints_scale)
         images = np.full((1, len(FINGERS), TAXELS), force * config.tactile_scale)
         points = np.full((1, len(FINGERS), 3), point * config.contacts_scale)
-        return STATES[config.state].observe(joints, images, points)[0]
+        return STATES[config.state].observe(Felt(joints, images, points))[0]
 
     return x(-JOINT_BOUND, 0.0, -1.0), x(JOINT_BOUND, FORCE_BOUND, 1.0)
 

@@ -47,13 +47,13 @@ class Grasping:
         self.centre = self.data.xpos[scene.object_body].copy()
         self.contact = _BENT.copy()
         for finger in FINGERS:
-            self.contact[list(FINGER_JOINTS[finger])] = self._touch(finger)
+            self.contact[FINGER_JOINTS[finger]] = self._touch(finger)
 
     def command(self, fingers: tuple[str, ...]) -> FloatArray:
         """Joint targets of a grip by these fingers, the others waiting open [rad], (8,)."""
         targets = np.empty(8)
         for finger in FINGERS:
-            joints = list(FINGER_JOINTS[finger])
+            joints = FINGER_JOINTS[finger]
             if finger in fingers:
                 targets[joints] = self.contact[joints] + self._press(finger)
             else:
@@ -82,7 +82,7 @@ class Grasping:
 
     def _distance(self, finger: str, height: float) -> float:
         """Gap between fingertip and object with the tip at that height [m]."""
-        joints = list(FINGER_JOINTS[finger])
+        joints = FINGER_JOINTS[finger]
         self.data.qpos[joints] = self._reach(finger, height)
         mujoco.mj_kinematics(self.scene.model, self.data)
         tip = self.scene.tip_geoms[FINGERS.index(finger)]
@@ -93,7 +93,7 @@ class Grasping:
 
     def _reach(self, finger: str, height: float) -> FloatArray:
         """Joint positions with the tip over (under) the object's centre line at a height: damped Gauss-Newton."""
-        joints = list(FINGER_JOINTS[finger])
+        joints = FINGER_JOINTS[finger]
         site = self._site(finger)
         jacobian = np.empty((3, self.scene.model.nv))
         self._place(finger, _BENT)
@@ -109,7 +109,7 @@ class Grasping:
 
     def _press(self, finger: str) -> FloatArray:
         """Target offsets that press with PRESS along the approach: J' F / k [rad]."""
-        joints = list(FINGER_JOINTS[finger])
+        joints = FINGER_JOINTS[finger]
         self._place(finger, self.contact)
         jacobian = np.empty((3, self.scene.model.nv))
         mujoco.mj_jacSite(self.scene.model, self.data, jacobian, None, self._site(finger))
@@ -118,7 +118,7 @@ class Grasping:
 
     def _place(self, finger: str, joints: FloatArray) -> None:
         """Put one finger's joints as given and the others as they began: nothing depends on what was asked before."""
-        index = list(FINGER_JOINTS[finger])
+        index = FINGER_JOINTS[finger]
         self.data.qpos[:8] = _BENT
         self.data.qpos[index] = joints[index]
         mujoco.mj_kinematics(self.scene.model, self.data)

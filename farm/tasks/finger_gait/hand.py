@@ -17,7 +17,7 @@ JOINTS: Final = (
 )
 """The controlled joints, in the order of every (..., 8) array."""
 
-FINGER_JOINTS: Final = {"index": (0, 1, 2), "middle": (3, 4, 5), "thumb": (6, 7)}
+FINGER_JOINTS: Final = {"index": [0, 1, 2], "middle": [3, 4, 5], "thumb": [6, 7]}
 """Which of the controlled joints move a finger."""
 
 LOWER: Final = np.array([-0.196, -0.174, -0.227, -0.196, -0.174, -0.227, -0.189, -0.162])

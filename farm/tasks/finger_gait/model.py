@@ -11,7 +11,6 @@ import mujoco
 
 import farm
 from farm.errors import ConfigError
-from farm.sim.scene import compiled
 from farm.tasks.finger_gait.hand import FINGERS
 
 CONTACTS: Final = 4
@@ -53,11 +52,7 @@ def files(object_name: str) -> dict[str, str]:
 
 
 def mjcf(sources: Mapping[str, str]) -> str:
-    """The texts of `files` as one MJCF text that needs no other file.
-
-    Raises:
-      ConfigError: one is no XML.
-    """
+    """The texts of `files` as one MJCF text that needs no other file; a ConfigError where one is no XML."""
     whole = ET.Element("mujoco")
     for name in ("hand.xml", "finger_gait.xml", "object.xml"):
         try:
@@ -65,15 +60,6 @@ def mjcf(sources: Mapping[str, str]) -> str:
         except (KeyError, ET.ParseError) as error:
             raise ConfigError(f"the hand's model: {name} cannot be read: {error}") from None
     return ET.tostring(whole, encoding="unicode")
-
-
-def load(object_name: str) -> "Hand":
-    """Compile the hand with an object.
-
-    Raises:
-      ConfigError: there is no such object, or MuJoCo refuses it.
-    """
-    return Hand(compiled(mjcf(files(object_name)), f"object {object_name}"), object_name)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
-"""What the controller sees: the four state bases of the thesis (3.5.3).
+"""What the hand feels, and what of it the controller sees: the thesis' four state bases (3.5.3), and two of forces.
 
-Pure, batched. A new state base is one function here and one line in STATES.
+Pure, batched. A new state base is one line in STATES.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,40 +12,61 @@ from farm.arrays import FloatArray
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
 from farm.tasks.finger_gait.touch import TAXELS
 
+_COUNT: Final = len(FINGERS)
+_SIZES: Final = {"joints": len(JOINTS), "images": TAXELS * _COUNT, "points": 3 * _COUNT, "forces": _COUNT}
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What the hand feels, at any number of moments; that of a grip to be reached is its demonstration."""
+
+    joints: FloatArray
+    """q [rad], (..., 8)"""
+    images: FloatArray
+    """c [N], (..., 3, 18)"""
+    points: FloatArray
+    """CP, the contact points [radii], (..., 3, 3)"""
+
+    @property
+    def forces(self) -> FloatArray:
+        """Total force on each fingertip [N], (..., 3)."""
+        return self.images.sum(axis=-1)
+
 
 @dataclass(frozen=True)
 class StateBase:
-    """A state base: how many numbers, whether touch is needed, and how they are made."""
+    """A state base: what is felt of these kinds, one after the other."""
 
-    size: int
-    touch: bool
-    """Whether it needs taxels and contact points (they cost time)."""
-    observe: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-    """(joints (B, 8) [rad], images (B, 3, 18) [N], contact points (B, 3, 3) [radii]) -> x (B, size)."""
+    parts: tuple[str, ...]
+    """Names of what is felt."""
 
+    @property
+    def size(self) -> int:
+        """Length d of the observation."""
+        return sum(self.sizes)
 
-def _joints(joints: FloatArray, images: FloatArray, points: FloatArray) -> FloatArray:  # noqa: ARG001
-    return joints
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Lengths of its parts."""
+        return tuple(_SIZES[part] for part in self.parts)
 
+    @property
+    def touch(self) -> bool:
+        """Whether it needs taxels or contact points (they cost time)."""
+        return self.parts != ("joints",)
 
-def _joints_contacts(joints: FloatArray, images: FloatArray, points: FloatArray) -> FloatArray:  # noqa: ARG001
-    return np.concatenate([joints, points.reshape(len(joints), -1)], axis=1)
+    def observe(self, felt: Felt) -> FloatArray:
+        """The observation x of B moments, (B, d)."""
+        count = len(felt.joints)
+        return np.concatenate([getattr(felt, part).reshape(count, -1) for part in self.parts], axis=1)
 
-
-def _tactile(joints: FloatArray, images: FloatArray, points: FloatArray) -> FloatArray:  # noqa: ARG001
-    return images.reshape(len(joints), -1)
-
-
-def _joints_tactile(joints: FloatArray, images: FloatArray, points: FloatArray) -> FloatArray:  # noqa: ARG001
-    return np.concatenate([joints, images.reshape(len(joints), -1)], axis=1)
-
-
-_POINTS, _IMAGES = 3 * len(FINGERS), TAXELS * len(FINGERS)
 
 STATES: Final[dict[str, StateBase]] = {
-    "joints": StateBase(len(JOINTS), False, _joints),
-    "joints+contacts": StateBase(len(JOINTS) + _POINTS, True, _joints_contacts),
-    "tactile": StateBase(_IMAGES, True, _tactile),
-    "joints+tactile": StateBase(len(JOINTS) + _IMAGES, True, _joints_tactile),
+    "joints": StateBase(("joints",)),
+    "joints+contacts": StateBase(("joints", "points")),
+    "tactile": StateBase(("images",)),
+    "joints+tactile": StateBase(("joints", "images")),
+    "forces": StateBase(("forces",)),
+    "cop": StateBase(("points", "forces")),
 }
-"""State bases by name; 8, 17, 54 and 62 numbers."""
+"""State bases by name; 8, 17, 54, 62, 3 and 12 numbers. The first four are the thesis'."""

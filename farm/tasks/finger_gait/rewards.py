@@ -11,6 +11,7 @@ import numpy as np
 
 from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.tasks.finger_gait.hand import LOWER, UPPER
+from farm.tasks.finger_gait.observations import Felt
 
 TERMS: Final = ("tactile", "joints", "action", "contact points", "drop")
 """What a reward is made of, in the order of every (..., 5) array of terms."""
@@ -49,70 +50,34 @@ WEIGHTS: Final[dict[str, Weights]] = {
 """Rows of Table 3.1 by the controller they were made for."""
 
 
-@dataclass(frozen=True)
-class Demonstration:
-    """The grip to be reached, recorded from the simulation."""
-
-    joints: FloatArray
-    """q_d [rad], (8,)"""
-    images: FloatArray
-    """c_d [N], (3, 18)"""
-    points: FloatArray
-    """CP_d [radii], (3, 3)"""
+Reward = Callable[[Felt, FloatArray, Felt, Weights], FloatArray]
+"""What is felt (..., 8 and so on), the action (..., 8), the demonstration and weights -> terms (..., 5)."""
 
 
-Reward = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, Demonstration, Weights], FloatArray]
-
-
-def basic(
-    joints: FloatArray,
-    images: FloatArray,  # noqa: ARG001
-    points: FloatArray,  # noqa: ARG001
-    action: FloatArray,
-    goal: Demonstration,
-    weights: Weights,
-) -> FloatArray:
+def basic(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
     """Terms of (3.3): joints and action; W_q = a2 / (q_d' q_d) I and W_a = a3 I, which the thesis leaves open."""
-    zero = np.zeros(joints.shape[:-1])
-    near = -weights.joints / float(_squares(goal.joints)) * _squares(joints - goal.joints)
+    zero = np.zeros(felt.joints.shape[:-1])
+    near = -weights.joints / float(_squares(goal.joints)) * _squares(felt.joints - goal.joints)
     return np.stack([zero, near, -weights.action * _squares(action), zero, zero], axis=-1)
 
 
-def full(
-    joints: FloatArray,
-    images: FloatArray,
-    points: FloatArray,
-    action: FloatArray,
-    goal: Demonstration,
-    weights: Weights,
-) -> FloatArray:
+def full(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
     """Terms of (3.5): tactile image, joints, action and contact points."""
-    terms = basic(joints, images, points, action, goal, weights)
-    touch = images.reshape(*images.shape[:-2], -1) - goal.images.reshape(-1)
-    where = (points - goal.points).reshape(*points.shape[:-2], -1)
+    terms = basic(felt, action, goal, weights)
+    touch = felt.images.reshape(*felt.images.shape[:-2], -1) - goal.images.reshape(-1)
+    where = (felt.points - goal.points).reshape(*felt.points.shape[:-2], -1)
     terms[..., 0] = -weights.tactile / float(_squares(goal.images.reshape(-1))) * _squares(touch)
     terms[..., 3] = -weights.contact_points * _squares(where)
     return terms
 
 
-def limited(
-    joints: FloatArray,
-    images: FloatArray,
-    points: FloatArray,
-    action: FloatArray,
-    goal: Demonstration,
-    weights: Weights,
-) -> FloatArray:
+def limited(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
     """Terms of (3.5) with no action punished for more than a joint's range ("limit the action punishment", 4.1.1)."""
-    return full(joints, images, points, np.minimum(np.abs(action), _RANGE), goal, weights)
+    return full(felt, np.minimum(np.abs(action), _RANGE), goal, weights)
 
 
-REWARDS: Final[dict[str, Reward]] = {
-    "basic": basic,
-    "full": full,
-    "limited": limited,
-}
-"""Rewards by name: joints (..., 8), images (..., 3, 18), points (..., 3, 3), action (..., 8) -> terms (..., 5)."""
+REWARDS: Final[dict[str, Reward]] = {"basic": basic, "full": full, "limited": limited}
+"""Rewards by name."""
 
 
 def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArray, weights: Weights) -> FloatArray:
@@ -137,7 +102,7 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
     return out
 
 
-def factors(reward: str, weights: Weights, goal: Demonstration) -> FloatArray:
+def factors(reward: str, weights: Weights, goal: Felt) -> FloatArray:
     """Factors of the squares that a reward takes off: tactile, joints, action, contact points, (4,)."""
     full = float(reward != "basic")
     touch = full * weights.tactile / float(_squares(goal.images.reshape(-1)))

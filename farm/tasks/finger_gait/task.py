@@ -21,8 +21,8 @@ from farm.tasks.base import Camera, Channel, Record, Score, Task, TaskConfig, Ta
 from farm.tasks.finger_gait import model, rewards, touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, TIP_RADIUS, UPPER
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS, Demonstration
+from farm.tasks.finger_gait.observations import STATES, Felt
+from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
 
 TIMESTEP: Final = 0.01
 """A physics step [s]."""
@@ -45,7 +45,8 @@ MAX_SHIFT: Final = 0.015
 MAX_TURN: Final = np.deg2rad(30.0)
 """How far the object may turn from how it was released [rad]."""
 
-_LEAST_COSINE: Final = float(elementary.cos(np.array(0.5 * MAX_TURN)))  # of half that
+LEAST_COSINE: Final = float(elementary.cos(np.array(0.5 * MAX_TURN)))
+"""Cosine of half of that."""
 
 SCALE: Final = (0.8, 1.2)
 """Perturbation: friction and mass are multiplied by U(SCALE)."""
@@ -110,7 +111,6 @@ class FingerGaitConfig(TaskConfig):
     """Factor of the taxels' forces [N] in the state."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if self.object.endswith(".xml"):  # so that a run can be repeated from anywhere
             object.__setattr__(self, "object", str(Path(self.object).resolve()))
@@ -141,13 +141,20 @@ class Perturbation:
     """Added to the joint readings in the state [rad], (T, 8)."""
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, steps: int) -> "Perturbation":
+    def draw(
+        cls,
+        rng: np.random.Generator,
+        steps: int,
+        *,
+        friction: tuple[float, float] = SCALE,
+        mass: tuple[float, float] = SCALE,
+        displacement: float = DISPLACEMENT,
+    ) -> "Perturbation":
         """Draw one, always the same numbers in the same order."""
-        friction, mass = rng.uniform(*SCALE, 2)
         return cls(
-            friction=float(friction),
-            mass=float(mass),
-            displacement=rng.uniform(-DISPLACEMENT, DISPLACEMENT, 3),
+            friction=float(rng.uniform(*friction)),
+            mass=float(rng.uniform(*mass)),
+            displacement=rng.uniform(-displacement, displacement, 3),
             noise=rng.normal(0.0, JOINT_NOISE, (steps, len(JOINTS))),
         )
 
@@ -166,13 +173,14 @@ class FingerGait(Task):
     camera = Camera(lookat=(0.035, 0.014, 0.01), distance=0.34, azimuth=150.0, elevation=-14.0)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
-            "perturb": True, "policy": "kernel", "initial_mu": 1.75, "initial_sigma": 0.8, "sigma_rule": "capped",
+            "perturb": True, "policy": "kernel", "initial_mu": 1.5, "initial_sigma": 0.3, "sigma_rule": "capped",
+            "sigma_floor": 0.02, "pairs": 5, "learning_rate_mu": 0.3, "learning_rate_sigma": 0.1, "generations": 90,
         },
         "thesis": {"policy": "projected", "normaliser": "thesis", "sigma_rule": "bare"},
     }  # fmt: skip
     start_commands: FloatArray
     """Joint targets of the start grip [rad], (8,)."""
-    goal: Demonstration
+    goal: Felt
     """The grip to be reached."""
 
     def files(self) -> dict[str, str]:
@@ -200,6 +208,11 @@ class FingerGait(Task):
             terms=TERMS, success=True, channels=self.channels,
         )  # fmt: skip
 
+    @property
+    def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
+        """Sizes of the state base's parts."""
+        return STATES[self.config.state].sizes
+
     # Beginning a rollout
 
     def setup(self, sim: Sim) -> None:
@@ -208,36 +221,44 @@ class FingerGait(Task):
         Raises:
           ConfigError: the fingers cannot reach the object, or a grip does not hold it.
         """
+        grasping = self._find_start(sim)
+        goal = grasping.command(GRIPS[self.config.goal_grip])
+        self.goal = self._demonstrate(sim, self.config.goal_grip, goal)
+
+    def _find_start(self, sim: Sim) -> Grasping:
+        """Find the commands of the start grip, and see that it holds the object."""
         sim.begin(1)
         self.measure(sim)  # asked for before the search for the grip, which would begin again otherwise
         grasping = Grasping(self.hand)
         self._waiting = grasping.command(())
         self.start_commands = grasping.command(GRIPS[self.config.start_grip])
         self._demonstrate(sim, self.config.start_grip, self.start_commands)
-        goal = grasping.command(GRIPS[self.config.goal_grip])
-        self.goal = self._demonstrate(sim, self.config.goal_grip, goal)
+        return grasping
 
-    def _demonstrate(self, sim: Sim, grip: str, commands: FloatArray) -> Demonstration:
+    def _demonstrate(self, sim: Sim, grip: str, commands: FloatArray) -> Felt:
         """Close a grip, release, let it settle, and record it."""
         sim.begin(1)
         self._close(sim, commands, np.zeros((1, 3)))
         sim.step(SETTLE)
         felt = self.measure(sim)
-        joints, images = sim.qpos[0, : len(JOINTS)].copy(), touch.image(felt["force"], felt["place"])
+        joints, images = sim.qpos[0, : len(JOINTS)].copy(), touch.images(felt)
         sim.step(HOLD - SETTLE)
         if not touching(self.measure(sim)["force"])[0]:
             raise ConfigError(f"grip {grip!r} does not hold object {self.hand.object_name!r}; take another grip")
-        return Demonstration(joints=joints, images=images[0], points=touch.contact_points(images)[0])
+        return Felt(joints=joints, images=images[0], points=touch.contact_points(images)[0])
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
         """Set friction and mass, close the start grip round the frozen object, and release it."""
         nominal = Perturbation.none(self.steps)
-        drawn = [nominal if rng is None else Perturbation.draw(rng, self.steps) for rng in rngs]
+        drawn = [nominal if rng is None else self._drawn(rng) for rng in rngs]
         if self.config.friction != 1.0 or any(each is not nominal for each in drawn):
             self._set_conditions(sim, drawn)
         self._close(sim, self.start_commands, np.stack([each.displacement for each in drawn]))
         sim.own["noise"] = np.stack([each.noise for each in drawn])
         sim.own["target"] = np.tile(self.start_commands, (len(drawn), 1))
+
+    def _drawn(self, rng: np.random.Generator) -> Perturbation:
+        return Perturbation.draw(rng, self.steps)
 
     def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
         friction, mass, inertia = (sim.expand(f) for f in ("geom_friction", "body_mass", "body_inertia"))
@@ -261,14 +282,16 @@ class FingerGait(Task):
     # A control step
 
     def measure(self, sim: Sim) -> dict[str, FloatArray]:
-        """Forces (B, 3, C) [N] as of the last physics step's beginning, where they act in the fingertips' frames
-        (B, 3, C, 3) [m], and joint targets (B, 8) [rad]."""  # noqa: D205, D209
-        count, sensors = len(sim), _sensors(sim)
-        axes = sim.site_xmat[:, self.hand.tip_sites].reshape(count, len(FINGERS), 1, 3, 3)
-        away = sensors[..., 4:7] - sim.site_xpos[:, self.hand.tip_sites][:, :, None, :]
-        place = axes[..., 0, :] * away[..., 0:1] + axes[..., 1, :] * away[..., 1:2] + axes[..., 2, :] * away[..., 2:3]
-        found = sensors[..., 0] > 0
-        return {"force": _force(sensors), "place": np.where(found[..., None], place, 0.0), "target": sim.ctrl}
+        """Normal forces of the contacts (B, 3, C) [N] as of the beginning of the last physics step, where they act
+        (B, 3, C, 3) [m], the fingertips' positions (B, 3, 3) [m] and axes (B, 3, 9), and joint targets (B, 8) [rad].
+
+        `touch.place` puts them into the fingertips' frames, once for all frames of a batch.
+        """  # noqa: D205
+        sensors, tips = _sensors(sim), self.hand.tip_sites
+        return {
+            "force": _force(sensors), "contact": sensors[..., 4:7], "tip": sim.site_xpos[:, tips],
+            "axes": sim.site_xmat[:, tips], "target": sim.ctrl,
+        }  # fmt: skip
 
     def observe(self, sim: Sim) -> FloatArray:
         """The state base's x, (B, d)."""
@@ -277,10 +300,10 @@ class FingerGait(Task):
         images = points = joints  # not looked at by a state base without touch
         if state.touch:
             felt = self.measure(sim)
-            images = touch.image(felt["force"], felt["place"])
+            images = touch.images(felt)
             points = touch.contact_points(images) * config.contacts_scale
             images = images * config.tactile_scale
-        return state.observe(joints * config.joints_scale, images, points)
+        return state.observe(Felt(joints * config.joints_scale, images, points))
 
     def act(self, sim: Sim, action: FloatArray) -> FloatArray:
         """Joint targets of raw actions (B, 8) [rad], finite."""
@@ -293,19 +316,20 @@ class FingerGait(Task):
 
     def ended(self, sim: Sim) -> BoolArray:
         """Where no fingertip touches the object any more."""
-        return ~touching(_force(_sensors(sim)))
+        sensors = _sensors(sim)
+        return np.asarray(~((sensors[..., 0] > 0) & (sensors[..., 1] > 0)).any(axis=(1, 2)))
 
     # Whole rollouts
 
     def score(self, record: Record) -> Score:
         """Reward terms and success of whole rollouts: touch is computed once for all of their steps."""
         force, joints = record.frames["force"], record.frames["qpos"][..., : len(JOINTS)]
-        images = touch.image(force, record.frames["place"])
-        points = touch.contact_points(images)
+        images = touch.images(record.frames)
+        felt = Felt(joints, images, touch.contact_points(images))
         dropped = ~record.failed & ~touching(force[np.arange(len(record.steps)), record.steps - 1])
         weights = WEIGHTS[self.config.weights]
         with np.errstate(over="ignore", invalid="ignore"):
-            reward = REWARDS[self.config.reward](joints, images, points, record.actions, self.goal, weights)
+            reward = REWARDS[self.config.reward](felt, record.actions, self.goal, weights)
         terms = rewards.end(reward, record.steps, dropped, record.failed, weights)
         return Score(terms, ~(dropped | record.failed) & self._success(record))
 
@@ -327,11 +351,8 @@ class FingerGait(Task):
         bodies = tuple(self.model.body(int(tip.bodyid[0])).name for tip in tips)
         places = np.stack([tip.pos + touch.positions() for tip in tips])
         fingers: dict[str, Any] = {"labels": FINGERS, "colours": _COLOURS, "unit": "N"}
-        joints: dict[str, Any] = {
-            "labels": tuple(n.replace("_", " ") for n in JOINTS),
-            "colours": _joint_colours(),
-            "unit": "rad",
-        }
+        names = tuple(name.replace("_", " ") for name in JOINTS)
+        joints: dict[str, Any] = {"labels": names, "colours": _joint_colours(), "unit": "rad"}
         return (
             Channel(
                 name="tactile", kind="images", shape=(len(FINGERS), *touch.SHAPE), top=2.0, bodies=bodies,
@@ -352,7 +373,7 @@ class FingerGait(Task):
 
     def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """The channels' values, from what was measured."""
-        images = touch.image(frames["force"], frames["place"])
+        images = touch.images(frames)
         points, force = touch.contact_points(images), images.sum(axis=-1)
         centres = np.stack([self.model.geom_pos[tip] for tip in self.hand.tip_geoms])
         length = np.sqrt((points * points).sum(axis=-1, keepdims=True))
@@ -411,17 +432,17 @@ def touching(force: FloatArray) -> BoolArray:
 
 def moved(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """How far poses (..., 7) are from others: shift [m] and angle [rad], to be read, not to decide: see `stayed`."""
-    shift, cosine = _distance(pose, start)
+    shift, cosine = distance(pose, start)
     return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
 
 
 def stayed(pose: FloatArray, start: FloatArray) -> BoolArray:
     """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others, the same on every processor: no arccos."""
-    shift, cosine = _distance(pose, start)
-    return np.asarray((shift <= MAX_SHIFT) & (cosine >= _LEAST_COSINE))
+    shift, cosine = distance(pose, start)
+    return np.asarray((shift <= MAX_SHIFT) & (cosine >= LEAST_COSINE))
 
 
-def _distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+def distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Shift [m] and the cosine of half the angle between poses (..., 7)."""
     difference = pose[..., :3] - start[..., :3]
     shift = np.sqrt((difference * difference).sum(axis=-1))

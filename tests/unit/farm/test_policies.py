@@ -1,6 +1,7 @@
 """Random features and controllers against their formulas; and rows that do not know of their batch."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,17 +11,29 @@ from hypothesis import strategies as st
 from farm.errors import ConfigError, UnservedError
 from farm.policies.base import Policy
 from farm.policies.fourier import Cosine, Direct, FeaturesConfig, Kernel, KernelConfig, Projected
+from farm.policies.networks import Linear, Mlp, MlpConfig
+from farm.policies.radial import Rbf, RbfConfig, WeightedKernel, WeightedKernelConfig
 from farm.tasks.base import TaskSpec
 
 ACTIONS = 3
-KINDS = {"direct": Direct, "projected": Projected, "kernel": Kernel, "cosine": Cosine}
+FOURIER = {"direct": Direct, "projected": Projected, "kernel": Kernel, "cosine": Cosine}
+KINDS = FOURIER | {"linear": Linear, "mlp": Mlp, "rbf": Rbf, "weighted-kernel": WeightedKernel}
 
 
 def make(name: str = "projected", features: int = 50, size: int = 8, seed: int = 0, bandwidth: float = 1.0) -> Policy:
     kind, spec = KINDS[name], TaskSpec(observation=size, action=ACTIONS, steps=1, period=0.1)
-    own = {} if kind is Kernel else {"features": features}
-    config = kind.Config(bandwidth=bandwidth, **own)
-    return kind(config, spec, kind.draw(config, spec, np.random.default_rng(seed)))
+    own = {
+        "kernel": {"bandwidth": bandwidth},
+        "linear": {},
+        "mlp": {"layers": (features, 5)},
+        "rbf": {"centres": features, "bandwidth": bandwidth},
+        "weighted-kernel": {"width": bandwidth},
+    }.get(name, {"features": features, "bandwidth": bandwidth})
+    config, rng = kind.Config(**own), np.random.default_rng(seed)
+    constants = kind.draw(config, spec, rng)
+    if kind.standardised:
+        constants |= {"origin": rng.normal(size=size), "spread": rng.uniform(0.1, 2.0, size)}
+    return kind(config, spec, constants)
 
 
 def states(count, size=8, seed=3):
@@ -101,7 +114,7 @@ def test_constants_of_another_size_are_a_clear_error(name, wrong):
 # ---------------------------------------------------------------- controllers
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", FOURIER)
 @pytest.mark.parametrize("bandwidth", [1.0, 0.4])
 def test_actions_are_as_written(name, bandwidth):
     policy = make(name, features=20, bandwidth=bandwidth)
@@ -119,6 +132,54 @@ def test_actions_are_as_written(name, bandwidth):
             else:
                 expected = sum(a * b for a, b in zip(parts, z, strict=True))
             assert actions[i, joint] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def plain(policy, theta, x):
+    """One rollout's actions (A,), by numpy's own products and functions."""
+    config, a, d = policy.config, ACTIONS, len(x)
+    if isinstance(policy, Mlp):
+        for inputs, units in pairwise((d, *config.layers, a)):
+            rows, theta = theta[: units * (inputs + 1)].reshape(units, -1), theta[units * (inputs + 1) :]
+            out = rows @ np.append(x, 1.0)
+            x = np.tanh(out)
+        return out
+    if isinstance(policy, Linear):
+        return theta.reshape(a, -1) @ np.append(x, 1.0)
+    if isinstance(policy, Rbf):
+        k = config.centres
+        distance = np.linalg.norm(theta[: k * d].reshape(k, d) - x, axis=1)
+        return theta[k * d :].reshape(a, k) @ np.exp(-(distance**2) / (2 * config.bandwidth**2))
+    rows, y = theta.reshape(a, -1), (x - policy.constants["origin"]) / policy.constants["spread"]
+    distance = np.linalg.norm(rows[:, :-1] - y, axis=1)
+    return config.weight_scale * rows[:, -1] * np.exp(-(distance**2) / (2 * d * config.width**2))
+
+
+@pytest.mark.parametrize("name", set(KINDS) - set(FOURIER))
+@pytest.mark.parametrize("size", [1, 8, 62])
+def test_actions_are_those_of_plain_numpy(name, size):
+    policy = make(name, features=7, size=size, bandwidth=1.3)
+    sizes = {"mlp": 7 * (size + 1) + 5 * 8 + 3 * 6, "rbf": 7 * (size + 3)}
+    assert policy.size == sizes.get(name, 3 * (size + 1))
+    theta, x = parameters(policy, 5), states(5, size)
+    wanted = [plain(policy, *row) for row in zip(theta, x, strict=True)]
+    np.testing.assert_allclose(act(policy, theta, x), wanted, rtol=1e-11, atol=1e-13)
+
+
+def test_a_weighted_kernel_begins_at_rest_and_may_act_with_either_sign():
+    policy, x = make("weighted-kernel"), states(4)
+    theta = parameters(policy, 4).reshape(4, ACTIONS, -1)
+    theta[:, :, -1] = [0.0, 2.0, -2.0]
+    actions = act(policy, theta.reshape(4, -1), x)
+    assert (actions[:, 0] == 0.0).all()
+    assert (actions[:, 1] > 0.0).all()
+    assert (actions[:, 2] < 0.0).all()
+
+
+def test_a_weighted_kernel_needs_its_task_s_origin_and_spread():
+    policy = make("weighted-kernel")
+    for constants in ({}, {"origin": np.zeros(8)}, {"origin": np.zeros(8), "spread": np.ones(9)}):
+        with pytest.raises(UnservedError, match="constant '(origin|spread)' of the policy is"):
+            WeightedKernel(policy.config, policy.spec, constants)
 
 
 def test_projected_tends_to_kernel():
@@ -153,7 +214,7 @@ def test_the_kernel_is_one_at_its_centre():
 
 
 @pytest.mark.parametrize("features", [1, 7, 50, 1000])
-@pytest.mark.parametrize("size", [8, 62])
+@pytest.mark.parametrize("size", [1, 8, 62])
 @pytest.mark.parametrize("name", KINDS)
 def test_a_row_is_the_same_whoever_shares_its_batch(name, size, features):
     policy = make(name, features, size)
@@ -222,3 +283,23 @@ def test_a_wrong_setting_is_named(options, message):
     with pytest.raises(ConfigError, match=message):
         FeaturesConfig(**options)
     assert KernelConfig(bandwidth=2).bandwidth == 2.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (MlpConfig, {"layers": ()}, "layers are 0; expected 1 to 20 hidden layers"),
+        (MlpConfig, {"layers": (1,) * 21}, "layers are 21; expected 1 to 20"),
+        (MlpConfig, {"layers": (32, 0)}, "layers has 0; expected 1 to 10000 units in each"),
+        (MlpConfig, {"layers": (10_001,)}, "layers has 10001; expected 1 to 10000"),
+        (MlpConfig, {"layers": (1.5,)}, "layers has 1.5"),
+        (MlpConfig, {"layers": "32"}, "layers is '32'; expected tuple"),
+        (RbfConfig, {"centres": 0}, "centres is 0; expected 1 to 100000"),
+        (RbfConfig, {"bandwidth": -1.0}, "bandwidth is -1.0; expected a positive"),
+        (WeightedKernelConfig, {"width": 0.0}, "width is 0.0; expected a positive"),
+        (WeightedKernelConfig, {"weight_scale": 0.0}, "weight-scale is 0.0; expected a positive"),
+    ],
+)
+def test_a_wrong_setting_of_the_others_is_named(kind, options, message):
+    with pytest.raises(ConfigError, match=message):
+        kind(**options)

@@ -158,6 +158,7 @@ def test_repeated() -> None:
     assert parse("--connect", "a", "--count", "1", "--connect", "b").inner.connect == ("a", "b")
     default = Outer(inner=Inner(connect=("a",)))
     assert parse(default=default).inner.connect == ("a",)
+    assert parse("--connect", "b", "--connect=c", default=default).inner.connect == ("b", "c"), "not behind the default"
 
 
 MISTAKES = [
@@ -222,7 +223,7 @@ def test_every_command_has_a_help(
     assert f"usage: farm {command}" in said
     assert max(len(line) for line in said.splitlines() if not line.startswith("usage")) <= 100
     if command in ("run", "learner"):
-        for part in ("[rad]", "(default: 150)", "--traces {all,extremes,none}", "--task STR"):
+        for part in ("[rad]", "(default: 90)", "--traces {all,extremes,none}", "--task STR"):
             assert part in said
     if command == "worker":
         assert "[s]" in said
@@ -244,3 +245,11 @@ def test_the_front_page(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_mistake_in_a_settings_value_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--features", "many"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_value_nested_beyond_what_can_be_shown() -> None:
+    deep: list[object] = []
+    for _ in range(10_000):
+        deep = [deep]
+    with pytest.raises(ConfigError, match="^config.json: maximum recursion depth exceeded"):
+        from_dict(Everything, {"count": deep}, "config.json")

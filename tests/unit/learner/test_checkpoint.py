@@ -1,10 +1,12 @@
 """Checkpoints: read back bit for bit, and never half: neither when damaged nor when writing fails."""
 
 import errno
+import hashlib
 import os
 from dataclasses import fields, replace
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -62,8 +64,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
         {},
         {"best": None, "replayed": True, "canary": None, "constants": {}, "files": {}, "code": {}},
         {"best": BestRollout(seed=None, theta=EXTREMES)},
+        {
+            "best": BestRollout(seed=None, theta=EXTREMES, normaliser=EXTREMES.reshape(2, 6)),
+            "moments": EXTREMES[:5],
+            "steps": 10**12,
+        },
     ],
-    ids=range(3),
+    ids=range(4),
 )
 def test_there_and_back(tmp_path: Path, changed: dict[str, object]) -> None:
     told = checkpoint(**changed)
@@ -102,6 +109,18 @@ def test_something_appended(tmp_path: Path, whole: bytes) -> None:
     path.write_bytes(whole + b"\0")
     with pytest.raises(CheckpointError, match="truncated or damaged"):
         load(path)
+
+
+def test_of_before_there_were_statistics_of_observations(tmp_path: Path) -> None:
+    path, told = tmp_path / "checkpoint", checkpoint()
+    save(path, told)
+    body = codec.encode(told, 2)
+    head = path.read_bytes()[: -len(body) - hashlib.sha256().digest_size]
+    plain = msgpack.unpackb(body, ext_hook=msgpack.ExtType)
+    del plain["moments"], plain["steps"], plain["best"]["normaliser"]
+    old = msgpack.packb(plain)
+    path.write_bytes(head + hashlib.sha256(old).digest() + old)
+    assert bits(load(path)) == bits(told)
 
 
 def test_of_another_version(tmp_path: Path, whole: bytes) -> None:

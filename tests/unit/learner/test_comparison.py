@@ -8,8 +8,8 @@ import pytest
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
-from learner import comparison
-from learner.comparison import Compared, names, table
+from learner.commands import compare
+from learner.commands.compare import Compared, names, table
 from learner.config import RunConfig, configure
 from learner.run_folder import RunFolder
 
@@ -65,14 +65,14 @@ def test_names_are_as_short_as_they_can_be() -> None:
 def test_a_run_without_a_generation(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "r", RunConfig())
     with pytest.raises(ConfigError, match="has no generation behind it"):
-        comparison.read([folder])
+        compare.read([folder])
 
 
 def test_stored_means(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "r", RunConfig())
     for generation in (1, 2, 3):
         folder.append(progress(generation, False), np.full(4, generation + 0.5), np.ones(4), 3)
-    assert folder.mean(2).tolist() == [2.5] * 4
+    assert folder.mean(2)[0].tolist() == [2.5] * 4
     for wanted, nearest in ((9, 3), (-4, 1)):
         with pytest.raises(ConfigError, match=f"3 from 1 to 3 are, the nearest is {nearest}"):
             folder.mean(wanted)

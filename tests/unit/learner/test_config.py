@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from farm.errors import ConfigError
-from farm.policies.fourier import Cosine, Direct
+from farm.policies.fourier import Cosine, Direct, Kernel
 from farm.tasks.finger_gait.task import FingerGaitConfig
 from learner import config as configs
 from learner.algorithms import PGPE
+from learner.algorithms.snes import SNES
 from learner.config import RunConfig, changed_by, changes, configure, presets
 
 CODE = """
@@ -103,6 +104,7 @@ def test_what_is_left_out_is_the_tasks_first_preset(pole: str, file: Path) -> No
     assert made == configure(pole) == configure(pole, "tall")
     assert configure(pole, "small").policy_config.features == 3
     assert configure(pole, "small").task_config.length == 1.0
+    assert (RunConfig().generations, configure(preset="thesis").generations, made.generations) == (90, 150, 150)
     general = RunConfig(task=f"{file}:Plain")
     assert general == configure(f"{file}:Plain", "default")
     assert (general.policy_config.features, general.algorithm_config.optimiser) == (50, "clipup")
@@ -131,6 +133,16 @@ def test_a_part_that_is_chosen_anew_begins_with_its_own_defaults() -> None:
     assert kept == replace(old, algorithm_config=replace(old.algorithm_config, pairs=4))
     new = changed_by(old, {"policy": "cosine"})
     assert (new.policy_config, new.task_config, new.seed) == (Cosine.Config(), old.task_config, 3)
+
+
+def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_own(pole: str, file: Path) -> None:
+    made = configure(f"{file}:Plain", policy="kernel", algorithm=f"{file}:Walk")
+    assert (made.policy_config, made.algorithm_config.pairs) == (Kernel.Config(bandwidth=1.0), 5)
+    assert configure(pole, "small", policy="cosine").policy_config.features == 3
+    assert configure(algorithm="snes").algorithm_config == SNES()
+    assert configure(algorithm="snes", pairs=3).algorithm_config == SNES(pairs=3)
+    with pytest.raises(ConfigError, match="unknown setting features"):
+        configure(f"{file}:Plain", policy="kernel", features=3)
 
 
 def test_names_that_two_parts_have_are_refused(file: Path) -> None:
@@ -254,7 +266,7 @@ def test_changes_are_told_by_their_flags() -> None:
 
 
 def test_of_another_plug_in_only_what_both_have_is_a_change(file: Path) -> None:
-    walk = changed_by(RunConfig(), {"algorithm": f"{file}:Walk", "stride": 0.5})
+    walk = changed_by(RunConfig(), {"algorithm": f"{file}:Walk", "stride": 0.5, "pairs": 6})
     assert [change[0] for change in changes(RunConfig(), walk)] == ["algorithm", "pairs"]
     assert configs.preset_of(walk) == "own"
     assert configs.from_dict(json.loads(json.dumps(configs.to_dict(walk))), "here") == walk

@@ -15,14 +15,15 @@ import pytest
 import farm
 from farm import plugins
 from farm.errors import CheckpointError, ConfigError, RunError
-from farm.net.work import Jobs, Results
+from farm.moments import normaliser
+from farm.net.work import NOT_NORMALISED, Jobs, Results
+from farm.policies.normalised import Normalised
 from farm.rollouts import served
 from learner import checkpoint as checkpoints
 from learner import setup
 from learner.config import RunConfig, configure
 from learner.learner import REPLAY_EVERY, Learner
 from learner.replay import load
-from learner.run import _resumed
 from learner.run_folder import RunFolder
 from learner.scheduler.round import RoundResults
 from learner.telemetry.report import Report
@@ -72,14 +73,23 @@ class Alone:
         self.admission, self.workers, self.reissued = SimpleNamespace(canary="c"), ("w/1",), 0
         self.problem, self._runner, self._rng = found, found.runner(), np.random.default_rng(seed)
         self.rounds: list[tuple[int, Jobs, str]] = []
+        self.normalisers: list[np.ndarray] = []
 
-    def begin(self, generation: int, mu: np.ndarray, jobs: Jobs, traces: str = "none") -> None:
+    def begin(
+        self,
+        generation: int,
+        mu: np.ndarray,
+        jobs: Jobs,
+        traces: str = "none",
+        normaliser: np.ndarray = NOT_NORMALISED,
+    ) -> None:
         self.rounds.append((generation, jobs, traces))
+        self.normalisers.append(normaliser)
         shapes = self.problem.spec.shapes(len(self.problem.scene.bodies))
-        self._round = RoundResults(jobs, traces, self.problem.spec.trace, shapes)
+        self._round = RoundResults(jobs, traces, self.problem.spec.trace, shapes, normaliser.shape[-1])
         for some in np.array_split(self._rng.permutation(len(jobs)), 3):
             part = jobs.take(sorted(some.tolist()))
-            given = self._runner.run(mu, part, traces)
+            given = self._runner.run(mu, part, traces, normaliser)
             said = Results.carrying(given, part, run="r", incarnation="i", round=0, worker="w/1")
             place = self._round.place(said)
             assert place is not None
@@ -112,7 +122,7 @@ def learnt(config: RunConfig, path: Path) -> list[Report]:
 def taken_up(path: Path, *, mixed: bool = False, **changed: Any) -> tuple[Learner, Alone]:
     folder = RunFolder.open(path)
     config = replace(folder.read_config(), **changed)
-    found, at = _resumed(folder, config, mixed=mixed)
+    found, at = setup.resumed(folder, config, mixed=mixed)
     folder.rewind(at)
     folder.write_config(config)
     return Learner(found, folder, at), Alone(found, 1)
@@ -185,6 +195,36 @@ def test_solved_often_enough_is_the_end(pole: str, tmp_path: Path) -> None:
         setup.problem(config)
 
 
+def test_so_many_steps_are_the_end(pole: str, tmp_path: Path) -> None:
+    config = configure(pole, generations=9, stop_after_steps=2 * 8 * 4 + 1)
+    assert len(learnt(config, tmp_path / "r")) == 3
+    assert checkpoints.load(tmp_path / "r" / "checkpoint").steps == 3 * 8 * 4
+    learnt(replace(config, generations=2), tmp_path / "half")
+    learner, alone = taken_up(tmp_path / "half", generations=9)
+    assert len(list(learner.learn(alone))) == 1  # type: ignore[arg-type]
+    assert learner.over
+    assert learner.summary("finished", 1, None)["steps"] == 3 * 8 * 4
+
+
+def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path) -> None:
+    falling = tmp_path / "falling.py"
+    falling.write_text(POLE + "\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.1\n")
+    config = configure(f"{falling}:Pole", gamma=0.5, generations=1)
+    plain, shifted = (
+        begun(config, tmp_path / "plain"),
+        begun(replace(config, task_config=replace(config.task_config, reward_offset=3.0)), tmp_path / "shifted"),
+    )
+    (first,), (second,) = (list(learner.learn(alone)) for learner, alone in (plain, shifted))  # type: ignore[arg-type]
+    assert second.progress.return_mean == first.progress.return_mean
+    assert second.progress.mean_policy_return == first.progress.mean_policy_return
+    learner, alone = shifted
+    steps, returns = alone.collect().steps[:8], alone.collect().returns[:8]
+    assert len(set(steps.tolist())) > 1
+    told = returns + 3.0 * (1.0 - 0.5**steps) / 0.5
+    assert learner.state.best == pytest.approx(told.max())
+    assert state(tmp_path / "plain") != state(tmp_path / "shifted")
+
+
 def test_physics_that_always_blows_up_is_said_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -233,6 +273,22 @@ def test_a_resumed_run_gives_the_same_numbers(pole: str, tmp_path: Path) -> None
     assert taken_up(tmp_path / "r")[0].over
 
 
+@pytest.mark.parametrize("algorithm", ["pgpe", "snes", "ars", "cma-es", "sep-cma"])
+def test_every_algorithm_is_resumed_to_the_same_bits(pole: str, tmp_path: Path, algorithm: str) -> None:
+    def after(path: Path) -> dict[str, object]:
+        values = checkpoints.load(path / "checkpoint").state
+        return {name: v.tobytes() if isinstance(v, np.ndarray) else v for name, v in values.items()}
+
+    config = configure(pole, algorithm=algorithm, generations=6, policy="linear", normalise=True)
+    reports = learnt(config, tmp_path / "whole")
+    learnt(replace(config, generations=3), tmp_path / "r")
+    learner, alone = taken_up(tmp_path / "r", generations=6)
+    assert len(list(learner.learn(alone))) == 3  # type: ignore[arg-type]
+    assert after(tmp_path / "r") == after(tmp_path / "whole")
+    assert after(tmp_path / "whole")["generation"] == 6
+    assert load(tmp_path / "whole", 5).rollout().trajectory.value == reports[5].progress.mean_policy_return
+
+
 def test_other_settings_are_refused(pole: str, tmp_path: Path) -> None:
     config = configure(pole, generations=1)
     learnt(config, tmp_path / "r")
@@ -272,6 +328,94 @@ def test_a_checkpoint_of_another_algorithms_state(pole: str, tmp_path: Path) -> 
         taken_up(tmp_path / "r")
 
 
+# ---------------------------------------------------------------- normalised observations
+
+
+NORMALISED: dict[str, Any] = {"policy": "linear", "normalise": True, "initial_sigma": 0.5}
+
+
+def observed(found: setup.Problem, rounds: list[tuple[int, Jobs, str]], mus: list[np.ndarray]) -> np.ndarray:
+    """What the exploring rollouts of a run saw, one by one, each generation normalised by those before it."""
+    parts, seen = [], [np.zeros((0, 2))]
+    runner = found.runner()
+    for (_, jobs, _), mu in zip(rounds, mus, strict=True):
+        before = np.concatenate(seen)
+        mean, deviation = (before.mean(axis=0), before.std(axis=0)) if len(before) else (np.zeros(2), np.ones(2))
+        runner.policy = Normalised(found.policy, np.stack([mean, deviation]))
+        for theta, seed in zip(jobs.theta(mu)[:8], jobs.seeds(), strict=False):
+            rollouts = runner.rollouts(theta[None], [seed])
+            qpos = np.concatenate([rollouts.start["qpos"], rollouts.frames["qpos"][0, :-1]])
+            velocity = np.diff(np.concatenate([qpos[:1], qpos]), axis=0) / 0.02  # Euler's, from rest
+            parts.append(np.concatenate([qpos, velocity], axis=1))
+        seen = list(parts)
+    return np.concatenate(parts)
+
+
+def test_observations_are_normalised_by_all_generations_before(pole: str, tmp_path: Path) -> None:
+    learner, alone = begun(configure(pole, **NORMALISED), tmp_path / "r")
+    mus = []
+    for _ in learner.learn(alone):  # type: ignore[arg-type]
+        mus.append(np.array(RunFolder.open(tmp_path / "r").parameters()["mu"][-1]))
+    at = checkpoints.load(tmp_path / "r" / "checkpoint")
+    x = observed(learner.problem, alone.rounds, [np.full(3, 1.0), *mus[:-1]])
+    assert at.moments[0] == len(x) == 3 * 8 * 4, "exploring rollouts alone count"
+    np.testing.assert_allclose(at.moments[1:3], x.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(at.moments[3:], x.var(axis=0) * len(x), rtol=1e-6)
+    wanted = [normaliser(np.zeros(5)), *learner.folder.parameters()["normaliser"]]
+    for (_, jobs, _), sent, own in zip(alone.rounds, alone.normalisers, wanted, strict=False):
+        assert sent[0].tobytes() == own.tobytes()
+        assert jobs.rollouts.sum() >= 9
+    assert wanted[-1].tobytes() == normaliser(at.moments).tobytes()
+
+
+def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(pole: str, tmp_path: Path) -> None:
+    def after(path: Path) -> tuple[bytes, ...]:
+        at = checkpoints.load(path / "checkpoint")
+        assert at.best is not None
+        return (*state(path), at.moments.tobytes(), at.best.normaliser.tobytes())
+
+    learnt(configure(pole, **NORMALISED, generations=6), tmp_path / "whole")
+    found, at = setup.start(configure(pole, **NORMALISED, generations=6), "other")
+    folder = RunFolder.create(tmp_path / "other", found.config)
+    list(Learner(found, folder, at).learn(Alone(found, seed=5)))  # type: ignore[arg-type]
+    learnt(configure(pole, **NORMALISED, generations=3), tmp_path / "r")
+    learner, alone = taken_up(tmp_path / "r", generations=6)
+    list(learner.learn(alone))  # type: ignore[arg-type]
+    assert after(tmp_path / "whole") == after(tmp_path / "other") == after(tmp_path / "r")
+    plain = learnt(configure(pole, **{**NORMALISED, "normalise": False}, generations=6), tmp_path / "plain")
+    assert plain[-1].progress.return_mean != learner.folder.progress()[-1].return_mean
+
+
+def test_every_policy_of_a_normalised_run_is_seen_as_it_was(pole: str, tmp_path: Path) -> None:
+    reports = learnt(configure(pole, **NORMALISED, generations=REPLAY_EVERY + 2), tmp_path / "r")
+    for generation in (0, 1, 5, REPLAY_EVERY + 1):
+        earlier = load(tmp_path / "r", generation)
+        assert earlier.rollout().trajectory.value == reports[generation].progress.mean_policy_return
+    shown = [report for report in reports if report.replay is not None]
+    assert shown
+    for report in shown:  # the best rollout so far, in a round whose observations are normalised otherwise
+        assert report.replay is not None
+        assert report.replay.value == reports[report.progress.generation - 2].progress.best
+
+
+def test_a_run_that_starts_from_a_normalised_one_goes_on_with_its_statistics(pole: str, tmp_path: Path) -> None:
+    learnt(configure(pole, **NORMALISED), tmp_path / "first")
+    other = checkpoints.load(tmp_path / "first" / "checkpoint")
+    _, at = setup.start(configure(pole, **NORMALISED, init_from=str(tmp_path / "first")), "second")
+    assert at.moments.tobytes() == other.moments.tobytes()
+    plain = configure(pole, **{**NORMALISED, "normalise": False}, init_from=str(tmp_path / "first"))
+    with pytest.raises(ConfigError, match="its parameters mean something else"):
+        setup.start(plain, "second")
+
+
+def test_statistics_of_other_observations_are_refused(pole: str, tmp_path: Path) -> None:
+    learnt(configure(pole, **NORMALISED, generations=1), tmp_path / "r")
+    at = checkpoints.load(tmp_path / "r" / "checkpoint")
+    checkpoints.save(tmp_path / "r" / "checkpoint", replace(at, moments=np.zeros(3)))
+    with pytest.raises(CheckpointError, match="its statistics are of other observations than its task's"):
+        taken_up(tmp_path / "r", generations=2)
+
+
 # ---------------------------------------------------------------- beginning from another run
 
 
@@ -298,6 +442,55 @@ def test_a_run_whose_parameters_mean_something_else_is_no_beginning(pole: str, t
             setup.start(configure(pole, init_from=str(tmp_path / "first"), **changed), "second")
     with pytest.raises(ConfigError, match="is not a run's folder"):
         setup.start(configure(pole, init_from=str(tmp_path)), "second")
+
+
+# ---------------------------------------------------------------- a start that fits the observation
+
+
+@pytest.mark.parametrize(("policy", "own"), [("kernel", {}), ("projected", {"features": 5})])
+def test_a_fitted_start(pole: str, policy: str, own: dict[str, Any]) -> None:
+    config = configure(pole, policy=policy, initial_mu=1.5, start="fitted", **own)
+    found = setup.fitted(config)
+    distance = np.hypot(1.5 - 0.2, 1.5)  # qpos and qvel at the start
+    width, sigma = found.policy_config.bandwidth, found.algorithm_config.initial_sigma  # type: ignore[attr-defined]
+    assert distance**2 / (2 * width**2) == pytest.approx(2.0)
+    assert 2 * sigma**2 / (2 * width**2) == pytest.approx(1.0)
+    assert setup.fitted(found) == found, "so that config.json repeats the run"
+    state = setup.start(found, "r")[1].state
+    assert (state["mu"] == 1.5).all()
+    assert (state["sigma"] == sigma).all()
+    printed = replace(config, start="printed")
+    assert setup.fitted(printed) is printed
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({}, "--start fitted is for the policies kernel and projected, not direct"),
+        ({"policy": "kernel", "init_from": "x"}, "--start fitted and --init-from exclude each other"),
+        ({"policy": "kernel", "normalise": True}, "--start fitted and --normalise exclude each other"),
+    ],
+)
+def test_a_start_that_cannot_be_fitted(pole: str, changed: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        setup.fitted(configure(pole, start="fitted", **changed))
+
+
+def test_a_fitted_start_begins_beside_the_observation(pole: str, tmp_path: Path) -> None:
+    (tmp_path / "pole.py").write_text(POLE.replace("0.2 if rng", "0.0 if rng"))
+    with pytest.raises(ConfigError, match="--initial-mu is the observation at the start; take another"):
+        setup.fitted(configure(pole, policy="kernel", initial_mu=0.0, start="fitted"))
+
+
+def test_the_finger_gaits_start_fits_every_state_base() -> None:
+    sizes = {"joints": 8, "joints+contacts": 17, "tactile": 54, "joints+tactile": 62}
+    for state, size in sizes.items():
+        found = setup.fitted(configure(state=state, start="fitted"))
+        width = found.policy_config.bandwidth  # type: ignore[attr-defined]
+        policy = setup.start(found, "r")[0].policy
+        assert 0.1 < width < 10.0
+        assert found.algorithm_config.initial_sigma == pytest.approx(width * np.sqrt(2 / size))  # type: ignore[attr-defined]
+        assert policy.size == 8 * size
 
 
 # ---------------------------------------------------------------- what workers are told

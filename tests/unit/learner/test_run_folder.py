@@ -139,7 +139,7 @@ def test_torn_ends_are_not_read(folder: RunFolder) -> None:
 @pytest.mark.parametrize(
     "tail", [b"\0" * 50, b"\xff\xfe\n", b"[]\n", b"null\n", b'{"version": 1}\n', b'{"version": 2}\n']
 )
-def test_rubbish_ends_what_is_read(folder: RunFolder, tail: bytes) -> None:
+def test_rubbish_is_not_read(folder: RunFolder, tail: bytes) -> None:
     fill(folder, 3)
     with (folder.path / "progress.jsonl").open("ab") as file:
         file.write(tail)
@@ -147,6 +147,79 @@ def test_rubbish_ends_what_is_read(folder: RunFolder, tail: bytes) -> None:
     folder.rewind(checkpoint(3))
     fill(folder, 4, first=4)
     assert folder.progress() == [progress(g) for g in range(1, 5)]
+
+
+def damage(folder: RunFolder, *changes: tuple[int, bytes]) -> bytes:
+    path = folder.path / "progress.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    for number, line in changes:
+        lines[number - 1] = line
+    path.write_bytes(b"".join(lines))
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"\n", b"\x80\0 \n", b'{"version": 2}\n', b"[" * 100_000 + b"\n", b'{"version": 1' + b"1" * 5000 + b"}\n"]
+    + [(json.dumps(progress(g).to_dict()) + "\n").encode() for g in (1, 3, 9000)],
+    ids=["empty", "noise", "fields", "nested", "digits", "an older one", "doubled", "of the future"],
+)
+def test_a_damaged_line_costs_no_other(folder: RunFolder, caplog: pytest.LogCaptureFixture, line: bytes) -> None:
+    fill(folder, 7)
+    content = damage(folder, (4, line))
+    rest = [progress(g) for g in (1, 2, 3, 5, 6, 7)]
+    assert folder.progress() == rest
+    folder.rewind(checkpoint(6))
+    assert folder.progress() == rest[:-1]
+    copy = folder.path / "progress.jsonl.damaged"
+    assert copy.read_bytes() == content
+    (said,) = caplog.messages
+    assert "1 damaged line(s) dropped (line 4), 5 kept" in said or "(line 3), 5 kept" in said
+    assert str(copy) in said
+
+    content = damage(folder, (2, b"{}\n"), (3, b"}\n"))
+    folder.rewind(checkpoint(6))
+    assert copy.read_bytes() != content
+    assert copy.with_name("progress.jsonl.damaged2").read_bytes() == content
+    assert "2 damaged line(s) dropped (line 2, 3), 3 kept" in caplog.messages[1]
+    folder.rewind(checkpoint(6))
+    assert len(caplog.messages) == 2
+    fill(folder, 7, first=7)
+    assert [p.generation for p in folder.progress()] == [1, 5, 6, 7]
+
+
+def test_an_end_torn_off_before_the_checkpoint_is_kept(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    fill(folder, 3)
+    path = folder.path / "progress.jsonl"
+    torn = path.read_bytes()[:-30]
+    path.write_bytes(torn)
+    folder.rewind(checkpoint(3))
+    assert (folder.path / "progress.jsonl.damaged").read_bytes() == torn
+    assert "1 damaged line(s) dropped (line 3), 2 kept" in caplog.text
+
+
+def test_a_crash_tears_off_an_end_without_a_word(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    fill(folder, 4)
+    path = folder.path / "progress.jsonl"
+    path.write_bytes(path.read_bytes()[:-30])
+    folder.rewind(checkpoint(3))
+    assert not caplog.messages
+    assert not list(folder.path.glob("*.damaged*"))
+
+
+def test_what_cannot_be_copied_is_not_cut(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(folder, 3)
+    content = damage(folder, (2, b"{}\n"))
+
+    def full(_: object, to: Path) -> None:
+        to.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        folder.rewind(checkpoint(3))
+    assert (folder.path / "progress.jsonl").read_bytes() == content
+    assert not list(folder.path.glob("*.damaged*"))
 
 
 def test_cut_back_to_the_checkpoint(folder: RunFolder) -> None:
@@ -203,6 +276,21 @@ def test_parameters_are_begun_whole_or_not_at_all(folder: RunFolder, monkeypatch
         (b"\x93\n", "has no readable first line"),
         (b'{"version": 7}\n', "is not of version 1"),
         (b"3\n", "is not of version 1"),
+        (b"[" * 990, "has no readable first line"),
+        *(
+            (f'{{"version": 1, "parameters": {size}, "every": {every}}}\n'.encode() + b"\1" * 80, "is damaged: ")
+            for size, every in (
+                (-1, 1),
+                (0, 1),
+                ("true", 1),
+                ('"5"', 1),
+                (10**30, 1),
+                ("[]", 1),
+                (1, 0),
+                (1, 1.5),
+                (1, 7),
+            )
+        ),
     ],
 )
 def test_parameters_that_are_none(folder: RunFolder, content: bytes, words: str) -> None:
@@ -211,11 +299,32 @@ def test_parameters_that_are_none(folder: RunFolder, content: bytes, words: str)
         folder.parameters()
 
 
+def test_a_wrong_count_of_parameters_cuts_nothing(folder: RunFolder) -> None:
+    fill(folder, 3)
+    path = folder.path / "parameters"
+    path.write_bytes(path.read_bytes().replace(b'"parameters": 5', b'"parameters": 4'))
+    before = path.read_bytes(), (folder.path / "progress.jsonl").read_bytes()
+    with pytest.raises(ConfigError, match="is damaged: its generations do not rise .* moved elsewhere"):
+        folder.rewind(checkpoint(1))
+    path.write_bytes(before[0].replace(b'"parameters": 4', b'"parameters": 500'))
+    with pytest.raises(ConfigError, match="is of 500 parameters, the checkpoint of 5: moved elsewhere"):
+        folder.rewind(checkpoint(1))
+    for rest in (b'5, "observation": 900', b'5, "observation": 1'):
+        path.write_bytes(before[0].replace(b'"parameters": 4', b'"parameters": ' + rest))
+        with pytest.raises(ConfigError, match="is damaged: .* moved elsewhere"):
+            folder.rewind(checkpoint(1))
+    assert (folder.path / "progress.jsonl").read_bytes() == before[1]
+    path.rename(path.with_name("old"))
+    folder.rewind(checkpoint(1))
+    fill(folder, 2, first=2)
+    assert_holds(folder, [2])
+
+
 def test_summaries(folder: RunFolder) -> None:
     assert folder.read_summary() is None
     folder.write_summary({"run": "r", "best_return": None})
     assert folder.read_summary() == {"run": "r", "best_return": None}
-    for content in ("", "{", "[]"):
+    for content in ("", "{", "[]", "[" * 100_000):
         (folder.path / "summary.json").write_text(content)
         assert folder.read_summary() is None
 
@@ -223,3 +332,14 @@ def test_summaries(folder: RunFolder) -> None:
 def test_a_new_run_can_be_discarded(folder: RunFolder) -> None:
     folder.discard()
     assert not folder.path.exists()
+
+
+def test_normalisers_are_kept_where_there_are_some(folder: RunFolder) -> None:
+    seen = np.random.default_rng(0).uniform(size=(4, 2, 3))
+    for generation in (1, 2, 3):
+        folder.append(progress(generation), *ROWS[generation], 10, seen[generation])
+    rows = folder.parameters()
+    assert rows["normaliser"].tobytes() == seen[1:].tobytes()
+    mu, normaliser = folder.mean(2)
+    assert (mu.tobytes(), normaliser.tobytes()) == (ROWS[2][0].tobytes(), seen[2].tobytes())
+    assert "normaliser" in (folder.path / "parameters").read_bytes().partition(b"\n")[0].decode()

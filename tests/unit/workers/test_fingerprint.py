@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from farm import plugins
 from farm.policies import fourier
 from farm.sim.sim import Sim
 from farm.tasks import loop
@@ -33,20 +34,23 @@ def _features(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fourier.Direct, "features", lambda self, x: np.nextafter(whole(self, x), 1.0))
 
 
-def _kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = fourier.Kernel.act
-    monkeypatch.setattr(fourier.Kernel, "act", lambda self, theta, x: np.nextafter(whole(self, theta, x), 2.0))
-
-
 def _physics(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Sim.control
     monkeypatch.setattr(Sim, "control", lambda self, ctrl: whole(self, np.nextafter(ctrl, 1.0)))
 
 
-@pytest.mark.parametrize("change", [_reward, _features, _kernel, _physics])
+@pytest.mark.parametrize("change", [_reward, _features, _physics])
 def test_the_last_bit_of_anything_shows(monkeypatch: pytest.MonkeyPatch, change) -> None:
     before = fresh()
     change(monkeypatch)
     assert fresh() != before
     monkeypatch.undo()
     assert fresh() == before
+
+
+@pytest.mark.parametrize("name", plugins.BUILT_IN["policies"])
+def test_every_built_in_policy_counts(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    before, kind = fresh(), plugins.find("policies", name).target
+    whole = kind.act
+    monkeypatch.setattr(kind, "act", lambda self, theta, x: np.nextafter(whole(self, theta, x), 2.0))
+    assert fresh() != before

@@ -1,190 +1,22 @@
 """A worker and a learner that follows a script: who says what when, what is served, and what is ignored."""
 
-import hashlib
 import logging
-import threading
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from stage import BEGINNING, FARM, Learner, Runner, Stage, at_work, indices, until
 
 from farm import plugins
-from farm.arrays import FloatArray
-from farm.errors import ConfigError, UnservedError
+from farm.errors import ConfigError
 from farm.net import codec, keys
-from farm.net.events import Event
 from farm.net.messages import Refusal, Spec, WorkRequest
-from farm.net.session import Session, connect, free_endpoint, listen
-from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated
+from farm.net.work import Results
 from farm.rollouts import SIMULATION
 from farm.sim.engines import CAPACITY
 from workers import worker as workers
-from workers.worker import Worker, WorkerConfig
-
-FARM, P, WAIT = "try", 3, 20.0
-BEGINNING = Spec(run="", task="made-up", task_config={}, policy="none", policy_config={}, code={})
-
-
-class Runner:
-    """Simulates nothing; a rollout's return is the sum of its parameters."""
-
-    go: ClassVar[threading.Event]
-    made: ClassVar[list[str]]
-    ran: ClassVar[list[str]]
-
-    def __init__(self, name: str, policy: Any, make: Callable[..., Any]) -> None:
-        self.name, self.policy = name, policy
-        self.made.append(name)
-        assert callable(make)
-
-    def run(self, mu: FloatArray, jobs: Jobs, traces: str) -> Simulated:
-        self.ran.append(self.name)
-        self.go.wait(WAIT)
-        if 13 in jobs.indices:
-            raise ArithmeticError("thirteen")
-        returns = jobs.theta(mu).sum(axis=1)
-        shown = np.zeros((len(returns) if traces == "all" else 0, 1, 2), "<f4")
-        return Simulated(returns, np.zeros((len(returns), 4), bool), shown, ())
-
-    def close(self) -> None:
-        pass
-
-
-def served(spec: Spec, files: tuple[Path, ...]) -> tuple[str, Any]:
-    assert files == ()
-    if spec.task == "broken":
-        raise RuntimeError("no such\n  machine")
-    if spec.task == "unknown":
-        raise UnservedError("not here")
-    return spec.run, SimpleNamespace(size=P)
-
-
-class Learner:
-    """One run as a learner shows it; says only what the test says."""
-
-    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING) -> None:
-        self.session, self.run, self.asked = session, run, Counter[str]()
-        self.spec = codec.encode(replace(spec, run=run))
-        self.header = RoundHeader(
-            run=run, incarnation="first", round=2, generation=0, spec=hashlib.sha256(self.spec).hexdigest(),
-            traces="all", mu=np.ones(P),
-        )  # fmt: skip
-        session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
-        session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))
-        session.answer(keys.generation(FARM, run), lambda: self._say("generation", codec.encode(self.header)))
-        session.token(keys.learner_token(FARM, run))
-
-    def _say(self, what: str, payload: bytes) -> bytes:
-        self.asked[what] += 1
-        return payload
-
-    def announce(self) -> None:
-        self.session.publish(keys.generation(FARM, self.run), codec.encode(self.header))
-
-    def send(self, worker: str, *indices: int, **changed: object) -> None:
-        """Jobs of one rollout each, whose eps are their index."""
-        header = self.header
-        jobs = Jobs.exploring(np.array([np.full(len(header.mu), float(i)) for i in indices]), (1,), None)
-        jobs.table[:, 0] = indices
-        values = {"run": self.run, "incarnation": header.incarnation, "round": header.round}
-        chunk = Chunk.carrying(jobs, **(values | changed))  # type: ignore[arg-type]
-        self.session.publish(keys.inbox(FARM, worker), codec.encode(chunk))
-
-
-class Stage:
-    """A farm's network with a place for learners, and one worker at a time on a thread."""
-
-    def __init__(self, session: Session, endpoint: str) -> None:
-        self.session, self._endpoint = session, endpoint
-        self._stop, self._open = threading.Event(), ExitStack()
-        self._hired: list[Worker] = []
-        session.subscribe("want", keys.want(FARM, "**"))
-        session.watch("worker", keys.worker_token(FARM, "**"))
-
-    def hire(self, **changed: Any) -> Worker:
-        config = WorkerConfig(connect=(self._endpoint,), farm=FARM, name="w", **changed)
-        session = self._open.enter_context(connect((self._endpoint,), WAIT, lambda: False))
-        worker = Worker(config, session)
-        self._hired.append(worker)
-        worker.join()
-        thread = threading.Thread(target=self._work, args=(worker,))
-        thread.start()
-        self._open.callback(thread.join)
-        until(lambda: self.session.present(keys.worker_token(FARM, worker.id), 1.0))  # before, it could not be reached
-        return worker
-
-    def _work(self, worker: Worker) -> None:
-        while not self._stop.is_set():
-            worker.turn()
-        worker.leave()
-
-    def next(self, *topics: str, kind: type[object] | None = None) -> tuple[str, object]:
-        """The next message of these topics: its key's tail and what it says."""
-        while True:
-            event = self.session.events.get(timeout=WAIT)
-            if event.topic not in topics:
-                continue
-            if event.topic == "worker":
-                return keys.tail(event.key, keys.worker_token(FARM, "")), event.alive
-            return event.topic, codec.decode(event.payload, kind or (WorkRequest if event.topic == "want" else Results))
-
-    def results(self, *runs: str) -> Results:
-        _, said = self.next(*(f"result of {run}" for run in runs or ("r",)))
-        assert isinstance(said, Results)
-        return said
-
-    def failure(self) -> Failure:
-        _, said = self.next("result of r", kind=Failure)
-        assert isinstance(said, Failure)
-        return said
-
-    def let_go(self) -> None:
-        """Ask the worker to leave, and wake it."""
-        self._stop.set()
-        for worker in self._hired:
-            worker._session.events.put(Event("refused", "", b""))
-
-    def close(self) -> None:
-        self.let_go()
-        Runner.go.set()
-        self._open.close()
-
-
-@pytest.fixture
-def real() -> Iterator[Stage]:
-    """Whose workers simulate."""
-    Runner.go, Runner.made, Runner.ran = threading.Event(), [], []
-    Runner.go.set()
-    endpoint = free_endpoint()
-    with listen(endpoint, FARM) as session:
-        opened = Stage(session, endpoint)
-        yield opened
-        opened.close()
-
-
-@pytest.fixture
-def stage(real: Stage, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    monkeypatch.setattr(workers, "served", served)
-    monkeypatch.setattr(workers, "Runner", Runner)
-    return real
-
-
-def until(event: Callable[[], object]) -> None:
-    end = time.monotonic() + WAIT
-    while not event():
-        assert time.monotonic() < end
-        threading.Event().wait(0.005)
-
-
-def indices(results: Results) -> list[int]:
-    return results.jobs.tolist()
+from workers.worker import WorkerConfig
 
 
 @pytest.mark.parametrize("_", range(3))
@@ -217,28 +49,6 @@ def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
         assert answer.returns.tolist() == [3.0 + 3 * first, 6.0 + 3 * first]
     assert learner.asked == {"generation": 1, "spec": 1}
     assert Runner.made == ["r"]
-
-
-def test_chunks_of_rounds_gone_by_are_dropped(stage: Stage) -> None:
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
-    learner.announce()
-    learner.send(worker.id, 0, round=1)
-    learner.send(worker.id, 1, incarnation="before")
-    learner.send(worker.id, 2)
-    assert indices(stage.results()) == [2]
-
-
-def at_work(stage: Stage) -> tuple[Learner, Worker]:
-    """A worker in the middle of job 0, held up there, with jobs 1 and 2 on their way."""
-    learner, worker = Learner(stage.session, "r"), stage.hire()
-    stage.next("want")
-    Runner.go.clear()
-    learner.send(worker.id, 0)
-    until(lambda: Runner.ran)
-    for index in (1, 2):
-        learner.send(worker.id, index)
-    return learner, worker
 
 
 def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
@@ -355,81 +165,6 @@ def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytes
     assert [r.levelno for r in caplog.records] == [logging.ERROR]
 
 
-def test_messages_it_cannot_read(
-    stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    learner = Learner(stage.session, "r")
-    with monkeypatch.context() as other:
-        other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
-        newer = codec.encode(learner.header)
-    worker = stage.hire()
-    inbox, generation = keys.inbox(FARM, worker.id), keys.generation(FARM, "r")
-    stage.next("worker")
-    for key in (inbox, generation, generation):
-        for payload in (
-            b"",
-            b"\xc1",
-            newer,
-            codec.encode(replace(learner.header, run="a//b")),
-            codec.encode(Refusal(run="r", reason="none")),
-        ):
-            stage.session.publish(key, payload)
-    learner.announce()
-    learner.send(worker.id, 1)
-    assert indices(stage.results()) == [1]
-    said = f"schema version {codec.SCHEMA + 1}, this side speaks {codec.SCHEMA}"
-    until(lambda: sum(said in line for line in caplog.messages) == 2)
-
-
-def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
-    Runner.go.clear()
-    learner.send(worker.id, 1)
-    until(lambda: Runner.ran)
-    learner.send(worker.id, 2)
-    learner.header = replace(learner.header, round=learner.header.round - 1)
-    learner.announce()
-    Runner.go.set()
-    assert [indices(stage.results()) for _ in range(2)] == [[1], [2]]
-
-
-def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_MEMORY", 10_000)
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
-    learner.announce()
-    for i in range(20):  # together three times as much, and each of the last ones too much by itself
-        header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200 if i < 6 else 2000))
-        stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
-    until(lambda: worker._ignored["large"] == 14)
-    for i in range(20):
-        header = replace(learner.header, run=f"another-{i}", mu=np.ones(200))
-        stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
-    until(lambda: "another-19" in worker._runs)
-    learner.send(worker.id, 1)
-    assert indices(stage.results()) == [1], "what was crowded out is asked for again"
-    kept = [run.header for run in worker._runs.values() if run.header]
-    assert sum(header.mu.nbytes for header in kept) <= 10_000
-    monkeypatch.setattr(workers, "IDLE", 0.0)
-    while True:
-        _, want = stage.next("want")
-        assert isinstance(want, WorkRequest)
-        if want.ignored == {"large": 14}:
-            break
-
-
-def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
-    learner.header = replace(learner.header, mu=np.ones(P + 1))
-    learner.send(worker.id, 0)
-    until(lambda: "ignored jobs of run r: not 3 parameters" in caplog.text)
-    learner.header = replace(learner.header, mu=np.ones(P), round=3)
-    learner.send(worker.id, 1)
-    assert indices(stage.results()) == [1]
-
-
 def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
     learner, worker = Learner(stage.session, "r"), stage.hire()
     for _ in range(3):
@@ -438,18 +173,6 @@ def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixtur
     learner.send(worker.id, 0)
     stage.results()
     assert caplog.messages == ["run r does not take this worker: its machine rounds"]
-
-
-def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
-    learner = Learner(stage.session, "r")
-    learner.spec += b" "
-    worker = stage.hire()
-    learner.send(worker.id, 0)
-    until(lambda: "run r does not tell what it simulates; its jobs wait" in caplog.messages)
-    learner.spec = learner.spec[:-1]
-    learner.send(worker.id, 1)
-    assert indices(stage.results()) == [1]
-    assert Runner.made == ["r"]
 
 
 # ---------------------------------------------------------------- classes in files

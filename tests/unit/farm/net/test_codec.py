@@ -459,3 +459,14 @@ def test_mutated_bytes_are_a_message_or_a_message_error(start, length, instead, 
     payload = VALID[:start] + instead + VALID[start + length :]
     never_anything_else(payload * (1 + doubled), (Sample,))
     assert peak_of(payload) < bound(payload)
+
+
+def test_a_timestamp_is_a_number() -> None:
+    """No object of msgpack's own reaches whoever takes a table of anything for JSON."""
+    body = msgpack.unpackb(codec.encode(sample()), ext_hook=msgpack.ExtType)
+    body["settings"] = {"when": msgpack.Timestamp(7, 500_000_000)}
+    settings = codec.decode(msgpack.packb(body), Sample).settings
+    assert settings == {"when": 7.5}
+    body["count"] = msgpack.Timestamp(7, 0)
+    with pytest.raises(MessageError, match="Sample.count"):
+        codec.decode(msgpack.packb(body), Sample)

@@ -87,15 +87,23 @@ MESSAGES = {
         policy_release="b 2", task_release="gymnasium 1.4",
     ),
     "round": RoundHeader(**HEAD, generation=6, spec="0f" * 32, traces="all", mu=RNG.normal(size=P)),
+    "normalised round": RoundHeader(
+        **HEAD, generation=6, spec="0f", traces="all", mu=np.zeros(2), normaliser=RNG.uniform(0.1, 1.0, (2, 2, 3))
+    ),
     "chunk": Chunk.carrying(JOBS, **HEAD),
     "chunk of means": Chunk.carrying(JOBS.take([3]), **HEAD),
     "results": Results(
         **HEAD, worker="host/a1", jobs=np.array([0, 3, 9]), returns=RNG.normal(size=5),
-        flags=RNG.random((5, 4)) < 0.5, traces=RNG.exponential(size=(4, 15, 6)).astype("<f4"), trajectories=(WIRE,),
+        flags=RNG.random((5, 4)) < 0.5,
+        steps=np.arange(1, 6), traces=RNG.exponential(size=(4, 15, 6)).astype("<f4"), trajectories=(WIRE,),
     ),
     "results of one": Results(
         **HEAD, worker="w/1", jobs=np.array([4]), returns=np.zeros(1), flags=np.zeros((1, 4), bool),
-        traces=np.empty((0, 15, 0), "<f4"), trajectories=(),
+        steps=np.ones(1, "<i8"), traces=np.empty((0, 15, 0), "<f4"), trajectories=(),
+    ),
+    "results with moments": Results(
+        **HEAD, worker="w/1", jobs=np.array([4]), returns=np.zeros(2), flags=np.zeros((2, 4), bool),
+        steps=np.ones(2, "<i8"), traces=np.empty((0, 15, 0), "<f4"), trajectories=(), moments=RNG.uniform(size=(2, 7)),
     ),
     "failure": Failure(**HEAD, worker="host/a1", index=3, error="ValueError: so it went"),
     "failure of all": Failure(**HEAD, worker="host/a1", index=None, error="not served"),
@@ -187,6 +195,7 @@ STRANGE = {  # by column
     **{column: (-1, -2, 2**32) for column in range(6, 10)},  # half a seed
 }
 
+NONE = np.zeros(0, "<i8")
 REFUSED = {
     "request": [
         {"credits": -1},
@@ -199,6 +208,16 @@ REFUSED = {
         {"host": "\x1b[2J"},
     ],
     "round": [{"traces": "some"}],
+    "normalised round": [
+        {"normaliser": np.ones((2, 1, 3))},
+        {"normaliser": np.zeros((2, 2, 3))},
+    ],
+    "results with moments": [
+        {"moments": np.zeros((1, 7))},
+        {"moments": np.zeros((2, 6))},
+        {"moments": np.full((2, 7), -1.0)},
+        {"moments": np.array([[1.0, 0.0, 1.0, 1.0, -1.0]] * 2)},
+    ],
     "spec": [
         {"code": {"task": 1}},
         {"files": {"model.xml": None}},
@@ -227,8 +246,11 @@ REFUSED = {
         {"returns": np.zeros(1)},
         {"flags": np.zeros((3, 4), dtype=bool)},
         {"flags": np.zeros((5, 3), dtype=bool)},
+        {"steps": np.ones(4, dtype=np.int64)},
     ],
-    "results of one": [{"jobs": np.zeros(0, "<i8"), "returns": np.zeros(0), "flags": np.zeros((0, 4), bool)}],
+    "results of one": [
+        {"jobs": NONE, "returns": np.zeros(0), "flags": np.zeros((0, 4), bool), "steps": NONE},
+    ],
     "failure": [{"error": text} for text in ("x" * 1001, "two\nlines", "\x1b[2J")],
     "trajectory": [
         {"bodies": np.zeros((3, 3, 7), "<f4")},
@@ -314,7 +336,7 @@ def test_some_jobs_are_the_same_jobs(chosen):
 
 
 def test_results_carry_the_jobs_indices():
-    given_ = Simulated(np.arange(3.0), np.zeros((3, 4), bool), np.zeros((0, 0, 0), "<f4"), (WIRE,))
+    given_ = Simulated(np.arange(3.0), np.zeros((3, 4), bool), np.ones(3, "<i8"), np.zeros((0, 0, 0), "<f4"), (WIRE,))
     made = Results.carrying(given_, JOBS.take([1, 3]), **HEAD, worker="w/1")
     assert codec.decode(codec.encode(made), Results).jobs.tolist() == [1, 3]
 

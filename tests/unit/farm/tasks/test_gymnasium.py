@@ -13,8 +13,7 @@ from farm.errors import ConfigError
 from farm.net.work import Jobs
 from farm.policies.fourier import Direct, FeaturesConfig
 from farm.rollouts import Runner
-from farm.tasks.base import TaskConfig
-from farm.tasks.gymnasium import NOMINAL, Environment, make, reset_seed
+from farm.tasks.gymnasium import NOMINAL, Environment, EnvironmentConfig, make, reset_seed
 from farm.tasks.loop import RETURN_FLOOR
 
 SEED = seeds.training(0, 3, 4)
@@ -22,7 +21,7 @@ SEED = seeds.training(0, 3, 4)
 
 @cache
 def runner(name: str, **settings) -> Runner:
-    task = Environment(TaskConfig(**settings), name)
+    task = Environment(EnvironmentConfig(**settings), name)
     spec, config = task.spec(), FeaturesConfig(features=20)
     return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
 
@@ -31,7 +30,7 @@ def theta_of(made: Runner, count: int = 1, scale: float = 0.5) -> np.ndarray:
     return np.random.default_rng(0).normal(0.0, scale, (count, made.policy.size))
 
 
-@pytest.mark.parametrize("name", ["Pusher-v5", "Hopper-v5", "InvertedPendulum-v5"])
+@pytest.mark.parametrize("name", ["Pusher-v5", "Hopper-v5", "InvertedPendulum-v5", "Ant-v5"])
 @pytest.mark.parametrize("seed", [None, SEED])
 def test_a_rollout_is_a_plain_loops(name, seed):
     made, gamma = runner(name, gamma=0.95), 0.95
@@ -46,14 +45,15 @@ def test_a_rollout_is_a_plain_loops(name, seed):
         x, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
         rewards.append(reward)
         over = terminated or truncated
-    assert found.terms[0, : len(rewards), 0].tolist() == rewards
+    assert found.terms[0, : len(rewards), 0].tolist() == pytest.approx(rewards, rel=0, abs=1e-12)
     assert found.frames["qpos"][0, len(rewards) - 1].tolist() == env.unwrapped.data.qpos.tolist()
-    assert found.returns[0] == sum(gamma**t * reward for t, reward in enumerate(rewards))
+    assert found.returns[0] == pytest.approx(sum(gamma**t * reward for t, reward in enumerate(rewards)), abs=1e-9)
     assert (found.steps[0], found.ended[0], found.failed[0]) == (len(rewards), terminated, False)
 
 
-def test_rollouts_do_not_depend_on_their_batch():
-    made = runner("Hopper-v5")
+@pytest.mark.parametrize("name", ["Hopper-v5", "Ant-v5"])
+def test_rollouts_do_not_depend_on_their_batch(name):
+    made = runner(name)
     seeded = [SEED, None, SEED, (3, 1, 2, 0), None]
     theta = theta_of(made, 5)
     together = made.rollouts(theta, seeded)
@@ -64,8 +64,9 @@ def test_rollouts_do_not_depend_on_their_batch():
         assert alone.frames["qpos"].tobytes() == together.frames["qpos"][row].tobytes()
 
 
-def test_a_pair_starts_alike_and_seeds_differ():
-    made = runner("Reacher-v5")
+@pytest.mark.parametrize("name", ["Reacher-v5", "Ant-v5"])
+def test_a_pair_starts_alike_and_seeds_differ(name):
+    made = runner(name)
     theta = np.repeat(theta_of(made), 3, axis=0)
     start = made.rollouts(theta, [SEED, SEED, seeds.training(0, 3, 5)]).start["qpos"]
     assert start[0].tolist() == start[1].tolist() != start[2].tolist()
@@ -74,20 +75,21 @@ def test_a_pair_starts_alike_and_seeds_differ():
     assert len(drawn) == 100
 
 
-def test_a_trajectory_shows_the_scene_at_control_rate():
-    made = runner("Pusher-v5", steps=5)
+@pytest.mark.parametrize(("name", "parts"), [("Ant-v5", 1), ("Pusher-v5", 5)])
+def test_a_trajectory_shows_the_scene_at_physics_rate_where_it_can(name, parts):
+    made = runner(name, steps=5)
     given = made.run(theta_of(made)[0], Jobs.single(theta_of(made)[0], "physics", SEED))
     [shown] = given.trajectories
     assert shown.fits(made.spec.shapes(len(made.scene.bodies)))
-    np.testing.assert_allclose(shown.times, np.arange(6) * 0.05)
+    np.testing.assert_allclose(shown.times, np.arange(5 * parts + 1) * 0.05 / parts)
     rollouts = made.rollouts(theta_of(made), [SEED])
-    np.testing.assert_allclose(shown.bodies[1:], made.scene.poses(rollouts.frames["qpos"][0]), atol=1e-6)
+    np.testing.assert_allclose(shown.bodies[parts::parts], made.scene.poses(rollouts.frames["qpos"][0]), atol=1e-6)
     assert (shown.value, shown.success) == (rollouts.returns[0], None)
     assert given.traces.size == 0
 
 
 def test_physics_that_blows_up_is_never_good():
-    made = runner("HalfCheetah-v5", steps=50)
+    made = runner("Ant-v5", steps=50)
     theta, own = theta_of(made, scale=5.0), made.sim.engine._envs[0].unwrapped
     before = made.rollouts(theta, [None]).returns[0]
     own.model.opt.timestep = 0.5
@@ -127,7 +129,7 @@ def test_what_cannot_be_learnt_is_one_line(name, line):
 )
 def test_names_that_are_none_are_refused_and_nothing_is_imported(name):
     with pytest.raises(ConfigError, match="gym:NAME-vN"):
-        Environment(TaskConfig(), name)
+        Environment(EnvironmentConfig(), name)
     assert "antigravity" not in sys.modules
 
 
@@ -157,3 +159,41 @@ def test_a_scene_has_names_of_its_own_for_everything(name):
     assert len(set(scene.bodies)) == len(scene.bodies)
     poses = scene.poses(scene.model.qpos0[None])
     np.testing.assert_allclose(np.linalg.norm(poses[..., 3:], axis=-1), 1.0)
+
+
+def test_arguments_of_an_environment():
+    plain, free = (
+        runner("Hopper-v5"),
+        runner("Hopper-v5", env_arg=("terminate_when_unhealthy=false", "healthy_reward=7")),
+    )
+    theta = theta_of(plain)
+    short, long = plain.rollouts(theta, [None]), free.rollouts(theta, [None])
+    assert short.steps[0] < long.steps[0] == 1000
+    at = short.steps[0] - 1
+    assert long.terms[0, :at, 0].tolist() == pytest.approx((short.terms[0, :at, 0] + 6.0).tolist())
+    wide = runner("Hopper-v5", env_arg=("exclude_current_positions_from_observation=false",))
+    assert wide.spec.observation == plain.spec.observation + 1
+    assert EnvironmentConfig(env_arg=("healthy_z_range=[0.1, 9]",)).arguments == {"healthy_z_range": [0.1, 9]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("healthy_reward",), "env-arg is 'healthy_reward'; expected NAME=VALUE"),
+        (("=3",), "env-arg is '=3'; expected NAME=VALUE"),
+        ((3,), "env-arg is '3'; expected NAME=VALUE"),
+        (("healthy_reward=lots",), "env-arg healthy_reward is 'lots'; expected a value of JSON"),
+        (("a=1", "a=2"), "env-arg: a is given twice"),
+        (('xml_file="hopper.xml"',), "env-arg xml_file is not taken: a file does not travel to workers"),
+        (('render_mode="human"',), "env-arg render_mode is not taken"),
+    ],
+)
+def test_arguments_that_make_no_sense(arguments, said):
+    with pytest.raises(ConfigError, match=said):
+        EnvironmentConfig(env_arg=arguments)
+
+
+@pytest.mark.parametrize("argument", ["colour=1", "disable_env_checker=true", "healthy_z_range=3"])
+def test_arguments_that_an_environment_does_not_take(argument):
+    with pytest.raises(ConfigError, match="task gym:Hopper-v5: "):
+        Environment(EnvironmentConfig(env_arg=(argument,)), "Hopper-v5").spec()

@@ -8,7 +8,7 @@ from farm.errors import ConfigError
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, GRIPS, JOINTS, LOWER, TIP_RADIUS, UPPER
 from farm.tasks.finger_gait.model import CONTACT_WIDTH, CONTACTS
-from farm.tasks.finger_gait.task import TIMESTEP
+from farm.tasks.finger_gait.task import TIMESTEP, FingerGait, FingerGaitConfig
 
 BENT = np.array([0.47, 1.09, 0.88, 0.48, 1.11, 0.88, 0.70, 0.86])
 LINKS = {  # kg: base, proximal, medial, distal with its tip
@@ -22,7 +22,7 @@ LINKS = {  # kg: base, proximal, medial, distal with its tip
 @pytest.fixture(scope="module", params=model.objects())
 def scene(request):
     """Every object there is."""
-    return model.load(request.param)
+    return FingerGait(FingerGaitConfig(object=request.param)).hand
 
 
 @pytest.fixture(scope="module")
@@ -191,4 +191,4 @@ def test_the_freeze_holds_the_object_where_it_is(scene):
 @pytest.mark.parametrize("name", ["spoon", "", "../hand", "BAR"])
 def test_an_unknown_object_names_the_known_ones(name):
     with pytest.raises(ConfigError, match=f"unknown object {name!r}; known are .*bar"):
-        model.load(name)
+        FingerGait(FingerGaitConfig(object=name))

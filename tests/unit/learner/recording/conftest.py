@@ -14,6 +14,7 @@ from farm.net.stats import GenerationStats
 from farm.sim.scene import Scene, compiled
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import Channel, TaskSpec, flat
+from learner.recording.drawing import Drawing
 from learner.recording.recorder import Recorder
 
 STEPS, PERIOD = 15, 0.1
@@ -69,7 +70,7 @@ def start(tmp_path: Path, scene: Scene, spec: TaskSpec) -> Callable[..., Recorde
     """Begin a recorder of a run called `try`."""
 
     def begin(name: str = "run.rrd", done: int = 0, spec: TaskSpec = spec) -> Recorder:
-        return Recorder(tmp_path / name, run="try", scene=scene, spec=spec, config="# settings", done=done)
+        return Recorder(tmp_path / name, run="try", drawing=Drawing(scene, spec), config="# settings", done=done)
 
     return begin
 

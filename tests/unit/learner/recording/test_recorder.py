@@ -13,17 +13,20 @@ from rerun.chunk import RrdReader
 from farm.errors import ConfigError
 from learner.recording import recorder as recorders
 from learner.recording.comparison import Shown, record_comparison
+from learner.recording.drawing import Drawing
 from learner.recording.files import parts
-from learner.recording.recorder import Recorder, record_replay
+from learner.recording.recorder import Recorder
+from learner.recording.replay import record_replay
 
 WRITE = """
 import os, pickle, resource, sys
 from pathlib import Path
 from farm.sim.scene import Scene, compiled
 from learner.recording import rows
+from learner.recording.drawing import Drawing
 from learner.recording.recorder import Recorder
 path, mjcf, spec, calls, limit = pickle.load(sys.stdin.buffer)
-recorder = Recorder(Path(path), run="try", scene=Scene(compiled(mjcf, "")), spec=spec, config="")
+recorder = Recorder(Path(path), run="try", drawing=Drawing(Scene(compiled(mjcf, "")), spec), config="")
 if limit:
     rows.FLUSH = 1.0
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -191,21 +194,21 @@ def test_a_recording_ends_before_the_disk_is_full(start, stats, read, monkeypatc
 
 def test_viewers_are_served(scene, spec, stats, rollout, traces):
     with pytest.raises(ConfigError, match="without a file"):
-        Recorder(None, run="try", scene=scene, spec=spec, config="")
-    recorder = Recorder(None, run="try", scene=scene, spec=spec, config="", serve=("127.0.0.1", 0))
+        Recorder(None, run="try", drawing=Drawing(scene, spec), config="")
+    recorder = Recorder(None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", 0))
     assert recorder.uri is not None
     port = int(recorder.uri.removeprefix("rerun+http://127.0.0.1:").removesuffix("/proxy"))
     recorder.generation(stats(), rollout(), traces(), rate=1.0)
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     with pytest.raises(ConfigError, match="choose another"):
-        Recorder(None, run="try", scene=scene, spec=spec, config="", serve=("127.0.0.1", port))
+        Recorder(None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", port))
     recorder.close()
 
 
 def test_replays_follow_each_other(scene, spec, rollout, tmp_path, read):
     path, shown = tmp_path / "replay.rrd", [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())]
     for _ in range(2):  # the second takes the first one's place
-        record_replay(path, run="try", scene=scene, spec=spec, config="# settings", rollouts=shown)
+        record_replay(path, run="try", drawing=Drawing(scene, spec), config="# settings", rollouts=shown)
     rows = read("replay.rrd")
     assert [p.name for p in tmp_path.iterdir()] == ["replay.rrd"]
     assert [r.recording_id for r in RrdReader(path).recordings()] == ["try-replay"]
@@ -218,7 +221,7 @@ def test_replays_follow_each_other(scene, spec, rollout, tmp_path, read):
 
 def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, stats, rollout, tmp_path, read):
     curves = [stats(g) for g in (1, 2)]
-    both = [Shown(name, scene, spec, curves, rollout()) for name in ("one", "other")]
+    both = [Shown(name, Drawing(scene, spec), curves, rollout()) for name in ("one", "other")]
     record_comparison(tmp_path / "compare.rrd", both, "| table |")
     rows = read("compare.rrd")
     force = rollout().channels["touch/force"]
@@ -227,7 +230,9 @@ def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, stat
         assert len(rows.times(f"{root}/world/ball")) == 16
     [where] = rows.fixed("/runs/other", "translation")
     assert np.linalg.norm(where) > scene.mover.radius, "scenes stand apart"
-    record_comparison(tmp_path / "mixed.rrd", [both[0], Shown("c", scene, plain, curves, rollout(spec=plain))], "")
+    record_comparison(
+        tmp_path / "mixed.rrd", [both[0], Shown("c", Drawing(scene, plain), curves, rollout(spec=plain))], ""
+    )
     assert not [entity for entity in read("mixed.rrd").batches if "force" in entity]
 
 

@@ -15,28 +15,19 @@ def want(worker: str = "a/1", credits: int = 4, canary: str = "bits") -> WorkReq
 # ---------------------------------------------------------------- admission
 
 
-def test_the_first_worker_decides_whose_numbers_count() -> None:
+def test_the_first_result_decides_whose_numbers_count() -> None:
     admission = Admission(None)
-    assert admission.refusal(want()) is None
-    assert admission.canary == "bits"
+    assert admission.refusal(want(canary="odd")) is None
+    assert admission.refusal(want("b/1")) is None
+    assert admission.counted("bits")
+    assert not admission.counted("bits")
     assert admission.refusal(want("b/1")) is None
     assert "rounds differently" in str(admission.refusal(want("c/1", canary="others")))
     assert admission.canary == "bits"
 
 
-def test_who_did_nothing_and_left_decides_nothing() -> None:
-    admission = Admission(None)
-    admission.refusal(want(canary="odd"))
-    admission.deserted()
-    assert admission.refusal(want()) is None
-    admission.counted()
-    admission.deserted()
-    assert admission.canary == "bits"
-
-
 def test_a_resumed_run_knows_whose_numbers_count() -> None:
     admission = Admission("bits")
-    admission.deserted()
     assert "--mixed" in str(admission.refusal(want(canary="others")))
     assert admission.refusal(want()) is None
 
@@ -85,13 +76,25 @@ def test_those_who_ask_early_are_looked_after_in_turn() -> None:
     assert [known.early(2) for _ in range(3)] == [["a/1", "b/1"], ["c/1", "a/1"], ["b/1", "c/1"]]
 
 
+def test_many_tokens_of_one_name_keep_nobody_else_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(membership, "_MOST_OF_ONE", 2)
+    known = Attendance()
+    for i in range(2):
+        known.came(f"many/{i}")
+    with pytest.raises(MessageError, match="of its name"):
+        known.came("many/2")
+    assert known.came("honest/1") is None
+    known.left("many/0")
+    known.came("many/2")
+
+
 def test_names_and_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membership, "_MOST", 2)
     monkeypatch.setattr(membership, "_ASKING", 2)
     known = Attendance()
     for name in ("a/1", "b/1"):
         known.came(name)
-    with pytest.raises(MessageError, match="2 workers are there already"):
+    with pytest.raises(MessageError, match="2 workers, or 1000 of its name, are there"):
         known.came("c/1")
     known.came("b/1")
     for name in ("d/1", "e/1"):

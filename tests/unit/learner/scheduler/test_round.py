@@ -40,7 +40,8 @@ def message(indices: Sequence[int], traces: str) -> Results:
     wanted = [rows[at] for at in traced(traces, returns, np.array(rows) >= 0)]
     return Results(
         run="r", incarnation="i", round=1, worker="w/1", jobs=np.array(jobs), returns=returns,
-        flags=np.array([[row % 2 == 1, False, row < 0, False] for row in rows]), traces=TRACES[wanted],
+        flags=np.array([[row % 2 == 1, False, row < 0, False] for row in rows]),
+        steps=np.array([1 + row % 2 for row in rows]), traces=TRACES[wanted],
         trajectories=tuple(replace(SHOWN, value=float(job)) for job in jobs if job >= PAIRS),
     )  # fmt: skip
 
@@ -112,8 +113,44 @@ def test_results_of_other_shapes_do_not_fit() -> None:
         {"trajectories": good.trajectories * 2},
         {"trajectories": (wide,)},
         {"trajectories": (other,)},
-        {"returns": good.returns[1:], "flags": good.flags[1:]},
+        {"returns": good.returns[1:], "flags": good.flags[1:], "steps": good.steps[1:]},
+        {"steps": good.steps * 0},
+        {"steps": good.steps + TRACE[0]},
         {"traces": good.traces[1:]},
         {"traces": good.traces[:, 1:]},
     ):
         assert round_.place(replace(good, **change)) is None, change
+
+
+def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
+    round_ = RoundResults(JOBS, "none", TRACE, SHAPES, 2)
+    assert round_.place(message([0], "none")) is None, "it has none"
+    for job in (1, 0, PAIRS):
+        sent = message([job], "none")
+        sent = replace(sent, moments=np.full((len(sent.returns), 5), job + 1.0))
+        for wrong in (np.zeros((len(sent.returns), 3)), np.zeros((0, 0))):
+            assert round_.place(replace(sent, moments=wrong)) is None
+        place = round_.place(sent)
+        assert place is not None
+        round_.put(sent, place, np.ones(1, bool))
+    assert round_.moments[:4, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
+    assert round_.moments[round_.rows(PAIRS), 0].tolist() == [PAIRS + 1.0]
+    plain, sent = RoundResults(JOBS, "none", TRACE, SHAPES), message([0], "none")
+    assert plain.place(sent) is not None
+    assert plain.place(replace(sent, moments=np.zeros((2, 5)))) is None, "nobody asked"
+
+
+@pytest.mark.parametrize("changed", ["returns", "flags", "steps", "moments"])
+def test_answers_differ_by_any_number_that_counts(changed: str) -> None:
+    round_ = RoundResults(JOBS, "none", TRACE, SHAPES, 2)
+    said = message([0, 1], "none")
+    said = replace(said, moments=np.ones((4, 5)))
+    place = round_.place(said)
+    assert place is not None
+    round_.put(said, place, np.ones(2, bool))
+    assert round_.answer(1) == round_.given(said, 1)
+    other = getattr(said, changed).copy()
+    other[-1:] = other[-1:] ^ True if changed == "flags" else other[-1:] + 1
+    lie = replace(said, **{changed: other})
+    assert round_.answer(0) == round_.given(lie, 0)
+    assert round_.answer(1) != round_.given(lie, 1)

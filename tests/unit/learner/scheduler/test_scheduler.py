@@ -65,15 +65,41 @@ def test_doubled_and_stale_results_do_not_count():
     scheduler = started(2, ["a"])
     scheduler.assign(0.0)
     assert scheduler.results("a", [0, 0, -1, 2], 0.1) == ["new", "doubled", "stale", "stale"]
-    assert scheduler.results("b", [0], 0.1) == ["doubled"]
     assert scheduler.remaining == 1
 
 
-def test_a_stranger_s_result_counts_and_the_job_is_not_sent_any_more():
-    scheduler = started(2)
-    assert scheduler.results("gone", [0], 0.0) == ["new"]
-    scheduler.want("a", 4, 0.0)
-    assert given(scheduler.assign(0.0)) == {"a": [1]}
+def test_results_count_of_workers_that_were_given_the_job_only():
+    scheduler = started(2, ["a", "b"], credits=1)
+    assert given(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
+    assert scheduler.results("stranger", [0, 1], 0.1) == ["unasked", "unasked"]
+    assert scheduler.results("b", [0], 0.1) == ["unasked"]
+    assert not scheduler.error("b", 0, 0.1)
+    assert scheduler.results("a", [0], 0.1) == ["new"]
+    assert scheduler.remaining == 1
+
+
+def test_a_worker_that_left_after_its_result_still_counts_and_the_job_is_not_sent_any_more():
+    scheduler = started(2, ["a"], credits=1)
+    assert given(scheduler.assign(0.0)) == {"a": [0]}
+    assert scheduler.lost("a") == 1
+    assert scheduler.results("a", [0], 0.1) == ["new"]
+    scheduler.want("b", 4, 0.1)
+    assert given(scheduler.assign(0.1)) == {"b": [1]}
+
+
+def test_jobs_that_are_reopened_are_done_again_by_others():
+    scheduler = started(2, ["a"], credits=2)
+    while not scheduler.complete:
+        for _, indices in scheduler.assign(0.0):
+            scheduler.results("a", list(indices), 0.1)
+    scheduler.lost("a")
+    scheduler.reopen([1], "a")
+    assert not scheduler.complete
+    assert scheduler.results("a", [1], 0.2) == ["unasked"]
+    scheduler.want("b", 2, 0.2)
+    assert given(scheduler.assign(0.2)) == {"b": [1]}
+    assert scheduler.results("b", [1], 0.3) == ["new"]
+    assert scheduler.complete
 
 
 def test_an_unknown_duration_is_probed_one_job_at_a_time():

@@ -16,6 +16,7 @@ from farm.sim.trajectory import Trajectory
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGERS, LOWER, TIP_RADIUS, UPPER
 from farm.tasks.finger_gait.task import FingerGait
+from learner.recording.drawing import Drawing
 from learner.recording.replay import record_replay
 
 BALL, DEPTH = 0.004, 0.0005
@@ -108,7 +109,7 @@ def test_the_last_rows_lie_where_a_bending_finger_closes(task: FingerGait, press
 def test_the_picture_is_brightest_where_the_ball_presses(task: FingerGait, pressed: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "pressed.rrd"
     scene, spec = Scene(task.model), task.spec()
-    record_replay(path, run="pressed", scene=scene, spec=spec, config="# a ball", rollouts=[("pressed", pressed)])
+    record_replay(path, run="pressed", drawing=Drawing(scene, spec), config="# a ball", rollouts=[("pressed", pressed)])
     formats, buffers, colours = {}, {}, {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()

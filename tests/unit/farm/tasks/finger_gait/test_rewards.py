@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from farm.tasks.finger_gait.hand import LOWER, UPPER
-from farm.tasks.finger_gait.rewards import RETURN_SCALE, REWARDS, TERMS, WEIGHTS, Demonstration, end
+from farm.tasks.finger_gait.observations import Felt
+from farm.tasks.finger_gait.rewards import RETURN_SCALE, REWARDS, TERMS, WEIGHTS, end
 from farm.tasks.loop import RETURN_FLOOR
 from farm.tasks.loop import discounted as _discounted
 
@@ -17,6 +18,10 @@ STEPS = 15
 
 def discounted(terms, gamma, scale=RETURN_SCALE):
     return _discounted(terms, gamma, scale)
+
+
+def rewarded(name, joints, images, points, action, goal, row):
+    return REWARDS[name](Felt(joints, images, points), action, goal, WEIGHTS[row])
 
 
 # ---------------------------------------------------------------- Table 3.1 and numbers by hand
@@ -36,7 +41,7 @@ def test_weights_are_those_of_table_3_1():
 
 def example():
     """Return q, c, CP, a and the demonstration of an example small enough to reckon by hand."""
-    goal = Demonstration(joints=np.ones(8), images=np.zeros((3, 18)), points=np.zeros((3, 3)))
+    goal = Felt(joints=np.ones(8), images=np.zeros((3, 18)), points=np.zeros((3, 3)))
     goal.images[0, 4], goal.images[2, 17] = 2.0, 1.0  # c_d'c_d = 5
     goal.points[1] = 0.1, 0.2, 0.3
     joints = np.full(8, 1.1)  # |q_d - q|^2 = 0.08, q_d'q_d = 8
@@ -57,7 +62,7 @@ def example():
     ],
 )
 def test_an_example_by_hand(reward, row, expected):
-    terms = REWARDS[reward](*example(), WEIGHTS[row])
+    terms = rewarded(reward, *example(), row)
     assert len(TERMS) == 5
     np.testing.assert_allclose(terms, expected, rtol=1e-6, atol=1e-15)
 
@@ -65,7 +70,7 @@ def test_an_example_by_hand(reward, row, expected):
 def test_the_demonstration_itself_costs_nothing():
     goal = example()[-1]
     for reward in REWARDS.values():
-        terms = reward(goal.joints, goal.images, goal.points, np.zeros(8), goal, WEIGHTS["direct"])
+        terms = reward(goal, np.zeros(8), goal, WEIGHTS["direct"])
         assert not terms.any()
 
 
@@ -105,7 +110,7 @@ SLOW = {"basic": slow_basic, "full": slow_full}
 def rollouts(count, seed=0):
     rng = np.random.default_rng(seed)
     shape = (count, STEPS)
-    goal = Demonstration(rng.normal(1, 0.3, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))
+    goal = Felt(rng.normal(1, 0.3, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))
     return (
         rng.normal(1, 0.3, (*shape, 8)),
         rng.exponential(0.3, (*shape, 3, 18)),
@@ -119,7 +124,7 @@ def rollouts(count, seed=0):
 @pytest.mark.parametrize("name", list(SLOW))
 def test_every_step_of_every_rollout_is_as_written(name, row):
     *values, goal = rollouts(4)
-    terms = REWARDS[name](*values, goal, WEIGHTS[row])
+    terms = rewarded(name, *values, goal, row)
     assert terms.shape == (4, STEPS, 5)
     for i in range(4):
         for t in range(STEPS):
@@ -131,10 +136,10 @@ def test_every_step_of_every_rollout_is_as_written(name, row):
 @pytest.mark.parametrize("count", [1, 2, 7, 32])
 def test_a_batch_equals_one_by_one_bit_for_bit(name, count):
     *values, goal = rollouts(count)
-    terms = REWARDS[name](*values, goal, WEIGHTS["projected"])
+    terms = rewarded(name, *values, goal, "projected")
     returns, _ = discounted(terms, 0.95)
     for i in range(count):
-        alone = REWARDS[name](*(value[i : i + 1] for value in values), goal, WEIGHTS["projected"])
+        alone = rewarded(name, *(value[i : i + 1] for value in values), goal, "projected")
         assert alone.tobytes() == terms[i].tobytes()
         assert discounted(alone, 0.95)[0].tobytes() == returns[i].tobytes()
 
@@ -260,13 +265,13 @@ def test_opposite_infinities_are_clamped():
 
 def test_the_limited_reward_punishes_no_action_beyond_its_range() -> None:
     joints, images, points = np.zeros(8), np.zeros((3, 18)), np.zeros((3, 3))
-    goal = Demonstration(np.ones(8), np.ones((3, 18)), np.ones((3, 3)))
+    goal = Felt(np.ones(8), np.ones((3, 18)), np.ones((3, 3)))
     ranges = UPPER - LOWER
     for action in (0.5 * ranges, ranges, -ranges):
         assert np.array_equal(
-            *(REWARDS[name](joints, images, points, action, goal, WEIGHTS["direct"]) for name in ("full", "limited"))
+            *(rewarded(name, joints, images, points, action, goal, "direct") for name in ("full", "limited"))
         )
-    huge = REWARDS["limited"](joints, images, points, np.full(8, -1e200), goal, WEIGHTS["direct"])
+    huge = rewarded("limited", joints, images, points, np.full(8, -1e200), goal, "direct")
     assert huge[2] == pytest.approx(-WEIGHTS["direct"].action * ranges @ ranges) == -10.0
 
 

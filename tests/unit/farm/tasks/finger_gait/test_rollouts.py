@@ -12,10 +12,11 @@ from farm.errors import ConfigError
 from farm.policies.base import Policy
 from farm.rollouts import Runner
 from farm.tasks.base import Record
-from farm.tasks.finger_gait import model, touch
+from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, GRIPS, LOWER, UPPER
-from farm.tasks.finger_gait.rewards import WEIGHTS, Demonstration
+from farm.tasks.finger_gait.observations import Felt
+from farm.tasks.finger_gait.rewards import WEIGHTS
 from farm.tasks.finger_gait.task import (
     CLOSING,
     PRESSES,
@@ -60,6 +61,10 @@ class Fixed(Policy):
         return prepared
 
 
+def loaded(name):
+    return FingerGait(FingerGaitConfig(object=name)).hand
+
+
 def fixed(value, seeds=(None,), physics=False, **settings) -> Rollouts:
     made = runner(**settings)
     other = copy.copy(made)
@@ -76,22 +81,29 @@ def trials(count):
 
 @functools.cache
 def grasp(name="bar"):
-    grasping = Grasping(model.load(name))
+    grasping = Grasping(loaded(name))
     return {fingers: grasping.command(fingers) for fingers in ((), *GRIPS.values())}
 
 
 def plain_measure(data):
-    """Joint positions and the object's pose, normal forces (3, 4) and their places (3, 4, 3)."""
-    force, place = np.zeros((3, 4)), np.zeros((3, 4, 3))
+    """Joint positions and the object's pose, normal forces (3, 4), where they act in the world (3, 4, 3), fingertips'
+    positions (3, 3) and axes (3, 9)."""
+    force, contact = np.zeros((3, 4)), np.zeros((3, 4, 3))
+    sites = [data.site(f"{finger}_tip") for finger in FINGERS]
     for f, finger in enumerate(FINGERS):
-        site = data.site(f"{finger}_tip")
-        axes = site.xmat.reshape(3, 3)
         for c, row in enumerate(data.sensor(finger).data.reshape(4, 7)):
-            if row[0] > 0:
-                force[f, c], away = row[1], row[4:] - site.xpos
-                for k in range(3):
-                    place[f, c, k] = axes[0, k] * away[0] + axes[1, k] * away[1] + axes[2, k] * away[2]
-    return data.qpos.copy(), force, place
+            force[f, c], contact[f, c] = row[1] if row[0] > 0 else 0.0, row[4:]
+    return data.qpos.copy(), force, contact, *(np.array([getattr(s, n) for s in sites]) for n in ("xpos", "xmat"))
+
+
+def plain_images(force, contact, tips, axes):
+    """Spread the forces where they act in the fingertips' frames, (3, 18)."""
+    place = np.zeros((3, 4, 3))
+    for f, c in np.ndindex(3, 4):
+        away, own = contact[f, c] - tips[f], axes[f].reshape(3, 3)
+        for k in range(3):
+            place[f, c, k] = own[0, k] * away[0] + own[1, k] * away[1] + own[2, k] * away[2]
+    return touch.image(force, place)
 
 
 def plain_close(own, commands, displacement):
@@ -110,17 +122,17 @@ def plain_close(own, commands, displacement):
 @functools.cache
 def plain_goal(grip):
     """The demonstration of a grip."""
-    own = model.load("bar").model
+    own = loaded("bar").model
     data = plain_close(own, grasp()[GRIPS[grip]], np.zeros(3))
     for _ in range(SETTLE):
         mujoco.mj_step(own, data)
-    qpos, force, place = plain_measure(data)
-    image = touch.image(force, place)
-    return Demonstration(joints=qpos[:8], images=image, points=touch.contact_points(image))
+    qpos, *felt = plain_measure(data)
+    image = plain_images(*felt)
+    return Felt(joints=qpos[:8], images=image, points=touch.contact_points(image))
 
 
-def plain_observation(task, joints, force, place):
-    images = touch.image(force[None], place[None])
+def plain_observation(task, joints, *felt):
+    images = plain_images(*felt)[None]
     points = touch.contact_points(images)
     parts = {"joints": joints[None], "contacts": points.reshape(1, -1), "tactile": images.reshape(1, -1)}
     return np.concatenate([parts[part] for part in task.config.state.split("+")], axis=1)
@@ -130,7 +142,7 @@ def plain_rollout(made, theta, seed):
     """Returns, steps, actions and frames of one rollout, stepped on its own."""
     task, steps = made.task, made.task.steps
     own = Perturbation.none(steps) if seed is None else Perturbation.draw(np.random.default_rng(seed), steps)
-    changed = copy.copy(model.load("bar").model)
+    changed = copy.copy(loaded("bar").model)
     body = changed.body("object").id
     changed.geom_friction[:] *= own.friction
     changed.body_mass[body] *= own.mass
@@ -142,7 +154,7 @@ def plain_rollout(made, theta, seed):
     frames = [np.zeros((1, steps, *part.shape)) for part in now]
     actions, prepared, count = np.zeros((1, steps, 8)), made.policy.prepare(theta[None]), steps
     for t in range(steps):
-        x = plain_observation(task, now[0][:8] + own.noise[t], now[1], now[2])
+        x = plain_observation(task, now[0][:8] + own.noise[t], *now[1:])
         actions[:, t] = made.policy.act(prepared, x)
         base = {"offset": start, "absolute": 0.0, "increment": last}[task.config.action]
         target = np.nan_to_num(base + actions[0, t], nan=0.0)
@@ -158,7 +170,7 @@ def plain_rollout(made, theta, seed):
             count = t + 1
             break
     task.goal, kept = plain_goal(task.config.goal_grip), task.goal
-    names = dict(zip(("qpos", "force", "place"), frames, strict=True))
+    names = dict(zip(("qpos", "force", "contact", "tip", "axes"), frames, strict=True))
     record = Record(names, {"qpos": first[0][None]}, actions, np.array([count]), np.array([False]))
     score = task.score(record)
     task.goal = kept
@@ -286,7 +298,7 @@ def thing(tmp_path):
 )  # fmt: skip
 def test_a_grip_is_found_for_an_object_of_ones_own(thing, size, place):
     name = thing(f'type="box" size="{size}"', place)
-    hand = model.load(name)
+    hand = loaded(name)
     grasping = Grasping(hand)
     for finger in FINGERS:
         assert 0 <= contact_gap(hand, grasping.contact, finger) < 1e-6, finger
@@ -304,7 +316,7 @@ def contact_gap(hand, joints, finger):
 
 def test_waiting_fingers_keep_their_distance():
     for finger in FINGERS:
-        assert contact_gap(model.load("bar"), grasp()[()], finger) == pytest.approx(0.02, abs=2e-3)
+        assert contact_gap(loaded("bar"), grasp()[()], finger) == pytest.approx(0.02, abs=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -330,7 +342,7 @@ def test_settings_that_name_nothing_are_clear_errors(tmp_path):
 
 
 def test_a_command_does_not_depend_on_what_was_asked_before():
-    grasping, commands = Grasping(model.load("bar")), grasp()
+    grasping, commands = Grasping(loaded("bar")), grasp()
     three = commands[GRIPS["index+middle+thumb"]]
     for first in commands:
         for fingers in commands:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.observations import STATES, Felt
 
 SIZES = {"joints": 8, "joints+contacts": 17, "tactile": 54, "joints+tactile": 62}
 
@@ -16,15 +16,15 @@ def parts(count=3):
     return joints, images, points
 
 
-def test_there_are_the_four_of_the_thesis():
-    assert {name: state.size for name, state in STATES.items()} == SIZES
+def test_there_are_the_four_of_the_thesis_and_two_of_forces():
+    assert {name: state.size for name, state in STATES.items()} == {**SIZES, "forces": 3, "cop": 12}
     assert {name for name, state in STATES.items() if not state.touch} == {"joints"}
 
 
 @pytest.mark.parametrize("name", SIZES)
 def test_parts_stand_in_the_order_of_the_name(name):
     joints, images, points = parts()
-    x = STATES[name].observe(joints, images, points)
+    x = STATES[name].observe(Felt(joints, images, points))
     assert x.shape == (3, SIZES[name])
     for row in range(3):
         expected = {
@@ -40,7 +40,16 @@ def test_parts_stand_in_the_order_of_the_name(name):
 @pytest.mark.parametrize("count", [1, 2, 32])
 def test_rows_are_independent(name, count):
     joints, images, points = parts(count)
-    x = STATES[name].observe(joints, images, points)
+    x = STATES[name].observe(Felt(joints, images, points))
     for row in range(count):
-        alone = STATES[name].observe(joints[row : row + 1], images[row : row + 1], points[row : row + 1])
+        alone = STATES[name].observe(Felt(joints[row : row + 1], images[row : row + 1], points[row : row + 1]))
         assert alone[0].tobytes() == x[row].tobytes()
+
+
+def test_forces_are_what_the_taxels_add_up_to():
+    joints, images, points = parts()
+    felt = Felt(joints, images, points)
+    np.testing.assert_array_equal(STATES["forces"].observe(felt), images.sum(axis=-1))
+    np.testing.assert_array_equal(
+        STATES["cop"].observe(felt), np.concatenate([points.reshape(len(joints), -1), images.sum(axis=-1)], axis=1)
+    )

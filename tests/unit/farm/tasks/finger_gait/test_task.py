@@ -13,7 +13,7 @@ from farm.errors import ConfigError
 from farm.tasks.base import Record
 from farm.tasks.finger_gait import touch as tactile
 from farm.tasks.finger_gait.hand import GRIPS, TIP_RADIUS
-from farm.tasks.finger_gait.rewards import Demonstration
+from farm.tasks.finger_gait.observations import Felt
 from farm.tasks.finger_gait.task import (
     CONTROL_PERIOD,
     DISPLACEMENT,
@@ -42,8 +42,8 @@ class Frames:
     place: np.ndarray
 
     def dict(self) -> dict[str, np.ndarray]:
-        """As the loop has them."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        """As the loop has them: the fingertips' frames are the world's."""
+        return {"qpos": self.qpos, **in_the_world(self.force, self.place)}
 
 
 class Touched(FingerGait):
@@ -51,12 +51,18 @@ class Touched(FingerGait):
 
     def measure(self, sim):
         """The test's own."""
-        return {"force": sim.force, "place": sim.place}
+        return in_the_world(sim.force, sim.place)
+
+
+def in_the_world(force, place):
+    """Return what is measured of contacts at places in the fingertips' frames, which are the world's."""
+    axes = np.broadcast_to(np.eye(3).ravel(), (*force.shape[:-1], 9))
+    return {"force": force, "contact": place, "tip": np.zeros((*force.shape[:-1], 3)), "axes": axes}
 
 
 def goal():
     rng = np.random.default_rng(0)
-    return Demonstration(rng.uniform(0.3, 1.0, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))
+    return Felt(rng.uniform(0.3, 1.0, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))
 
 
 def task(**options):

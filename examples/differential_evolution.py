@@ -1,0 +1,23 @@
+"""scipy's differential evolution searches the finger gait's kernel centres on a pool of workers.
+
+    python examples/differential_evolution.py
+
+It needs scipy. Everybody's search method goes the same way: parameters in, returns out.
+"""
+
+import sys
+
+import farm
+
+try:
+    from scipy.optimize import differential_evolution
+except ImportError:
+    sys.exit("this example needs scipy: pip install scipy")
+
+if __name__ == "__main__":
+    with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
+        found = differential_evolution(
+            lambda x: -pool.map(x.T), [(0.0, 3.0)] * pool.size, vectorized=True, updating="deferred",
+            maxiter=5, popsize=1, polish=False, rng=0,
+        )  # fmt: skip
+    print(f"return {-found.fun:.3f} after {found.nfev} rollouts")

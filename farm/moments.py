@@ -1,0 +1,71 @@
+"""Running mean and spread of observations: of one rollout, merged over many, and what policies are given. Pure.
+
+Moments of N observations (d,) are one row of 1 + 2 d numbers: N, their mean, and the sums of their squared deviations
+from it (M2). A row of zeros is of no observation. Every step is an elementwise operation in a given order, so that
+equal observations give equal bits.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from farm.arrays import FloatArray, IntArray
+
+_FLAT: Final = 1e-8  # a standard deviation below this is taken for none
+
+
+class Moments:
+    """Of the observations of B rollouts, step by step (Welford 1962)."""
+
+    def __init__(self, rollouts: int, size: int) -> None:
+        """None so far, of observations of that size."""
+        self.table = np.zeros((rollouts, 1 + 2 * size))
+        """(B, 1 + 2 d)"""
+        self._size = size
+
+    def add(self, rows: IntArray, x: FloatArray) -> None:
+        """Add an observation (n, d) to each of some rollouts (n,)."""
+        table, mean, squares = self.table, slice(1, 1 + self._size), slice(1 + self._size, None)
+        with np.errstate(over="ignore", invalid="ignore"):  # `merged` leaves out what is not finite
+            table[rows, 0] += 1.0
+            difference = x - table[rows, mean]
+            table[rows, mean] += difference / table[rows, :1]
+            table[rows, squares] += difference * (x - table[rows, mean])
+
+
+def usable(table: FloatArray) -> FloatArray:
+    """Moments (B, 1 + 2 d), with zeros in place of rows that are not finite."""
+    return np.where(np.isfinite(table).all(axis=1, keepdims=True), table, 0.0)
+
+
+def merged(total: FloatArray, table: FloatArray) -> FloatArray:
+    """Moments (1 + 2 d,) of all observations of `total` and, row by row in order, of a table (B, 1 + 2 d).
+
+    Chan, Golub & LeVeque 1979, Updating formulae and a pairwise algorithm for computing sample variances. A row with
+    which the sum would not be finite is left out.
+    """
+    size = len(total) // 2
+    for row in table:
+        count = total[0] + row[0]
+        if row[0] == 0.0:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            difference = row[1 : 1 + size] - total[1 : 1 + size]
+            mean = total[1 : 1 + size] + difference * (row[0] / count)
+            between = difference * difference * (total[0] * row[0] / count)
+            squares = total[1 + size :] + row[1 + size :] + between
+        out = np.concatenate([[count], mean, squares])
+        total = out if np.isfinite(out).all() else total
+    return total
+
+
+def normaliser(total: FloatArray) -> FloatArray:
+    """Mean and standard deviation (2, d) of moments (1 + 2 d,).
+
+    Zeros and ones where nothing has been observed yet; a number that never changes has the standard deviation 1.
+    """
+    size = len(total) // 2
+    if not len(total) or total[0] == 0.0:
+        return np.stack([np.zeros(size), np.ones(size)])
+    deviation = np.sqrt(total[1 + size :] / total[0])
+    return np.stack([total[1 : 1 + size], np.where(deviation > _FLAT, deviation, 1.0)])

@@ -1,0 +1,85 @@
+"""Controllers that are networks: linear, and a multilayer perceptron. Pure, batched.
+
+    linear    a = W x + b
+    mlp       h_1 = tanh(W_1 x + b_1), ..., h_L = tanh(W_L h_(L-1) + b_L), a = W h_L + b
+              (Rumelhart, Hinton & Williams 1986, Learning representations by back-propagating errors)
+
+Parameters are the layers one behind the other, each the rows (W_i, b_i) of its units. A unit's sum runs over its own
+row, in an order that the row's length decides alone; tanh is `farm/elementary.py`'s. Neither depends on the batch.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import ClassVar, Final
+
+import numpy as np
+
+from farm import elementary
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+from farm.policies.base import Policy, PolicyConfig
+
+_LAYERS: Final = 20
+_UNITS: Final = 10_000  # of a layer
+
+
+@dataclass(frozen=True, kw_only=True)
+class MlpConfig(PolicyConfig):
+    """Settings of the multilayer perceptron."""
+
+    layers: tuple[int, ...] = (32, 32)
+    """Units of each hidden layer, first to last; the flag is repeated."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        if not 1 <= len(self.layers) <= _LAYERS:
+            raise ConfigError(f"layers are {len(self.layers)}; expected 1 to {_LAYERS} hidden layers")
+        for units in self.layers:
+            if type(units) is not int or not 1 <= units <= _UNITS:
+                raise ConfigError(f"layers has {units!r}; expected 1 to {_UNITS} units in each")
+
+
+class Linear(Policy):
+    """Affine map of the observation: a = W x + b."""
+
+    @property
+    def size(self) -> int:
+        """A (d + 1)."""
+        return sum(units * (inputs + 1) for inputs, units in pairwise(self._sizes))
+
+    @property
+    def _sizes(self) -> tuple[int, ...]:
+        """Numbers that each layer takes, and those that the last gives."""
+        return self.spec.observation, self.spec.action
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions; may be huge or not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            out, layers = x, len(self._sizes) - 1
+            for layer, (weights, bias) in enumerate(self._matrices(prepared), 1):
+                out = (weights * np.ascontiguousarray(out)[:, None, :]).sum(axis=-1) + bias
+                if layer < layers:
+                    out = elementary.tanh(out)
+        return out
+
+    def _matrices(self, theta: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Weights (B, units, inputs) and biases (B, units) of each layer, from parameters (B, P)."""
+        first = 0
+        for inputs, units in pairwise(self._sizes):
+            end = first + units * (inputs + 1)
+            rows = theta[:, first:end].reshape(len(theta), units, inputs + 1)
+            # Sums of another memory order would round differently.
+            yield np.ascontiguousarray(rows[:, :, :-1]), rows[:, :, -1]
+            first = end
+
+
+class Mlp(Linear):
+    """Multilayer perceptron with tanh units and a linear output."""
+
+    Config: ClassVar[type[PolicyConfig]] = MlpConfig
+
+    @property
+    def _sizes(self) -> tuple[int, ...]:
+        return self.spec.observation, *self.config.layers, self.spec.action

@@ -1,0 +1,161 @@
+"""The fragile bar: a finger is added to a grip, gently, on a surface whose height nobody knows.
+
+The finger gait's grip of a bar by index finger and thumb, to which the middle finger is added. But the bar under the
+middle finger lies up to 10 mm higher or lower than it seems, and breaks at 3 N: when to stop closing can only be
+felt. Friction, mass and the bar's place vary more than in the finger gait, and the joints' readings are wrong by a
+constant that is drawn for each rollout, so that the joints' deflection is a poor sensor of force.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+
+from farm.arrays import BoolArray, FloatArray
+from farm.errors import ConfigError
+from farm.settings import setting
+from farm.sim.sim import Sim
+from farm.tasks.base import Record, Score, Task, TaskConfig, TaskSpec
+from farm.tasks.finger_gait.hand import FINGERS, JOINTS
+from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.task import (
+    CONTROL_PERIOD,
+    LEAST_COSINE,
+    MAX_SHIFT,
+    PRESSES,
+    SUCCESS_STEPS,
+    FingerGait,
+    Perturbation,
+    distance,
+    stayed,
+)
+
+TERMS: Final = ("force", "grip", "crush", "pose", "action", "drop")
+"""What the reward is made of."""
+
+WANTED: Final = 0.9
+"""Force of the middle finger that is wanted [N]."""
+
+WINDOW: Final = (0.4, 1.4)
+"""Forces of the middle finger that are a success [N]."""
+
+BREAKS: Final = 3.0
+"""Force at which the bar breaks, as seen at control steps [N]."""
+
+HEIGHT: Final = 0.01
+"""The surface under the middle finger lies U(-, +) off [m]."""
+
+_FRICTION: Final = (0.5, 1.5)
+_MASS: Final = (0.6, 2.0)
+_DISPLACEMENT: Final = 0.003  # [m]
+_WORST: Final = 6.0  # reward that a step after a drop loses, and all that crush and pose can lose of one
+_ACTION: Final = 0.2  # reward per squared change of the targets [1 / rad^2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FragileBarConfig(TaskConfig):
+    """The fragile bar's settings."""
+
+    gamma: float = setting(1.0, above=0.0, most=1.0)
+    """Discount factor of the return, per control step."""
+    state: str = "forces"
+    """State base, the controller's input x: forces | cop | joints | joints+contacts | tactile | joints+tactile."""
+    bias: float = setting(0.05, least=0.0, most=1.0)
+    """Joint readings are wrong by U(-bias, bias), drawn for each joint and rollout [rad]."""
+    action: Literal["offset", "absolute", "increment"] = "increment"
+    """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
+    friction: float = setting(1.0, above=0.0)
+    """Factor of every friction coefficient, of fingertips and object alike."""
+
+    # What the finger gait has settings for, and is fixed here: no fields, so no flags.
+    object = "fragile-bar"
+    start_grip = "index+thumb"
+    clip = True
+    joints_scale = contacts_scale = tactile_scale = 1.0
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        if self.state not in STATES:
+            raise ConfigError(f"unknown state base {self.state!r}; known are {', '.join(STATES)}")
+        if self.steps and not SUCCESS_STEPS <= self.steps <= 1000:
+            raise ConfigError(f"steps is {self.steps}; expected {SUCCESS_STEPS} to 1000")
+
+
+class FragileBar(FingerGait):
+    """The middle finger joins the grip of a bar whose surface is nobody knows where, without breaking it."""
+
+    Config = FragileBarConfig
+    steps = 25
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "default": {
+            "policy": "weighted-kernel", "width": 0.4, "weight_scale": 0.05, "algorithm": "snes", "pairs": 32,
+            "initial_sigma": 0.5, "generations": 20,
+        },
+    }  # fmt: skip
+    return_scale = Task.return_scale
+
+    def spec(self) -> TaskSpec:
+        """What both sides must know, without closing a grip."""
+        return TaskSpec(
+            observation=STATES[self.config.state].size, action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
+            terms=TERMS, success=True, channels=self.channels,
+        )  # fmt: skip
+
+    def setup(self, sim: Sim) -> None:
+        """Find the start grip; a ConfigError where it does not hold."""
+        self._find_start(sim)
+
+    def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
+        """Set conditions and the surface's height, close the start grip round the frozen bar, and release it."""
+        place = sim.expand("geom_pos")
+        fragile = self.model.geom("fragile").id
+        # Drawn ahead of everything else: what follows does not depend on how many numbers there are.
+        place[:, fragile, 2] = [0.0 if rng is None else rng.uniform(-HEIGHT, HEIGHT) for rng in rngs]
+        super().prepare(sim, rngs)
+
+    def _drawn(self, rng: np.random.Generator) -> Perturbation:
+        drawn = Perturbation.draw(rng, self.steps, friction=_FRICTION, mass=_MASS, displacement=_DISPLACEMENT)
+        drawn.noise[:] += rng.uniform(-self.config.bias, self.config.bias, len(JOINTS))
+        return drawn
+
+    def score(self, record: Record) -> Score:
+        """Reward terms, and success: the force in its window at the last steps, and never where it breaks."""
+        force = record.frames["force"].sum(axis=-1)
+        middle = force[..., FINGERS.index("middle")]
+        others = np.delete(force, FINGERS.index("middle"), axis=-1)
+        pose = slice(len(JOINTS), None)
+        shift, cosine = distance(record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose])
+        change = np.diff(record.frames["target"], axis=1, prepend=record.start["target"][:, None])
+        terms = np.stack(
+            [
+                -np.minimum(np.abs(middle - WANTED) / WANTED, 2.0) - ~_gentle(middle),
+                -(others < PRESSES).sum(axis=-1, dtype=float),
+                -np.minimum(np.maximum(middle - BREAKS, 0.0), _WORST),
+                # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
+                -np.minimum((shift / MAX_SHIFT) ** 2 + (1.0 - cosine) / (1.0 - LEAST_COSINE), _WORST),
+                -_ACTION * (change * change).sum(axis=-1),
+                np.zeros_like(middle),
+            ],
+            axis=-1,
+        )
+        over = np.arange(self.steps) >= record.steps[:, None]
+        terms[over], terms[over, -1] = 0.0, -_WORST
+        terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)
+        return Score(terms / self.steps, self._succeeded(record, force, middle))
+
+    def _succeeded(self, record: Record, force: FloatArray, middle: FloatArray) -> BoolArray:
+        last, pose = slice(-SUCCESS_STEPS, None), slice(len(JOINTS), None)
+        held = (force[:, last] >= PRESSES).all(axis=(1, 2))
+        there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose]).all(axis=1)
+        whole = (middle <= BREAKS).all(axis=1) & (record.steps == self.steps) & ~record.failed
+        return np.asarray(_gentle(middle[:, last]).all(axis=1) & held & there & whole)
+
+    def exported(self) -> dict[str, Any]:
+        """Nothing of its own."""
+        return {}
+
+
+def _gentle(middle: FloatArray) -> BoolArray:
+    return np.asarray((middle >= WINDOW[0]) & (middle <= WINDOW[1]))

@@ -1,0 +1,233 @@
+"""Starts, observations, rewards and ends of Gymnasium's MuJoCo environments, for a batch of rollouts at once.
+
+The environment itself steps one simulation at a time. Where its model is stepped in a batch instead, this is what it
+adds to the physics. Settings are read from an environment that was made with the run's arguments. Each class does what
+the environment of its name does in release 5 (gymnasium/envs/mujoco/NAME_v5.py, Farama Foundation), in its order and
+precision: actions count in single precision. Its sines, cosines and lengths may differ in the last bit.
+
+Ant and Humanoid are not here: their contact forces are of the last stage of an integration step, which a batch does
+not give.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from farm import elementary
+from farm.arrays import BoolArray, FloatArray
+from farm.sim.sim import Sim
+
+
+class Batched:
+    """What an environment adds to its physics; B rollouts."""
+
+    hidden = 0
+    """Positions that an observation leaves out, unless it is told not to."""
+    most = np.inf
+    """Limit of the observed velocities."""
+    normal = False
+    """Whether first velocities are normal; else uniform."""
+
+    def __init__(self, env: Any) -> None:  # noqa: ANN401  an unwrapped environment
+        """Take its settings."""
+        self.env, self.model = env, env.model
+        self.qpos, self.qvel = env.init_qpos.copy(), env.init_qvel.copy()
+        self.left_out = self.hidden * bool(getattr(env, "_exclude_current_positions_from_observation", False))
+
+    def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """First positions (nq,) and velocities (nv,)."""
+        scale = self.env._reset_noise_scale
+        qpos = self.qpos + rng.uniform(-scale, scale, self.model.nq)
+        if self.normal:
+            return qpos, self.qvel + scale * rng.standard_normal(self.model.nv)
+        return qpos, self.qvel + rng.uniform(-scale, scale, self.model.nv)
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """The observation, (B, d)."""
+        return np.concatenate([sim.qpos[:, self.left_out :], np.clip(sim.qvel, -self.most, self.most)], axis=1)
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
+        """The reward of the control step that just ended, from positions (B, nq) before it, (B,)."""
+        forward: FloatArray = self.env._forward_reward_weight * ((sim.qpos[:, 0] - before[:, 0]) / self.env.dt)
+        return forward - self.env._ctrl_cost_weight * self.effort(sim)
+
+    def effort(self, sim: Sim) -> FloatArray:
+        """Squared length of the action in single precision, (B,)."""
+        action = sim.ctrl.astype(np.float32)
+        return np.square(action).sum(axis=1)
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where the environment terminates, (B,)."""
+        return np.zeros(len(sim), dtype=bool)
+
+
+class Swimmer(Batched):
+    """Swimmer-v5."""
+
+    hidden = 2
+
+
+class HalfCheetah(Batched):
+    """HalfCheetah-v5."""
+
+    hidden, normal = 1, True
+
+
+class Walker2d(Batched):
+    """Walker2d-v5."""
+
+    hidden, most = 1, 10.0
+
+    def healthy(self, sim: Sim) -> BoolArray:
+        """Where it stands, (B,)."""
+        return _within(sim.qpos[:, 1], self.env._healthy_z_range) & _within(
+            sim.qpos[:, 2], self.env._healthy_angle_range
+        )
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
+        """Speed, and a bonus for standing, less the effort."""
+        forward: FloatArray = self.env._forward_reward_weight * ((sim.qpos[:, 0] - before[:, 0]) / self.env.dt)
+        rewards = forward + self.healthy(sim) * self.env._healthy_reward
+        return rewards - self.env._ctrl_cost_weight * self.effort(sim)
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where it fell."""
+        return ~self.healthy(sim) & bool(self.env._terminate_when_unhealthy)
+
+
+class Hopper(Walker2d):
+    """Hopper-v5."""
+
+    def healthy(self, sim: Sim) -> BoolArray:
+        """Where it stands, and no other number is out of range."""
+        others = np.concatenate([sim.qpos, sim.qvel], axis=1)[:, 2:]
+        return super().healthy(sim) & _within(others, self.env._healthy_state_range).all(axis=1)
+
+
+class InvertedPendulum(Batched):
+    """InvertedPendulum-v5."""
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
+        """1 where it stands."""
+        return (~self.ended(sim)).astype(float)
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where it fell, or a number is not finite."""
+        fell: BoolArray = np.abs(sim.qpos[:, 1]) > 0.2
+        return fell | ~np.isfinite(self.observe(sim)).all(axis=1)
+
+
+class InvertedDoublePendulum(Batched):
+    """InvertedDoublePendulum-v5."""
+
+    normal = True
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """The cart's place, sines and cosines of the angles, velocities, and the force on the cart."""
+        angles, speeds = sim.qpos[:, 1:], np.clip(sim.qvel, -10.0, 10.0)
+        force = np.clip(sim.qfrc_constraint[:, :1], -10.0, 10.0)
+        parts = [sim.qpos[:, :1], elementary.sin(angles), elementary.cos(angles), speeds, force]
+        return np.concatenate(parts, axis=1)
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
+        """A bonus for standing, less how far the tip is from where it should be, and the speeds."""
+        x, y = sim.site_xpos[:, 0, 0], sim.site_xpos[:, 0, 2]
+        v1, v2 = sim.qvel[:, 1], sim.qvel[:, 2]
+        bonus = self.env._healthy_reward * ~self.ended(sim)
+        return bonus - (0.01 * x**2 + (y - 2) ** 2) - (1e-3 * v1**2 + 5e-3 * v2**2)
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where the tip is low."""
+        low: BoolArray = sim.site_xpos[:, 0, 2] <= 1
+        return low
+
+
+class Reacher(Batched):
+    """Reacher-v5."""
+
+    def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """An arm near its zero, and a goal within a circle."""
+        qpos = rng.uniform(-0.1, 0.1, self.model.nq) + self.qpos
+        qpos[-2:] = _drawn(lambda: rng.uniform(-0.2, 0.2, 2), lambda length: length < 0.2)
+        qvel = self.qvel + rng.uniform(-0.005, 0.005, self.model.nv)
+        qvel[-2:] = 0.0
+        return qpos, qvel
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """Cosines and sines of the angles, the goal, the arm's speeds, and the way from the goal to the fingertip."""
+        angles = sim.qpos[:, :2]
+        away = self.way(sim, "fingertip", "target")[:, :2]
+        parts = [elementary.cos(angles), elementary.sin(angles), sim.qpos[:, 2:], sim.qvel[:, :2], away]
+        return np.concatenate(parts, axis=1)
+
+    def way(self, sim: Sim, to: str, start: str) -> FloatArray:
+        """The way from one body to another [m], (B, 3)."""
+        way: FloatArray = sim.xpos[:, self.model.body(to).id] - sim.xpos[:, self.model.body(start).id]
+        return way
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Less the distance, and the effort."""
+        near = -_length(self.way(sim, "fingertip", "target")) * self.env._reward_dist_weight
+        return near + -self.effort(sim) * self.env._reward_control_weight
+
+
+class Pusher(Reacher):
+    """Pusher-v5."""
+
+    def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """The arm as in the model, and the cylinder somewhere away from the goal."""
+        place = _drawn(lambda: np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)]), lambda length: length > 0.17)
+        qpos = self.qpos.copy()
+        qpos[-4:] = *place, 0.0, 0.0
+        qvel = self.qvel + rng.uniform(-0.005, 0.005, self.model.nv)
+        qvel[-4:] = 0.0
+        return qpos, qvel
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """The arm's angles and speeds, and where its tip, the cylinder and the goal are."""
+        places = [sim.xpos[:, self.model.body(name).id] for name in ("tips_arm", "object", "goal")]
+        return np.concatenate([sim.qpos[:, :7], sim.qvel[:, :7], *places], axis=1)
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Less the distances of the cylinder to the goal and to the tip, and the effort."""
+        near = -_length(self.way(sim, "object", "tips_arm")) * self.env._reward_near_weight
+        far = -_length(self.way(sim, "object", "goal")) * self.env._reward_dist_weight
+        return far + -self.effort(sim) * self.env._reward_control_weight + near
+
+
+def _within(values: FloatArray, limits: tuple[float, float]) -> BoolArray:
+    low, high = limits
+    return (low < values) & (values < high)
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    """(B, 3) -> (B,)."""
+    return np.sqrt((vectors * vectors).sum(axis=1))
+
+
+def _drawn(draw: Any, fits: Any) -> FloatArray:  # noqa: ANN401  functions
+    """The first of the drawn points (2,) whose distance from 0 fits."""
+    while True:
+        point: FloatArray = draw()
+        if fits(np.sqrt((point * point).sum())):
+            return point
+
+
+_CLASSES: Final[Mapping[str, type[Batched]]] = {
+    "swimmer_v5.SwimmerEnv": Swimmer,
+    "half_cheetah_v5.HalfCheetahEnv": HalfCheetah,
+    "hopper_v5.HopperEnv": Hopper,
+    "walker2d_v5.Walker2dEnv": Walker2d,
+    "inverted_pendulum_v5.InvertedPendulumEnv": InvertedPendulum,
+    "inverted_double_pendulum_v5.InvertedDoublePendulumEnv": InvertedDoublePendulum,
+    "reacher_v5.ReacherEnv": Reacher,
+    "pusher_v5.PusherEnv": Pusher,
+}
+
+
+def batched(env: Any) -> Batched | None:  # noqa: ANN401  as gymnasium.make gives it
+    """What stands for an environment in a batch; None where nothing does."""
+    own = type(env.unwrapped)
+    made = _CLASSES.get(f"{own.__module__}.{own.__name__}".removeprefix("gymnasium.envs.mujoco."))
+    return None if made is None or env.spec.additional_wrappers else made(env.unwrapped)

@@ -1,0 +1,74 @@
+"""What a task's observations are like: at its nominal start, and how far they spread."""
+
+from typing import Final
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import TaskError
+from farm.sim.engines import BatchEngine
+from farm.sim.scene import quiet
+from farm.sim.sim import Sim
+from farm.tasks.base import Task
+from farm.tasks.loop import Batch, again
+
+_ROLLOUTS: Final = 32
+_QUARTILES: Final = 1.349  # between those of a normal distribution, in standard deviations
+_FLOOR: Final = 1.0 / 3.0  # of a part's mean spread
+
+
+def nominal(task: Task) -> FloatArray:
+    """The observation at the nominal start, (d,).
+
+    Raises:
+      ConfigError: the task cannot be begun.
+      TaskError: the observation is not finite.
+    """
+    return _observed(task, np.empty((0, task.model.nu)))[0]
+
+
+def standard(task: Task, action: float) -> dict[str, FloatArray]:
+    """Origin m and spread s of the observation x, (d,) each: (x - m) / s is standardised.
+
+    m is x at the nominal start. s is the interquartile range of x, divided by the normal distribution's, over 32
+    rollouts from there, each with a constant action, normal with standard deviation `action`: a few blows must not
+    widen it. What hardly moves must not count as much as what does: s is at least a third of its mean over that part of
+    the observation (`Task.parts`), and 1 where nothing of a part moves. It belongs to the task: all runs draw alike.
+
+    Raises:
+      ConfigError: the task cannot be begun.
+      TaskError: an observation is not finite.
+    """
+    seen = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, task.model.nu)))
+    low, high = np.quantile(seen, (0.25, 0.75), axis=0)
+    spread, parts = (high - low) / _QUARTILES, task.parts or (seen.shape[1],)
+    if sum(parts) != len(spread):
+        raise TaskError(f"parts are {parts}; expected sizes that add up to the observation's {len(spread)}")
+    for part in np.split(spread, np.cumsum(parts)[:-1]):  # views
+        mean = part.mean()
+        np.maximum(part, _FLOOR * mean if mean > 0.0 else 1.0, out=part)
+    return {"origin": seen[0].copy(), "spread": spread}
+
+
+def _observed(task: Task, actions: FloatArray) -> FloatArray:
+    """Observations of rollouts with constant actions (B, A) from the nominal start, which is the first, (N, d)."""
+    quiet()
+    sim = Sim(task.engine(lambda model: BatchEngine(model, max(1, len(actions)))))
+
+    def look() -> list[FloatArray]:
+        task.setup(sim)
+        batch = Batch(task, sim, [None] * max(1, len(actions)))
+        seen = [np.array(batch.observe(), dtype=float)]
+        while len(actions) and not batch.over:
+            batch.step(actions[batch.active])
+            if not batch.over:
+                seen.append(np.array(batch.observe(), dtype=float))
+        return seen
+
+    try:
+        seen = np.concatenate(again(look))
+    finally:
+        sim.engine.close()
+    if not np.isfinite(seen).all():
+        raise TaskError("observe is not finite")
+    return seen

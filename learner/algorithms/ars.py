@@ -1,0 +1,64 @@
+"""ARS, augmented random search (Mania, Guy & Recht 2018, Simple random search provides a competitive approach to RL).
+
+    delta_n ~ N(0, I), n = 1..N;   r(+-,n) = return of mu +- nu delta_n
+    mu += alpha / (b sigma_R) sum of (r(+,n) - r(-,n)) delta_n, over the b directions of the largest max(r(+,n), r(-,n))
+
+sigma_R is the standard deviation of these 2b returns. nu, here the state's sigma, never changes. With `--normalise` it
+is the paper's V2-t, without it V1-t. Shapes: P parameters, N pairs. Sums run over the directions in order, never
+through BLAS.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+from farm.settings import setting
+from learner.algorithms.gradients import weighted_sum
+from learner.algorithms.mirrored import Mirrored
+from learner.algorithms.state import SearchState, finite_rows, moved
+
+
+@dataclass(frozen=True, kw_only=True)
+class ARS(Mirrored):
+    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+
+    pairs: int = setting(16, least=1)
+    """Directions a generation, N: a pair of rollouts each."""
+    top: int | None = setting(None, least=1)
+    """How many of them are used, b; None: half, rounded up."""
+    learning_rate_mu: float = setting(0.02, least=0.0)
+    """Step size, alpha."""
+    initial_sigma: float = setting(0.03, above=0.0)
+    """Standard deviation of the exploration, nu; it never changes."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        if self.top is not None and self.top > self.pairs:
+            raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")
+
+    def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
+        """Return the state after one update; where all used returns are equal mu stays.
+
+        Args:
+          state: the state `eps` was drawn from.
+          eps: what `ask` gave, (N, P).
+          returns: (N, 2), columns (+, -); all finite.
+
+        Raises:
+          ValueError: a shape is wrong, or a value not finite.
+          Diverged: the update would not be finite.
+        """
+        eps = finite_rows("eps", eps, (self.pairs, state.mu.size))
+        returns = finite_rows("returns", returns, (self.pairs, 2))
+        top = self.top or -(-self.pairs // 2)
+        used = np.sort(np.argsort(-returns.max(axis=1), kind="stable")[:top])
+        with np.errstate(all="ignore"):
+            spread = float(returns[used].std())
+            contrast = returns[used, 0] - returns[used, 1]
+            step = weighted_sum(contrast, eps[used] / state.sigma)
+            rate = self.learning_rate_mu / (top * spread) if spread > 0.0 else 0.0
+            mu = state.mu + rate * step
+        return moved(state, returns, mu=mu)

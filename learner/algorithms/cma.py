@@ -1,0 +1,182 @@
+"""CMA-ES and its separable form, by the library `cmaes` (Shibata). The door to it.
+
+Hansen 2016, The CMA evolution strategy: a tutorial; Ros & Hansen 2008, A simple modification in CMA-ES achieving linear
+time and space complexity. The search distribution is N(mu, step^2 C): C is any covariance matrix, or a diagonal one.
+
+The library's object lives for one call: it is made from our state, which is arrays alone, asked or told, and read. Its
+products are BLAS's, its eigenvectors LAPACK's and its exponential numpy's, so that the last bits depend on the
+learner's kind of processor and its BLAS threads, unlike those of all other algorithms here. On one machine a run
+repeats, and is resumed, bit by bit; workers make no difference.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+from farm.settings import Settings, setting
+from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows, moved
+
+_LARGEST: Final = 1000  # parameters with a full covariance: its update takes population x P^2 numbers
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CMAState(SearchState):
+    """The search distribution, and the paths that its covariance follows; sigma is step sqrt(diag C)."""
+
+    step: FloatArray
+    """Step size, (1,)."""
+    covariance: FloatArray
+    """C: its upper triangle row by row, (P (P + 1) / 2,), or its diagonal, (P,)."""
+    step_path: FloatArray
+    """Evolution path of the step size, (P,)."""
+    covariance_path: FloatArray
+    """Evolution path of the covariance, (P,)."""
+
+    def _check_sizes(self) -> None:
+        size = self.mu.size
+        wanted = {"sigma": (size,), "step": (1,), "covariance": (size, size * (size + 1) // 2)}
+        for name in self._vectors()[1:]:
+            if (found := getattr(self, name).size) not in wanted.get(name, (size,)) or not found:
+                raise ValueError(f"state: {name} has {found} entries, with {size} parameters")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CMAES(Settings):
+    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+
+    population: int = setting(20, least=4)
+    """Rollouts a generation."""
+    initial_mu: float = setting(0.0, least=-1e30, most=1e30)
+    """First mean of every parameter."""
+    initial_sigma: float = setting(1.0, above=0.0)
+    """First standard deviation of every parameter."""
+
+    optimiser: ClassVar[str] = "CMA"
+    """The library's class."""
+
+    def signs(self) -> tuple[int, ...]:
+        """Rollouts of a row of eps: mu + eps alone."""
+        return (1,)
+
+    def init(self, size: int) -> CMAState:
+        """Return the state before the first generation, of `size` parameters.
+
+        Raises:
+          ConfigError: cmaes is not installed, or does not do with so many parameters.
+        """
+        least, most = self._sizes()
+        if not least <= size <= most:
+            raise ConfigError(f"the policy has {size} parameters; {self._name} takes {least} to {most}")
+        begun = self._library()(mean=np.full(size, float(self.initial_mu)), sigma=float(self.initial_sigma))
+        return CMAState(**self._read(begun))
+
+    def restore(self, values: Mapping[str, StateValue]) -> CMAState:
+        """Return the state that `to_dict` told."""
+        state = CMAState.from_dict(values)
+        if state.covariance.size != self._entries(state.mu.size):
+            raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self._name} has not")
+        return state
+
+    def ask(self, state: CMAState, rng: np.random.Generator) -> FloatArray:
+        """Draw eps ~ N(0, step^2 C), (population, P)."""
+        search = self._write(state)
+        search.reseed_rng(int(rng.integers(2**32)))
+        return np.stack([search.ask() - state.mu for _ in range(self.population)])
+
+    def tell(self, state: CMAState, eps: FloatArray, returns: FloatArray) -> CMAState:
+        """Return the state after one update.
+
+        Args:
+          state: the state `eps` was drawn from.
+          eps: what `ask` gave, (population, P).
+          returns: (population, 1); all finite.
+
+        Raises:
+          ValueError: a shape is wrong, or a value not finite.
+          Diverged: the update would not be finite.
+        """
+        eps = finite_rows("eps", eps, (self.population, state.mu.size))
+        returns = finite_rows("returns", returns, (self.population, 1))
+        search = self._write(state)
+        with np.errstate(all="ignore"):
+            try:
+                search.tell([(state.mu + row, -float(value)) for row, value in zip(eps, returns[:, 0], strict=True)])
+                told = self._read(search)
+            except (AssertionError, ArithmeticError, np.linalg.LinAlgError) as error:
+                raise Diverged(f"the update after generation {state.generation} failed: {error}") from None
+        return moved(state, returns, **told)
+
+    @property
+    def _name(self) -> str:
+        return "cma-es"
+
+    def _sizes(self) -> tuple[int, int]:
+        """Least and greatest number of parameters."""
+        return 1, _LARGEST
+
+    def _entries(self, size: int) -> int:
+        """Numbers that the covariance of so many parameters is."""
+        return size * (size + 1) // 2
+
+    def _library(self) -> Any:  # noqa: ANN401  a class of the library's
+        try:
+            import cmaes
+        except ImportError:
+            raise ConfigError(f"algorithm {self._name} needs cmaes: pip install 'rolloutfarm[cma]'") from None
+        return getattr(cmaes, self.optimiser)
+
+    def _write(self, state: CMAState) -> Any:  # noqa: ANN401  the library's object
+        """The library's object in this state."""
+        mean, step = np.array(state.mu), float(state.step[0])
+        search = self._library()(mean=mean, sigma=step, population_size=self.population)
+        own = {"_p_sigma": np.array(state.step_path), "_pc": np.array(state.covariance_path), "_g": state.generation}
+        search.__setstate__({**search.__getstate__(), **own, self._covariance: np.array(state.covariance)})
+        return search
+
+    def _read(self, search: Any) -> dict[str, Any]:  # noqa: ANN401
+        """Arrays of our state from the library's object."""
+        found = search.__getstate__()
+        step, covariance = float(found["_sigma"]), np.array(found[self._covariance])
+        deviation = np.sqrt(self._diagonal(covariance, len(found["_mean"])))
+        return {
+            "mu": np.array(found["_mean"]), "sigma": step * deviation, "step": np.array([step]),
+            "covariance": covariance, "step_path": np.array(found["_p_sigma"]),
+            "covariance_path": np.array(found["_pc"]),
+        }  # fmt: skip
+
+    @property
+    def _covariance(self) -> str:
+        """The library's name of what we keep of C."""
+        return "_c_1d"
+
+    def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:
+        """Variances, (P,), of what we keep of C."""
+        return covariance[np.cumsum([0, *range(size, 1, -1)])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SepCMA(CMAES):
+    """CMA-ES with a diagonal covariance, for many parameters."""
+
+    optimiser: ClassVar[str] = "SepCMA"
+
+    @property
+    def _name(self) -> str:
+        return "sep-cma"
+
+    def _sizes(self) -> tuple[int, int]:
+        return 2, 10_000_000
+
+    def _entries(self, size: int) -> int:
+        return size
+
+    @property
+    def _covariance(self) -> str:
+        return "_C"
+
+    def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:  # noqa: ARG002
+        return covariance

@@ -1,0 +1,41 @@
+"""What searches by mirrored samples have in common: N pairs mu + eps and mu - eps, eps ~ N(0, diag(sigma^2)).
+
+Shapes: P parameters, N pairs.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.settings import Settings, setting
+from learner.algorithms.state import SearchState, StateValue
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mirrored(Settings):
+    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns (a subclass's)."""
+
+    pairs: int = setting(16, least=1)
+    """Pairs of rollouts a generation, N."""
+    initial_mu: float = 0.0
+    """First mean of every parameter."""
+    initial_sigma: float = setting(1.0, above=0.0)
+    """First standard deviation of every parameter."""
+
+    def signs(self) -> tuple[int, ...]:
+        """Rollouts of a row of eps: mu + eps and mu - eps."""
+        return (1, -1)
+
+    def init(self, size: int) -> SearchState:
+        """Return the state before the first generation, of `size` parameters."""
+        return SearchState(mu=np.full(size, float(self.initial_mu)), sigma=np.full(size, float(self.initial_sigma)))
+
+    def restore(self, values: Mapping[str, StateValue]) -> SearchState:
+        """Return the state that `to_dict` told."""
+        return SearchState.from_dict(values)
+
+    def ask(self, state: SearchState, rng: np.random.Generator) -> FloatArray:
+        """Draw eps, (N, P)."""
+        return state.sigma * rng.standard_normal((self.pairs, state.mu.size))

@@ -1,0 +1,167 @@
+"""A learnt policy as an ONNX model: observation in, action out. A door to onnx; docs/export.md describes the file.
+
+Double precision throughout, in the operators of opset 17. Sums and functions are the runtime's, so that the last bits
+are others than the farm's.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm import settings
+from farm.arrays import AnyArray
+from farm.errors import ConfigError, writing
+from learner.replay import LoadedPolicy
+
+OPSET: Final = 17
+"""Version of the operators."""
+IR: Final = 8
+"""Version of the file's format, which goes with them."""
+
+
+class Graph:
+    """Operators one behind the other; each value is known by its name, and N is the size of a batch."""
+
+    def __init__(self) -> None:
+        """Begin empty.
+
+        Raises:
+          ConfigError: onnx is not installed.
+        """
+        try:
+            import onnx
+        except ImportError:
+            raise ConfigError("an .onnx file needs onnx: pip install 'rolloutfarm[onnx]'") from None
+        self._onnx: Any = onnx
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+
+    def put(self, operator: str, *values: str | AnyArray | float, to: str = "", **attributes: Any) -> str:  # noqa: ANN401
+        """Apply an operator to values by name, or to constants; says the name of what comes out."""
+        names = [value if isinstance(value, str) else self._constant(value) for value in values]
+        out = to or f"v{len(self._nodes)}"
+        self._nodes.append(self._onnx.helper.make_node(operator, names, [out], **attributes))
+        return out
+
+    def _constant(self, value: AnyArray | float) -> str:
+        name = f"c{len(self._constants)}"
+        self._constants.append(self._onnx.numpy_helper.from_array(np.array(value), name))
+        return name
+
+    def model(self, inputs: int, outputs: int, properties: Mapping[str, str]) -> bytes:
+        """The file: from `observation` (N, inputs) to `action` (N, outputs)."""
+        helper, double = self._onnx.helper, self._onnx.TensorProto.DOUBLE
+        ends = [
+            helper.make_tensor_value_info(name, double, ["N", size])
+            for name, size in (("observation", inputs), ("action", outputs))
+        ]
+        graph = helper.make_graph(self._nodes, "policy", ends[:1], ends[1:], self._constants)
+        operators = [helper.make_opsetid("", OPSET)]
+        model = helper.make_model(graph, opset_imports=operators, ir_version=IR, producer_name="rolloutfarm")
+        helper.set_model_props(model, dict(properties))
+        self._onnx.checker.check_model(model)
+        content: bytes = model.SerializeToString()
+        return content
+
+
+def contents(policy: LoadedPolicy) -> bytes:
+    """The file.
+
+    Raises:
+      ConfigError: onnx is not installed, or the policy is not a built-in one.
+    """
+    problem, graph = policy.problem, Graph()
+    config, constants = problem.config, problem.policy.constants
+    if config.policy not in _FORMS:
+        raise ConfigError(f"policy {config.policy} has no form in ONNX; these have: {', '.join(_FORMS)}")
+    x = "observation"
+    if "observation_mean" in constants:
+        x = graph.put("Sub", x, constants["observation_mean"])
+        x = graph.put("Div", x, constants["observation_deviation"])
+    out = _FORMS[config.policy](graph, policy, x)
+    graph.put("Identity", out, to="action")
+    return graph.model(
+        problem.spec.observation,
+        problem.spec.action,
+        {
+            "task": config.task.rpartition("/")[2],
+            "policy": config.policy,
+            "generation": str(policy.generation),
+            "control_period": repr(problem.spec.period),
+            "task_config": json.dumps(settings.to_dict(config.task_config)),
+            "policy_config": json.dumps(settings.to_dict(config.policy_config)),
+        },
+    )
+
+
+def write(path: Path, policy: LoadedPolicy) -> None:
+    """Write the file.
+
+    Raises:
+      ConfigError: onnx is not installed, or the policy is not a built-in one.
+      RunError: it cannot be written.
+    """
+    content = contents(policy)
+    with writing(path):
+        path.write_bytes(content)
+
+
+def _layers(graph: Graph, policy: LoadedPolicy, x: str) -> str:
+    """Networks: `linear` and `mlp`."""
+    spec, config = policy.problem.spec, policy.problem.config.policy_config
+    sizes = (spec.observation, *getattr(config, "layers", ()), spec.action)
+    first = 0
+    for layer, (inputs, units) in enumerate(pairwise(sizes)):
+        if layer:
+            x = graph.put("Tanh", x)
+        end = first + units * (inputs + 1)
+        rows, first = policy.mu[first:end].reshape(units, inputs + 1), end
+        x = graph.put("Add", graph.put("MatMul", x, rows[:, :-1].T.copy()), rows[:, -1])
+    return x
+
+
+def _gaussians(graph: Graph, x: str, centres: AnyArray, bandwidth: float) -> str:
+    """exp(-|c - x|^2 / (2 h^2)) of centres (K, d), (N, K)."""
+    difference = graph.put("Sub", graph.put("Unsqueeze", x, np.array([1])), centres)
+    squares = graph.put("ReduceSum", graph.put("Mul", difference, difference), np.array([2]), keepdims=0)
+    return graph.put("Exp", graph.put("Mul", squares, -0.5 / bandwidth**2))
+
+
+def _kernel(graph: Graph, policy: LoadedPolicy, x: str) -> str:
+    config: Any = policy.problem.config.policy_config
+    return _gaussians(graph, x, policy.mu.reshape(policy.problem.spec.action, -1), config.bandwidth)
+
+
+def _rbf(graph: Graph, policy: LoadedPolicy, x: str) -> str:
+    spec, config = policy.problem.spec, policy.problem.config.policy_config
+    centres, weights = np.split(policy.mu, [config.centres * spec.observation])  # type: ignore[attr-defined]
+    values = _gaussians(graph, x, centres.reshape(-1, spec.observation), config.bandwidth)  # type: ignore[attr-defined]
+    return graph.put("MatMul", values, weights.reshape(spec.action, -1).T.copy())
+
+
+def _weighted_kernel(graph: Graph, policy: LoadedPolicy, x: str) -> str:
+    spec, config = policy.problem.spec, policy.problem.config.policy_config
+    constants, rows = policy.problem.policy.constants, policy.mu.reshape(spec.action, -1)
+    y = graph.put("Div", graph.put("Sub", x, constants["origin"]), constants["spread"])
+    bandwidth = config.width * float(np.sqrt(spec.observation))  # type: ignore[attr-defined]
+    values = _gaussians(graph, y, rows[:, :-1].copy(), bandwidth)
+    return graph.put("Mul", values, config.weight_scale * rows[:, -1])  # type: ignore[attr-defined]
+
+
+def _features(graph: Graph, policy: LoadedPolicy, x: str) -> str:
+    """Random features: `direct`, and those that are `direct` in what they prepare."""
+    found, config = policy.problem.policy, policy.problem.config.policy_config
+    rows = (found.constants["frequencies"] / config.bandwidth).T.copy()  # type: ignore[attr-defined]
+    weights = found.prepare(policy.mu[None])[0]
+    angle = graph.put("Add", graph.put("MatMul", x, rows), found.constants["phases"])
+    return graph.put("MatMul", graph.put("Cos", angle), np.sqrt(2.0 / len(rows.T)) * weights.T)
+
+
+_FORMS: Final[Mapping[str, Callable[[Graph, LoadedPolicy, str], str]]] = {
+    "direct": _features, "projected": _features, "cosine": _features, "kernel": _kernel, "linear": _layers,
+    "mlp": _layers, "rbf": _rbf, "weighted-kernel": _weighted_kernel,
+}  # fmt: skip

@@ -1,0 +1,194 @@
+"""A pool that evaluates parameter vectors, for search methods of one's own.
+
+import farm
+
+with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
+    returns = pool.map(thetas, seeds=range(len(thetas)))
+"""
+
+import logging
+import secrets
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm import seeds as streams
+from farm.arrays import FloatArray
+from farm.errors import ConfigError, RunError
+from farm.net.session import free_endpoint
+from farm.net.tls import find
+from farm.net.work import Jobs
+from farm.sim.trajectory import Trajectory
+from learner.config import configure
+from learner.run import Placement, connected, dispatch
+from learner.scheduler.dispatcher import Stopped
+from learner.scheduler.membership import Admission
+from learner.scheduler.scheduler import SchedulerConfig
+from learner.setup import problem
+
+log = logging.getLogger(__name__)
+
+_GATHER: Final = 256 << 20  # [bytes] of parameters that are given out at a time
+
+
+class Farm:
+    """Workers that evaluate parameters of a task's policy: each exactly once, in order, whatever dies.
+
+    Usable from several threads, which take turns. Ctrl-C ends a call; the pool stays usable.
+    """
+
+    def __init__(
+        self,
+        task: str = "finger-gait",
+        *,
+        workers: int = 2,
+        connect: str | Sequence[str] = (),
+        farm: str = "farm",
+        tls: str | Path | None = None,
+        audit: float = 0.02,
+        **settings: Any,  # noqa: ANN401  any setting of task and policy
+    ) -> None:
+        """Start local workers, or join a farm whose workers are elsewhere.
+
+        Args:
+          task: name of the task, or FILE.py:CLASS.
+          workers: processes on this machine; none are started with `connect`.
+          connect: where a router listens that workers connect to as well.
+          farm: name of the farm.
+          tls: folder with a learner's certificates.
+          audit: part of the evaluations that a second host repeats, where there is one.
+          settings: of task and policy as `farm.configure` takes them, such as policy="linear", preset, perturb.
+
+        Raises:
+          ConfigError: a setting makes no sense.
+          FarmError: nobody listens at `connect`.
+        """
+        endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+        self._problem = problem(configure(task, **settings))
+        self._place = Placement(
+            workers=0 if endpoints else workers, listen=free_endpoint(), connect=endpoints, farm=farm,
+            tls=None if tls is None else find(Path(tls), "learner"), scheduler=SchedulerConfig(audit=audit),
+        )  # fmt: skip
+        if not endpoints and workers < 1:
+            raise ConfigError(f"workers is {workers}; expected 1 or more, or connect to a farm that has some")
+        self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
+        with ExitStack() as stack:
+            link = stack.enter_context(connected(self._place, self._closed.is_set))
+            name = f"pool-{secrets.token_hex(4)}"
+            self._farm, self._pool = dispatch(
+                stack, link, self._place, self._problem, name, Admission(None), 0, self._closed.is_set
+            )
+            self._stack = stack.pop_all()
+
+    @property
+    def size(self) -> int:
+        """Length P of a parameter vector."""
+        return self._problem.policy.size
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of the local workers."""
+        return self._pool.pids if self._pool else []
+
+    def map(self, thetas: Any, seeds: Iterable[int] | None = None) -> FloatArray:  # noqa: ANN401  what asarray takes
+        """Returns of parameters (B, P), in their order, (B,).
+
+        Args:
+          thetas: parameters of B rollouts.
+          seeds: of each rollout's start and conditions, whole numbers below 2^32; None: the nominal ones.
+
+        Raises:
+          ConfigError: thetas or seeds are not what they should be; nothing was sent.
+          RunError: an evaluation failed wherever it was tried, or the pool is closed.
+        """
+        returns = np.empty(len(thetas))
+        for index, value in self.imap(thetas, seeds):
+            returns[index] = value
+        return returns
+
+    def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
+        """As `map`, but pairs (index, return) as they come; a later one of an index takes an earlier one's place."""
+        theta = self._parameters(thetas)
+        drawn = self._seeds(seeds, len(theta))
+        if not len(theta):
+            return
+        jobs = Jobs.exploring(theta, (1,), drawn)
+        with self._taken:
+            self._begin(jobs)
+            told = np.full(len(theta), np.nan)  # a host that is expelled has its answers taken back
+            try:
+                for results in self._farm.progress():
+                    for index in np.flatnonzero(results.done & (results.returns != told)).tolist():
+                        told[index] = results.returns[index]
+                        yield index, float(told[index])
+            except Stopped:
+                raise RunError("the pool is closed") from None
+
+    def rollout(self, theta: Any, seed: int | None = None) -> Trajectory:  # noqa: ANN401
+        """One rollout at physics rate, with its channels, of parameters (P,)."""
+        (one,) = self._parameters([theta])
+        drawn = self._seeds(None if seed is None else [seed], 1)
+        with self._taken:
+            self._begin(Jobs.single(one, "physics", None if drawn is None else drawn[0]))
+            try:
+                found = self._farm.collect().trajectory(0)
+            except Stopped:
+                raise RunError("the pool is closed") from None
+        assert found is not None
+        return found
+
+    def close(self) -> None:
+        """End the workers that were started; whoever waits gets a RunError."""
+        self._closed.set()
+        with self._taken:
+            self._stack.close()
+
+    def __enter__(self) -> "Farm":
+        """Itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def _begin(self, jobs: Jobs) -> None:
+        if self._closed.is_set():
+            raise RunError("the pool is closed")
+        self._round += 1
+        self._farm.begin(self._round, np.zeros(self.size), jobs)
+
+    def _parameters(self, thetas: Any) -> FloatArray:  # noqa: ANN401
+        try:
+            theta = np.ascontiguousarray(thetas, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigError(
+                f"thetas is a {type(thetas).__name__}; expected numbers of shape (B, {self.size})"
+            ) from None
+        if not theta.size and len(theta) == 0:
+            return np.empty((0, self.size))
+        if theta.ndim != 2 or theta.shape[1] != self.size:
+            raise ConfigError(f"thetas has shape {theta.shape}; expected (B, {self.size})")
+        if not np.isfinite(theta).all():
+            row = int(np.flatnonzero(~np.isfinite(theta).all(axis=1))[0])
+            raise ConfigError(f"thetas[{row}] is not finite; expected finite numbers")
+        if theta.nbytes > _GATHER:
+            most = _GATHER // (8 * self.size)
+            raise ConfigError(
+                f"thetas has {len(theta)} rows; at most {most} of {self.size} numbers are taken at a time"
+            )
+        return theta
+
+    def _seeds(self, seeds: Iterable[int] | None, count: int) -> list[tuple[int, ...]] | None:
+        if seeds is None:
+            return None
+        words = list(seeds)
+        if len(words) != count:
+            raise ConfigError(f"there are {len(words)} seeds; expected {count}, one for each row of thetas")
+        for word in words:
+            if isinstance(word, bool) or not isinstance(word, (int, np.integer)) or not 0 <= word < streams.SEEDS:
+                raise ConfigError(f"seed {str(word)[:40]!r}; expected a whole number from 0 to {streams.SEEDS - 1}")
+        return [streams.trial(0, int(word)) for word in words]

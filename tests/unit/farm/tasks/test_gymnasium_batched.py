@@ -1,0 +1,98 @@
+"""Environments of Gymnasium in a batch: each step's observation, reward and end are the environment's own."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from farm.policies.networks import Linear
+from farm.rollouts import Runner
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks.loop import RETURN_FLOOR, Batch, again
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from farm.tasks.gymnasium import Environment, EnvironmentConfig, EnvironmentEngine, make, reset_seed  # noqa: E402
+from farm.tasks.gymnasium_batched import batched  # noqa: E402
+
+ARGUMENTS = {
+    "Swimmer-v5": ("exclude_current_positions_from_observation=false", "ctrl_cost_weight=0.3", "frame_skip=2"),
+    "HalfCheetah-v5": ("exclude_current_positions_from_observation=false", "forward_reward_weight=0.5"),
+    "Hopper-v5": ("terminate_when_unhealthy=false", "healthy_reward=0.7", "healthy_state_range=[-3,3]"),
+    "Walker2d-v5": ("healthy_z_range=[0.9,1.4]", "healthy_angle_range=[-0.3,0.3]", "reset_noise_scale=0.05"),
+    "InvertedPendulum-v5": ("reset_noise_scale=0.1",),
+    "InvertedDoublePendulum-v5": ("healthy_reward=3.5", "reset_noise_scale=0.02"),
+    "Reacher-v5": ("reward_dist_weight=2", "reward_control_weight=0.3"),
+    "Pusher-v5": ("reward_near_weight=2", "reward_control_weight=0.3", "reward_dist_weight=0.7"),
+}
+CASES = [(name, own) for name, given in ARGUMENTS.items() for own in ((), given)]
+STARTS = (None, (3, 0, 1, 0), (3, 0, 2, 0))
+
+
+@cache
+def task(name: str, own: tuple[str, ...] = ()) -> Environment:
+    return Environment(EnvironmentConfig(env_arg=own, steps=100 if name in ("Pusher-v5",) else 0), name)
+
+
+@pytest.mark.parametrize(("name", "own"), CASES, ids=lambda value: value if isinstance(value, str) else len(value))
+def test_every_step_is_the_environments(name: str, own: tuple[str, ...]) -> None:
+    made = task(name, own)
+    assert made.batched is not None
+    sim, steps = Sim(made.engine(lambda model: BatchEngine(model, 5))), min(100, made.steps)
+
+    def begin() -> Batch:
+        begun = Batch(made, sim, [*STARTS, STARTS[1]])  # two begin alike
+        begun.observe()
+        begun.step(np.zeros((4, len(made.limits[0]))))
+        return Batch(made, sim, [*STARTS, STARTS[1]])
+
+    batch = again(begin)
+    raw = np.random.default_rng(0).uniform(-1.2, 1.2, (steps, 4, len(made.limits[0])))
+    envs = [make(name, **made.config.arguments) for _ in range(4)]
+    seen = [
+        env.reset(seed=reset_seed(None if start is None else np.random.default_rng(start)))[0]
+        for env, start in zip(envs, [*STARTS, STARTS[1]], strict=True)
+    ]
+    going = list(range(4))
+    for t in range(steps):
+        if not going:
+            break
+        np.testing.assert_allclose(batch.observe(), [seen[row] for row in going], rtol=0, atol=1e-9)
+        actions = made.act(sim, raw[t, going])
+        batch.step(raw[t, going])
+        for at, row in enumerate(list(going)):
+            action = actions[at].astype(np.float32)
+            seen[row], reward, terminated, *_ = envs[row].step(action)
+            assert batch._terms is not None
+            assert batch._terms[row, t, 0] == pytest.approx(reward, rel=0, abs=1e-9)
+            assert batch._frames["qpos"][row, t].tolist() == envs[row].unwrapped.data.qpos.tolist()
+            if terminated:
+                going.remove(row)
+        assert batch.active.tolist() == going
+
+
+def test_physics_that_blows_up_is_never_good() -> None:
+    made = Environment(EnvironmentConfig(env_arg=("reset_noise_scale=1e7",), steps=20), "HalfCheetah-v5")
+    linear = Linear(Linear.Config(), made.spec(), {})
+    found = Runner(made, linear).rollouts(np.zeros((1, linear.size)), [None])
+    assert (found.failed[0], found.clamped[0], found.returns[0]) == (True, True, RETURN_FLOOR)
+
+
+def test_others_step_themselves() -> None:
+    for name, own in (("HumanoidStandup-v5", ()), ("Ant-v5", ()), ("Swimmer-v4", ())):
+        made = Environment(EnvironmentConfig(env_arg=own), name)
+        assert (made.batched, made.substeps) == (None, 1)
+        assert isinstance(made.engine(lambda model: BatchEngine(model, 1)), EnvironmentEngine)
+
+
+def test_an_environment_derived_from_one_is_not_it() -> None:
+    from gymnasium.envs.mujoco.swimmer_v5 import SwimmerEnv
+
+    class Slow(SwimmerEnv):
+        pass
+
+    gymnasium.register("Slow-v0", Slow, max_episode_steps=10)
+    assert batched(make("Slow-v0")) is None
+    gymnasium.register("Same-v0", "gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv", max_episode_steps=10)
+    assert batched(make("Same-v0")) is not None

@@ -1,0 +1,103 @@
+"""What others wrote moves no cursor, rings no bell and turns no text around on a terminal of ours."""
+
+import io
+import logging
+from typing import Any
+
+import pytest
+from rich.console import Console, Group
+
+from farm import __main__ as door
+from farm.commands import logs, status
+from farm.commands.screen import plain
+from farm.errors import FarmError, printable
+from farm.net.telemetry import RunStatus, WorkerStatus
+
+ATTACKS = {
+    "escape": "\x1b",
+    "bell": "\a",
+    "clear the screen": "\x1b[2J",
+    "window title": "\x1b]0;owned\a",
+    "link": "\x1b]8;;http://evil\x1b\\safe\x1b]8;;\x1b\\",
+    "CSI of one character": "\x9b2J",
+    "OSC of one character": "\x9d0;x\x9c",
+    "bidi override": "\u202egnp.exe",
+    "bidi isolate": "\u2066a\u2069",
+    "new lines": "a\r\nfarm: all is well",
+    "backspace": "a\b",
+    "delete": "\x7f",
+    "null": "\0",
+    "line separator": "\u2028",
+    "tag": "\U000e0041",
+    "surrogate": "\udc80",
+}
+LETTERS = "Grüße, Ωμέγα, привет, 你好, こんにちは, שלום, café, 3 µs → 4 °C, C:\\x1b"
+
+
+def assert_harmless(text: str) -> None:
+    assert all(letter.isprintable() or letter == "\n" for letter in text), repr(text)
+
+
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
+def test_escaped(attack: str) -> None:
+    assert printable(attack).isprintable()
+    assert printable(f"a{attack}b").startswith("a")
+    assert "\\" in printable(attack)
+
+
+def test_letters_stay() -> None:
+    assert printable(LETTERS) == LETTERS
+
+
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
+def test_in_the_log(attack: str) -> None:
+    record = logging.LogRecord("n", logging.INFO, "p", 1, "run %s", (f"{attack}{LETTERS}",), None)
+    said = logs.Formatter("%(message)s").format(record)
+    assert said.isprintable()
+    assert said.startswith("run ")
+    assert said.endswith(LETTERS)
+
+
+def test_in_a_traceback_of_the_log() -> None:
+    try:
+        raise ValueError("".join(ATTACKS.values()))
+    except ValueError as error:
+        record = logging.LogRecord("n", logging.ERROR, "p", 1, "failed", (), (ValueError, error, error.__traceback__))
+    said = logs.Formatter("%(message)s").format(record)
+    assert_harmless(said)
+    assert len(said.splitlines()) > 3
+
+
+def test_every_handler_of_ours_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.INFO)
+    logs.set_up("INFO")
+    assert [type(handler.formatter) for handler in logging.root.handlers] == [logs.Formatter]
+
+
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
+def test_in_the_table_of_a_farm(attack: str) -> None:
+    machine: Any = {"host": attack, "cores": 1, "version": attack, "canary": attack, "ignored": {attack: 1}}
+    worker = WorkerStatus(worker=f"w{attack}/1", rollouts=1, rate=1.0, seen=1.0, **machine)
+    run = RunStatus(
+        run=f"r{attack}", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0,
+        refused=0, ignored={attack: 3}, workers=(worker,),
+    )  # fmt: skip
+    assert_harmless(shown(status._tables([run])))
+
+
+def test_in_rows_of_tables() -> None:
+    assert_harmless(shown(Group(*map(plain, ATTACKS.values()))))
+
+
+def test_at_the_front_door(capsys: pytest.CaptureFixture[str]) -> None:
+    assert door._ended(FarmError("a learner answers: " + "".join(ATTACKS.values()))) == 1
+    said = capsys.readouterr().err
+    assert_harmless(said)
+    assert len(said.splitlines()) == 1
+
+
+def shown(what: Group) -> str:
+    console = Console(file=io.StringIO(), width=500, color_system=None)
+    console.print(what)
+    return console.file.getvalue()  # type: ignore[attr-defined]

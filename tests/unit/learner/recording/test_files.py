@@ -1,0 +1,58 @@
+"""Compacting a recording: a process that is killed while at it leaves no other behind, and what it leaves goes."""
+
+import os
+import select
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from learner.recording import files
+
+HANGS = """#!/bin/sh
+for last; do :; done
+echo half > "$last"
+echo $$ > told
+exec sleep 1000
+"""
+"""In place of Rerun: begins to write, and never ends."""
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+
+
+def killed_while_compacting(path: Path) -> None:
+    """Compact a recording in another process, kill that, and see that the one it started ends as well."""
+    folder = path.parent
+    hangs, told = folder / "hangs", folder / "told"
+    os.mkfifo(told)
+    hangs.write_text(HANGS)
+    hangs.chmod(0o755)
+    code = "import sys, pathlib; from learner.recording import files; files.compact(pathlib.Path(sys.argv[1]))"
+    environment = {**os.environ, "RERUN_CLI_PATH": str(hangs)}
+    process = subprocess.Popen([sys.executable, "-c", code, str(path)], cwd=folder, env=environment)
+    child = os.pidfd_open(int(told.read_text()))
+    process.kill()
+    process.wait()
+    ended, _, _ = select.select([child], [], [], 10)
+    os.close(child)
+    assert ended, "it goes on without its parent"
+
+
+def test_nobody_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.rrd"
+    path.write_text("recorded")
+    killed_while_compacting(path)
+    assert path.read_text() == "recorded"
+    assert {each.name for each in tmp_path.glob("*merging*")} == {"run.merging.rrd", "run.merging"}
+    monkeypatch.setenv("RERUN_CLI_PATH", "false")  # what cannot be compacted stays as it is
+    assert files.next_part(path) == tmp_path / "run.part2.rrd"
+    assert path.read_text() == "recorded"
+    assert not list(tmp_path.glob("*merging*"))
+
+
+def test_what_was_left_goes_although_there_is_nothing_to_compact(tmp_path: Path) -> None:
+    (tmp_path / "run.merging").mkdir()
+    (tmp_path / "run.merging.rrd").touch()
+    assert files.next_part(tmp_path / "run.rrd") == tmp_path / "run.rrd"
+    assert not list(tmp_path.iterdir())

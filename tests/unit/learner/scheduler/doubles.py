@@ -1,0 +1,140 @@
+"""A dispatcher, and workers that do what a test says; no physics."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from farm.net import codec, keys
+from farm.net.messages import Spec, WorkRequest
+from farm.net.session import Session
+from farm.net.work import Chunk, Failure, Jobs, Results, traced
+from learner.scheduler.dispatcher import Dispatcher
+from learner.scheduler.membership import Admission
+from learner.scheduler.round import RoundResults
+from learner.scheduler.scheduler import SchedulerConfig
+
+FARM, RUN, TRACE = "try", "r", (3, 4)
+SPEC = Spec(run=RUN, task="none", task_config={}, policy="none", policy_config={}, code={})
+SHAPES = {"bodies": (2, 7), "actions": (1,), "terms": (2,), "channels/angle": (1,)}
+PATIENT = SchedulerConfig(straggler_seconds=60.0, audit=0.0)
+WAIT = 20.0
+
+
+def request(worker: str, credits: int = 1, *, idle: bool = False, canary: str = "c") -> WorkRequest:
+    runs = (RUN,) if idle else ()
+    return WorkRequest(worker=worker, credits=credits, idle=runs, version="0", canary=canary, host="h", cores=2)
+
+
+NEWER = codec.encode(request("a/1"), codec.SCHEMA + 1)
+
+
+def jobs(count: int) -> Jobs:
+    """Pairs whose index is in their seeds."""
+    return Jobs.exploring(np.zeros((count, 2)), (1, -1), [(3, 0, 4, i) for i in range(count)])
+
+
+class Worker:
+    """A worker that does what the test says: a job's returns are its index."""
+
+    def __init__(self, session: Session, name: str) -> None:
+        self.session, self.name = session, name
+        session.subscribe("inbox", keys.inbox(FARM, name))
+        session.subscribe("generation", keys.generation(FARM, "*"))
+        session.subscribe("refused", keys.refused(FARM, name))
+        session.watch("learner", keys.learner_token(FARM, "*"))
+        session.token(keys.worker_token(FARM, name))
+        self.next("learner")
+
+    def next(self, topic: str) -> bytes:
+        while True:
+            event = self.session.events.get(timeout=WAIT)
+            if event.topic == topic:
+                return event.payload
+
+    def chunk(self) -> Chunk:
+        return codec.decode(self.next("inbox"), Chunk)
+
+    def refusal(self) -> bytes:
+        return self.next("refused")
+
+    def want(self, credits: int, *, idle: bool = False) -> None:
+        self.say(keys.want(FARM, self.name), request(self.name, credits, idle=idle))
+
+    def say(self, key: str, message: object) -> None:
+        self.session.publish(key, message if isinstance(message, bytes) else codec.encode(message))
+
+    def results(self, chunk: Chunk, *indices: int, value: float | None = None) -> Results:
+        """Of all jobs of a chunk, or of these."""
+        chosen = sorted(indices or chunk.indices.tolist())
+        returns = np.repeat(np.array(chosen, dtype=float) if value is None else value, 2)
+        traces = np.zeros((len(traced("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4")
+        return Results(
+            **head(chunk), worker=self.name, jobs=np.array(chosen), returns=returns,
+            flags=np.zeros((len(returns), 4), bool), steps=np.ones(len(returns), "<i8"), traces=traces, trajectories=(),
+        )  # fmt: skip
+
+    def failure(self, chunk: Chunk, index: int | None, error: str) -> Failure:
+        return Failure(**head(chunk), worker=self.name, index=index, error=error)
+
+    def answer(self, message: object) -> None:
+        self.say(keys.result(FARM, RUN, self.name), message)
+
+    def work(self, count: int) -> list[int]:
+        """Answer chunks until so many jobs are done."""
+        done: list[int] = []
+        while len(done) < count:
+            chunk = self.chunk()
+            self.answer(self.results(chunk))
+            done += chunk.indices.tolist()
+        return done
+
+
+def head(chunk: Chunk) -> dict[str, object]:
+    return {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round}
+
+
+class Learner:
+    """A dispatcher, its rounds collected on another thread."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.stop = session, threading.Event()
+        self._pool = ThreadPoolExecutor(1)
+
+    def show(
+        self,
+        scheduler: SchedulerConfig = PATIENT,
+        stopped: Callable[[], bool] | None = None,
+        join: str | None = "farm worker --connect here",
+        canary: str | None = None,
+    ) -> Dispatcher:
+        self.farm = Dispatcher(
+            self.session,
+            FARM,
+            SPEC,
+            9,
+            join,
+            stopped or self.stop.is_set,
+            Admission(canary),
+            (TRACE, SHAPES),
+            scheduler,
+        )
+        return self.farm
+
+    def collect(self, todo: Jobs) -> "Future[RoundResults]":
+        self.farm.begin(0, np.zeros(2), todo, "extremes")
+        return self._pool.submit(self.farm.collect)
+
+    def close(self) -> None:
+        self.stop.set()
+        self._pool.shutdown()
+
+
+Hire = Callable[..., Any]
+
+
+def done(found: RoundResults) -> list[float]:
+    """The returns of each job's first rollout."""
+    return found.returns[::2].tolist()

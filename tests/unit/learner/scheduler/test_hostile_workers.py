@@ -1,0 +1,129 @@
+"""The learner's side of the network, against workers and sessions that are hostile; no physics."""
+
+from dataclasses import replace
+
+import pytest
+from doubles import FARM, NEWER, WAIT, Hire, Learner, done, jobs, request
+
+from farm.net import codec, keys
+from farm.net.messages import Refusal
+from learner.scheduler import dispatcher as dispatchers
+from learner.scheduler import membership
+
+
+def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codec, "MAX_BYTES", 100_000)
+    farm = learner.show()
+    worker = hire("a/1")
+    inbox = keys.want(FARM, worker.name)
+    for nonsense in (b"", b"\xc1", NEWER, request("b/1", 50)):
+        worker.say(inbox, nonsense)
+    worker.want(1)
+    collected = learner.collect(jobs(4))
+    first = worker.chunk()
+    honest = worker.results(first)
+    bad = [
+        b"", b"no message", b"\x80", b"\0" * 200_000, NEWER,
+        replace(honest, returns=honest.returns[:1], flags=honest.flags[:1], steps=honest.steps[:1]),
+            worker.results(first, -1),
+        replace(honest, traces=honest.traces[:, 1:]), worker.results(first, 4),
+        replace(honest, run="other"), replace(honest, worker="b/1"),
+        replace(honest, round=0), replace(honest, incarnation="0" * 16),
+        request("a/1"), worker.failure(first, 99, "no"), replace(worker.failure(first, 0, "no"), incarnation="gone"),
+    ]  # fmt: skip
+    for message in bad:
+        worker.answer(message)
+    assert farm.workers == ("a/1",), "somebody joined by a message of another"
+    worker.answer(honest)
+    worker.answer(worker.results(first, 0, value=7.0))
+    worker.work(3)
+    found = collected.result(WAIT)
+    assert done(found) == list(range(4))
+    assert farm.ignored == {"bad": 2 + 8, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
+
+
+def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner, hire: Hire) -> None:
+    farm = learner.show()
+    worker = hire("a/1")
+    worker.want(1)
+    collected = learner.collect(jobs(2))
+    first = worker.chunk()
+    worker.say(keys.want(FARM, worker.name), NEWER)
+    worker.answer(worker.results(first))
+    worker.work(1)
+    assert done(collected.result(WAIT)) == [0, 1]
+    assert farm.ignored == {"version": 1}
+
+
+def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(membership, "_SOON", 0.0)
+    monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
+    farm = learner.show()
+    worker = hire("a/1")
+    collected = learner.collect(jobs(30))
+    for i in range(500):
+        worker.say(keys.want(FARM, f"nobody/{i}"), request(f"nobody/{i}", 9))
+    worker.want(10)
+    worker.work(30)
+    collected.result(WAIT)
+    assert farm.workers == ("a/1",)
+    assert [known.worker for known in farm.census()] == ["a/1"]
+    collected = learner.collect(jobs(1))
+    worker.work(1)
+    collected.result(WAIT)
+    assert farm.ignored == {"absent": 500}
+
+
+def test_hostile_lines_are_told_of_once(learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
+    learner.show()
+    worker = hire("a/1")
+    worker.want(1)
+    collected = learner.collect(jobs(1))
+    chunk = worker.chunk()
+    for _ in range(500):
+        worker.answer(b"rubbish")
+    worker.answer(worker.results(chunk))
+    collected.result(WAIT)
+    assert learner.farm.ignored == {"bad": 500}
+    assert sum("ignored a message" in line for line in caplog.messages) == 1
+
+
+def test_another_release_hears_why_it_gets_nothing(learner: Learner, hire: Hire) -> None:
+    farm = learner.show()
+    other, worker = hire("a/1"), hire("b/1")
+    other.session.subscribe("refused", keys.refused(FARM, "a/1"))
+    collected = learner.collect(jobs(2))
+    other.say(keys.want(FARM, "a/1"), NEWER)
+    assert "run the same release on both" in codec.decode(other.next("refused"), Refusal).reason
+    worker.want(2)
+    worker.work(2)
+    collected.result(WAIT)
+    assert farm.ignored == {"version": 1}
+
+
+def test_numbers_of_a_worker_that_did_nothing_bind_nobody(learner: Learner, hire: Hire) -> None:
+    farm = learner.show()
+    worker, odd = hire("b/1"), hire("a/1")
+    collected = learner.collect(jobs(3))
+    odd.say(keys.want(FARM, "a/1"), request("a/1", 1, canary="odd"))
+    chunk = odd.chunk()
+    worker.want(2)
+    worker.work(2)
+    assert "rounds differently" in codec.decode(odd.refusal(), Refusal).reason
+    assert farm.admission.canary == "c"
+    odd.answer(odd.results(chunk, value=9.0))  # it was given that job, but is no longer admitted
+    worker.work(1)
+    assert done(collected.result(WAIT)) == [0, 1, 2]
+    assert farm.ignored == {"refused": 1}
+
+
+def test_patterns_are_nobodys_name(learner: Learner, hire: Hire) -> None:
+    farm = learner.show()
+    worker = hire("a/1")
+    collected = learner.collect(jobs(1))
+    for name in ("**", "*/*", "a/**"):
+        worker.say(keys.want(FARM, name), request(name))
+    worker.want(1)
+    worker.work(1)
+    collected.result(WAIT)
+    assert farm.ignored == {"foreign": 3}

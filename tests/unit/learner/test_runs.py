@@ -1,0 +1,65 @@
+"""`farm runs`: one run with damaged files costs its own row, not the table."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from farm.__main__ import main
+from learner.config import RunConfig
+from learner.run_folder import RunFolder
+
+GOOD: dict[str, Any] = {
+    "run": "good", "seed": 1, "generations": 3, "rollouts": 90, "mean_policy_return": 1.5, "mean_policy_success": True,
+    "robust_success_rate": 0.25, "parameters_sha256": "0123456789abcdef", "state": "finished", "seconds": 1.0,
+}  # fmt: skip
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for name in ("a", "good", "z"):
+        RunFolder.create(tmp_path / name, RunConfig()).write_summary(GOOD)
+    return tmp_path
+
+
+def damage(runs: Path, text: str) -> None:
+    for name in ("a", "z"):
+        (runs / name / "summary.json").write_text(text)
+
+
+def table(runs: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    capsys.readouterr()
+    assert main(["runs", str(runs), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)) == 3
+    assert main(["runs", str(runs)]) == 0
+    return capsys.readouterr().out.splitlines()[1:]
+
+
+@pytest.mark.parametrize("value", [[], {}, "x", True, 10**400, -(10**30)], ids=lambda value: str(value)[:10])
+@pytest.mark.parametrize("name", GOOD)
+def test_one_value_of_another_type(runs: Path, name: str, value: object, capsys: pytest.CaptureFixture[str]) -> None:
+    if type(value) is type(GOOD[name]):
+        pytest.skip("it is of that type")
+    damage(runs, json.dumps({**GOOD, name: value}))
+    first, good, last = table(runs, capsys)
+    assert good.split() == ["good", "finished", "3", "1.500", "yes", "25%", "01234567"]
+    assert first.split()[:5] == ["a", "summary.json", "is", "damaged", "0"]
+    assert last.split()[:5] == ["z", "summary.json", "is", "damaged", "0"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "[" * 100_000, '{"run"', "\0"])
+def test_no_summary_at_all(runs: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(runs, text)
+    assert "is damaged" in table(runs, capsys)[0]
+
+
+@pytest.mark.parametrize("missing", GOOD)
+def test_a_value_is_missing(runs: Path, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(runs, json.dumps({name: value for name, value in GOOD.items() if name != missing}))
+    assert len(table(runs, capsys)) == 3
+
+
+def test_names_are_shown_as_they_are(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(runs, json.dumps({**GOOD, "run": "[red]a\x1b[2J", "state": "\u202e"}))
+    assert table(runs, capsys)[0].split()[:2] == ["[red]a\\x1b[2J", "\\u202e"]

@@ -1,0 +1,175 @@
+"""A worker, and learners and sessions that are confused or hostile."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stage import FARM, WAIT, Learner, P, Runner, Stage, at_work, indices, until
+
+from farm.net import codec, keys
+from farm.net.messages import Refusal, WorkRequest
+from farm.net.session import connect
+from farm.sim.engines import CAPACITY
+from workers import worker as workers
+
+
+def test_chunks_of_rounds_gone_by_are_dropped(stage: Stage) -> None:
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.announce()
+    learner.send(worker.id, 0, round=1)
+    learner.send(worker.id, 1, incarnation="before")
+    learner.send(worker.id, 2)
+    assert indices(stage.results()) == [2]
+
+
+def test_messages_it_cannot_read(
+    stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = Learner(stage.session, "r")
+    with monkeypatch.context() as other:
+        other.setattr(codec, "SCHEMA", codec.SCHEMA + 1)
+        newer = codec.encode(learner.header)
+    worker = stage.hire()
+    inbox, generation = keys.inbox(FARM, worker.id), keys.generation(FARM, "r")
+    stage.next("worker")
+    for key in (inbox, generation, generation):
+        for payload in (
+            b"",
+            b"\xc1",
+            newer,
+            codec.encode(replace(learner.header, run="a//b")),
+            codec.encode(Refusal(run="r", reason="none")),
+        ):
+            stage.session.publish(key, payload)
+    learner.announce()
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1]
+    said = f"schema version {codec.SCHEMA + 1}, this side speaks {codec.SCHEMA}"
+    until(lambda: sum(said in line for line in caplog.messages) == 2)
+
+
+def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    Runner.go.clear()
+    learner.send(worker.id, 1)
+    until(lambda: Runner.ran)
+    learner.send(worker.id, 2)
+    learner.header = replace(learner.header, round=learner.header.round - 1)
+    learner.announce()
+    Runner.go.set()
+    assert [indices(stage.results()) for _ in range(2)] == [[1], [2]]
+
+
+def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_MEMORY", 10_000)
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.announce()
+    for i in range(20):  # together three times as much, and each of the last ones too much by itself
+        header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200 if i < 6 else 2000))
+        stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
+    until(lambda: worker._ignored["large"] == 14)
+    for i in range(20):
+        header = replace(learner.header, run=f"another-{i}", mu=np.ones(200))
+        stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
+    until(lambda: "another-19" in worker._runs)
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1], "what was crowded out is asked for again"
+    kept = [run.header for run in worker._runs.values() if run.header]
+    assert sum(header.mu.nbytes for header in kept) <= 10_000
+    monkeypatch.setattr(workers, "IDLE", 0.0)
+    while True:
+        _, want = stage.next("want")
+        assert isinstance(want, WorkRequest)
+        if want.ignored == {"large": 14}:
+            break
+
+
+def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.header = replace(learner.header, mu=np.ones(P + 1))
+    learner.send(worker.id, 0)
+    until(lambda: "ignored jobs of run r: not 3 parameters" in caplog.text)
+    learner.header = replace(learner.header, mu=np.ones(P), round=3)
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1]
+
+
+def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    learner = Learner(stage.session, "r")
+    learner.spec += b" "
+    worker = stage.hire()
+    learner.send(worker.id, 0)
+    until(lambda: "run r does not tell what it simulates; its jobs wait" in caplog.messages)
+    learner.spec = learner.spec[:-1]
+    learner.send(worker.id, 1)
+    assert indices(stage.results()) == [1]
+    assert Runner.made == ["r"]
+
+
+def test_a_false_header_stalls_nobody(stage: Stage) -> None:
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    for changed in ({"round": 2**63 - 1}, {"incarnation": "zzzz"}, {"round": 2**63 - 1, "mu": np.zeros(P)}):
+        stage.session.publish(
+            keys.generation(FARM, "r"),
+            codec.encode(replace(learner.header, **changed)),  # type: ignore[arg-type]
+        )
+        learner.send(worker.id, 1)
+        answer = stage.results()
+        assert (indices(answer), answer.returns.tolist()) == ([1], [6.0])
+    learner.header = replace(learner.header, round=3)
+    learner.announce()
+    learner.send(worker.id, 2)
+    assert indices(stage.results()) == [2]
+
+
+def test_jobs_of_a_round_that_no_learner_confirms_are_told_of(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.send(worker.id, 1, round=7)
+    until(lambda: "run r sends jobs of a round that its learner does not confirm" in caplog.messages)
+    until(lambda: worker._ignored["stale"] == 1)
+
+
+def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_ASK", 0.1)
+    over = threading.Event()
+    asked: list[str] = []
+
+    def deaf(run: str) -> bytes:
+        asked.append(run)
+        over.wait(WAIT)
+        return b""
+
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.announce()
+    with connect((stage.endpoint,), WAIT, lambda: False) as rogue:
+        for i in range(30):
+            rogue.answer(keys.generation(FARM, f"made-up-{i}"), lambda i=i: deaf(f"made-up-{i}"))
+        for i in range(30):
+            learner.send(worker.id, 0, run=f"made-up-{i}")
+        learner.send(worker.id, 1)
+        begun = time.monotonic()
+        assert indices(stage.results()) == [1]
+        assert time.monotonic() - begun < 2.0, "thirty questions were waited for"
+        until(lambda: worker._ignored["stale"] == 30)
+        over.set()
+    assert len(asked) < 5
+
+
+def test_no_more_jobs_are_kept_than_were_asked_for(stage: Stage) -> None:
+    learner, worker = at_work(stage)
+    most = 8 * CAPACITY
+    learner.send(worker.id, *range(10, 10 + most))
+    learner.send(worker.id, 3)
+    until(lambda: worker._ignored == {} and len(worker._session.events) == 4)
+    Runner.go.set()
+    assert [indices(stage.results()) for _ in range(4)] == [[0], [1], [2], [3]]
+    assert worker._ignored == {"large": 1}
