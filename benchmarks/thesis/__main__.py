@@ -1,6 +1,6 @@
 """The reproduction of Plage 2016, from a checkout: experiments of many runs each, and their figures.
 
-python -m benchmarks.thesis NAME          an experiment's runs side by side, then its figure; thesis for all
+python -m benchmarks.thesis NAME ...      an experiment's runs side by side, then its figure; thesis for all
 python -m benchmarks.thesis --list        what there is
 python -m benchmarks.thesis plot FOLDER   the figures again, from the recorded data
 """
@@ -41,8 +41,8 @@ class ExperimentCommand:
     `plot FOLDER` instead of a name draws the figures of such a folder again, from its recorded data.
     """
 
-    name: Annotated[str, tyro.conf.Positional] = ""
-    """One of --list, or thesis for all."""
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Of --list, one or more, or thesis for all."""
     list: bool = False
     """List the experiments, and end."""
     trials: int = TRIALS
@@ -78,13 +78,14 @@ def main(words: Sequence[str]) -> int:
     if command.list:
         _list()
         return 0
-    if not command.name:
+    if not command.names:
         raise ConfigError(f"which experiment? {PROGRAM} --list shows them")
-    names = tuple(EXPERIMENTS) if command.name == ALL else (find(command.name).name,)
+    wanted = {name for each in command.names for name in (EXPERIMENTS if each == ALL else (find(each).name,))}
+    names = tuple(name for name in EXPERIMENTS if name in wanted)
     check_matplotlib()
     check_sharing(command.sharing)
     logs.set_up("WARNING")
-    out = command.out or Path("runs") / command.name
+    out = command.out or Path("runs") / "+".join(command.names)
     folder = ExperimentFolder.prepare(out, names, command.trials, command.generations)
     with stop_flag("saving and ending") as stop:
         with Runs(folder.runs, folder.path) as shown:

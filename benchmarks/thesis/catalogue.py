@@ -5,12 +5,15 @@ are silent the preset's value stays (docs/method.md says what that leaves open).
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
 from typing import Any, Final
 
 from benchmarks.thesis import claims
 from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer
 from learner.algorithms.pgpe import PGPE
 from learner.config import RunConfig, configure
+from learner.setup import fitted
 
 TRIALS: Final = 5
 """Trials of a set-up unless told otherwise; the thesis has three."""
@@ -42,6 +45,15 @@ _FORMER: Final[Mapping[str, Any]] = {
 def _default(**settings: Any) -> RunConfig:  # noqa: ANN401
     return setup("default", **{**_FORMER, **settings})
 
+
+_WIDE: Final = ("contacts-D1500", "joints-tactile-D5400")
+_ACCURATE: Final = ("joints-D1600", "contacts-D3400", "tactile-D10800", "joints-tactile-D12600")
+_ALL: Final = ("joints-D1500", "contacts-D1500-N50", *_WIDE, *_ACCURATE)
+_EARLY: Final[Mapping[str, str]] = {
+    "joints": "early-joints", "joints+contacts": "early-contacts", "tactile": "early-tactile",
+    "joints+tactile": "early-joints-tactile",
+}  # fmt: skip
+"""Set-ups of 1500 rollouts, by state base."""
 
 _RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb"}
 
@@ -78,6 +90,7 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "joints-tactile-D12600": _projected("joints+tactile", 12600),
     "joints-kernel": setup("thesis", policy="kernel"),
     "default-contacts": _default(state="joints+contacts"),
+    **{name: _default(state=state, generations=50) for state, name in _EARLY.items()},
     "default-contacts-h2": _default(state="joints+contacts", bandwidth=2.0),
     "default-contacts-x0.3": _default(state="joints+contacts", contacts_scale=0.3),
     "default-contacts-x0.1": _default(state="joints+contacts", contacts_scale=0.1),
@@ -99,6 +112,38 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "default-plain-optimal-baseline": _default(estimator="plain", baseline="optimal"),
 }  # fmt: skip
 """Configurations by name; a run is one of them and a seed, shared by all experiments that show it."""
+
+FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
+    f"{name}-{suffix}": (name, parts)
+    for suffix, names, parts in (
+        (
+            "fitted",
+            ("joints-D1500", *_WIDE, *_ACCURATE, "contacts-D1500-N50", *_EARLY.values()),
+            ("bandwidth", "initial_sigma"),
+        ),
+        ("width", _WIDE, ("bandwidth",)),
+        ("sigma", _WIDE, ("initial_sigma",)),
+    )
+    for name in names
+}
+"""Set-ups whose start fits the size of the state: name -> the set-up, and which of the two settings are fitted."""
+
+
+@cache
+def config(name: str) -> RunConfig:
+    """The configuration of a set-up."""
+    if name in SETUPS:
+        return SETUPS[name]
+    base, parts = FITTED[name]
+    found: Any = fitted(replace(SETUPS[base], start="fitted"))
+    begun: Any = SETUPS[base]
+    policy, algorithm = begun.policy_config, begun.algorithm_config
+    if "bandwidth" in parts:
+        policy = replace(policy, bandwidth=found.policy_config.bandwidth)
+    if "initial_sigma" in parts:
+        algorithm = replace(algorithm, initial_sigma=found.algorithm_config.initial_sigma)
+    return replace(begun, policy_config=policy, algorithm_config=algorithm)
+
 
 _CLAIMS: Final = [
     Experiment(
@@ -325,6 +370,88 @@ _QUESTIONS: Final = [
         find=claims.learning,
     ),
     Experiment(
+        name="start-fitted",
+        title="A start that fits the size of the state",
+        question="A Gaussian kernel of 17, 54 or 62 numbers is zero at the printed start. Which state bases are learnt "
+        "after 1500 rollouts when the kernel's width and the first sigma are chosen so that the first mean acts a "
+        "little, and a sample's spread moves it by about one (`--start fitted`)?",
+        curves={
+            f"{state}, {start}": f"{name}{suffix}"
+            for start, suffix in (("fitted", "-fitted"), ("printed", ""))
+            for state, name in _EARLY.items()
+        },
+        figure=Curves(panels=("mean policy", "success"), over="rollouts"),
+        find=claims.mostly_learnt,
+    ),
+    Experiment(
+        name="fig-4.2-fitted",
+        title="Convergence of mu and sigma, from the fitted start",
+        question="Does the search distribution converge when the start fits the size of the state?",
+        claim="Sigma goes to 0 and mu converges, to another value in each trial (4.2.1).",
+        curves={"projected, joints+contacts, D 1500": "contacts-D1500-fitted"},
+        figure=Curves(panels=("mu_2", "sigma_2")),
+        find=claims.converges,
+    ),
+    Experiment(
+        name="fig-4.4-fitted",
+        title="State bases, from the fitted start",
+        question="Which of the hand's senses should the controller see, when each has a start that fits its size?",
+        claim="Joint positions learn fastest and highest, joint positions with the tactile image slowest (4.2.3).",
+        curves={
+            "joints, D 1500": "joints-D1500-fitted",
+            "joints+contacts, D 1500": "contacts-D1500-fitted",
+            "joints+tactile, D 5400": "joints-tactile-D5400-fitted",
+        },
+        find=claims.states,
+    ),
+    Experiment(
+        name="fig-4.5-fitted",
+        title="Pairs per generation, from the fitted start",
+        question="Few pairs and many updates, or many pairs and few updates, when the start fits the "
+        "size of the state?",
+        claim="N 50 rises at generation 30 to 40, drops and recovers; N 15 rises at 90, smoother and nearly as high "
+        "(4.2.4).",
+        curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
+        find=claims.pairs_a_generation,
+    ),
+    Experiment(
+        name="fig-4.6-fitted",
+        title="The same over rollouts, from the fitted start",
+        question="Which N makes more of the same number of rollouts, when the start fits the size of the state?",
+        claim="What counts is the number of rollouts; a small N learns sooner (4.2.4). The thesis counts histories, "
+        "of two rollouts each.",
+        curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
+        figure=Curves(over="rollouts"),
+        find=claims.rollouts_count,
+    ),
+    Experiment(
+        name="equal-accuracy-fitted",
+        title="State bases at one kernel accuracy, from the fitted start",
+        question="Thesis 5: how do the state bases compare when each has the features for an accuracy of 10 %, and a "
+        "start that fits its size?",
+        curves={
+            "joints, D 1600": "joints-D1600-fitted",
+            "joints+contacts, D 3400": "contacts-D3400-fitted",
+            "tactile, D 10800": "tactile-D10800-fitted",
+            "joints+tactile, D 12600": "joints-tactile-D12600-fitted",
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
+        name="why-fitted",
+        title="Width or first sigma?",
+        question="The fitted start changes two settings, the kernel's width (E = 2) and the first sigma (Q = 1). "
+        "Which of them does it?",
+        curves={
+            f"{state}, {start}": f"{name}{suffix}"
+            for state, name in zip(("joints+contacts", "joints+tactile"), _WIDE, strict=True)
+            for start, suffix in (("width alone", "-width"), ("sigma alone", "-sigma"), ("both", "-fitted"))
+        },
+        figure=Curves(panels=("mean policy", "success")),
+        find=claims.learning,
+    ),
+    Experiment(
         name="objects",
         title="Other objects",
         question="Thesis 5.2: can the gait be learnt on other objects, and does a policy work on objects it has "
@@ -382,9 +509,14 @@ RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 
 """Rollouts a second of two cores, of the projected policy times its features; for estimates alone."""
 
 
+def _cheap(name: str) -> RunConfig:
+    """A configuration that costs as much as the set-up's."""
+    return SETUPS[FITTED[name][0] if name in FITTED else name]
+
+
 def rollouts(name: str) -> int:
     """Exploring rollouts of a trial of a set-up."""
-    config = SETUPS[name]
+    config = _cheap(name)
     assert isinstance(config.algorithm_config, PGPE)
     return 2 * config.algorithm_config.pairs * config.generations
 
@@ -393,7 +525,7 @@ def minutes(names: tuple[str, ...]) -> float:
     """About how long set-ups take on two cores, one trial each [min]."""
     seconds = 0.0
     for name in names:
-        config = SETUPS[name]
+        config = _cheap(name)
         rate = RATES[config.policy]
         if config.policy == "projected":
             rate = min(550.0, rate / config.policy_config.features)  # type: ignore[attr-defined]

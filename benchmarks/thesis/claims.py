@@ -234,6 +234,14 @@ def learning(data: Data) -> list[Finding]:
     return out
 
 
+def mostly_learnt(data: Data) -> list[Finding]:
+    """Which of the set-ups are learnt at the end of most trials."""
+    return [
+        Finding(f"{label} is learnt in 4 of 5 trials", bool(series.learnt.mean() >= _MOST), counted(series))
+        for label, series in data.series.items()
+    ]
+
+
 def transfer(data: Data) -> list[Finding]:
     """Whether policies work on objects they were not learnt on."""
     rate = known_mean(data.measured["transfer"], axis=1)  # (learnt on, tried on), over the trials
@@ -251,6 +259,7 @@ def transfer(data: Data) -> list[Finding]:
 
 
 LEARNT_ON = 0.5
+_MOST = 0.8  # of the trials
 """Robust success, over the trials, from which an object counts as mastered."""
 
 

@@ -23,11 +23,11 @@ _STYLE: Final = {
     "svg.hashsalt": "rolloutfarm", "svg.fonttype": "none", "axes.titlesize": 9, "axes.titlelocation": "left",
 }  # fmt: skip
 
-_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9")
-"""Okabe and Ito's, told apart by the colour-blind; dashes and markers tell them apart in black and white."""
+_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#888888")
+"""Okabe and Ito's and a grey, told apart by the colour-blind; dashes and markers tell them apart in black and white."""
 
-_DASHES: Final = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
-_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
+_DASHES: Final = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)), (0, (3, 3)))
+_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 _PANELS: Final[dict[Panel, tuple[str, str]]] = {
     "return": ("return_mean", "mean return of a generation"),

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.thesis import series
-from benchmarks.thesis.catalogue import EXPERIMENTS, SETUPS
+from benchmarks.thesis import catalogue, series
+from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import Data, Experiment, trial
 from farm.errors import ConfigError
 from learner.config import RunConfig
@@ -97,7 +97,7 @@ class ExperimentFolder:
 
     def config(self, setup: str, number: int) -> RunConfig:
         """The configuration of a trial."""
-        return trial(SETUPS[setup], number, self.generations)
+        return trial(catalogue.config(setup), number, self.generations)
 
     def run(self, setup: str, number: int) -> RunFolder:
         """The folder of a trial, whether it is there or not."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.thesis import claims, series, shapes
-from benchmarks.thesis.catalogue import EXPERIMENTS, SETUPS, setup
+from benchmarks.thesis.catalogue import EXPERIMENTS, FITTED, SETUPS, config, setup
 from benchmarks.thesis.claims import features_for
 from benchmarks.thesis.experiment import (
     Chain,
@@ -54,17 +54,33 @@ def made(returns: np.ndarray, success: np.ndarray | None = None, **changes: obje
 
 def test_every_experiment_shows_set_ups_that_exist_and_every_set_up_is_shown():
     shown = {name for experiment in EXPERIMENTS.values() for name in experiment.curves.values()}
-    assert shown == set(SETUPS)
+    assert shown == set(SETUPS) | set(FITTED)
+    assert not set(SETUPS) & set(FITTED)
 
 
 def test_set_ups_are_different_and_their_names_can_be_runs():
-    assert all(keys.checked("run", f"{name}-s0") for name in SETUPS)
+    assert all(keys.checked("run", f"{name}-s0") for name in (*SETUPS, *FITTED))
     assert len({json.dumps(to_dict(config)) for config in SETUPS.values()}) == len(SETUPS), "two names for one set-up"
 
 
 @pytest.mark.parametrize("name", ["joints-D300", "default-cylinder", "direct-joints-N5", "cosine-joints-D100"])
 def test_set_ups_can_be_begun(name):
-    assert problem(SETUPS[name]).policy.size > 0
+    assert problem(config(name)).policy.size > 0
+
+
+def test_a_fitted_start_changes_width_and_first_sigma_or_one_of_them():
+    def of(name):
+        found = config(name)
+        return found.policy_config.bandwidth, found.algorithm_config.initial_sigma
+
+    printed, both = of("contacts-D1500"), of("contacts-D1500-fitted")
+    assert printed == (1.0, 2.0)
+    assert (of("contacts-D1500-width"), of("contacts-D1500-sigma")) == ((both[0], 2.0), (1.0, both[1]))
+    # d 17, mu 1: sigma = h sqrt(2 / d), and a spread moves the exponent by one.
+    assert 17 * both[1] ** 2 / (2 * both[0] ** 2) == pytest.approx(1.0)
+    assert replace(config("contacts-D1500-fitted"), policy_config=config("contacts-D1500").policy_config) == replace(
+        config("contacts-D1500"), algorithm_config=config("contacts-D1500-fitted").algorithm_config
+    )
 
 
 def test_a_set_up_is_its_preset_with_what_is_named_changed():
@@ -77,10 +93,10 @@ def test_a_set_up_is_its_preset_with_what_is_named_changed():
 
 
 def test_trials_differ_in_their_seed_and_may_be_cut_but_not_stretched():
-    config = replace(RunConfig(), generations=20)
-    assert trial(config, 3) == replace(config, seed=3)
-    assert trial(config, 0, 5).generations == 5
-    assert trial(config, 0, 50).generations == 20
+    run = replace(RunConfig(), generations=20)
+    assert trial(run, 3) == replace(run, seed=3)
+    assert trial(run, 0, 5).generations == 5
+    assert trial(run, 0, 50).generations == 20
 
 
 def test_nothing_is_said_of_a_set_up_without_runs(tmp_path):
@@ -89,7 +105,7 @@ def test_nothing_is_said_of_a_set_up_without_runs(tmp_path):
 
     experiment = EXPERIMENTS["fig-4.5"]
     nothing = made(np.full((3, 9), np.nan), states=("missing",) * 3, succeeded=np.zeros(3, bool))
-    configs = {label: SETUPS[name] for label, name in experiment.curves.items()}
+    configs = {label: config(name) for label, name in experiment.curves.items()}
     data = Data({"N 50": nothing, "N 15": made(rising(4, -1, 9, 3))}, {}, configs)
     assert judge(experiment, data) == []
     assert verdict([]) == "open"
@@ -309,7 +325,7 @@ def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
         broken = {k: np.where(np.arange(30) < 12, v, np.nan) for k, v in shown[0].columns.items()}
         shown[0] = replace(shown[0], columns=broken, states=("finished",) * 3 + ("diverged", "missing"))
     known = dict(zip(experiment.curves, shown, strict=True))
-    configs = {label: SETUPS[name] for label, name in experiment.curves.items()}
+    configs = {label: config(name) for label, name in experiment.curves.items()}
     paths = draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)
     assert all(path.stat().st_size > 5000 for path in paths)
     svg = " ".join(re.sub("<[^>]*>", " ", paths[1].read_text()).split())

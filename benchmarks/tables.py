@@ -1,0 +1,239 @@
+"""Published scores of linear policies beside ours: the settings, their score, ours, a line per seed.
+
+    python benchmarks/tables.py TABLE ENVIRONMENT [--seed S ...] [--out FILE]
+
+    python benchmarks/tables.py ars Hopper-v5 --seed 0 1 2
+    python benchmarks/tables.py --list
+
+Runs of several seeds are simulated side by side in one batch, in this process; each gives the numbers of the command
+that is printed for it, to the last bit. The score is the mean return of the last mean policy from 100 other starts.
+"""
+
+import argparse
+import hashlib
+import itertools
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm import seeds
+from farm.arrays import FloatArray, IntArray
+from farm.moments import merged, normaliser, usable
+from farm.rollouts import Runner
+from farm.tasks import loop
+from learner import setup
+from learner.config import RunConfig, configure
+
+STARTS: Final = 100
+LOOKS: Final = 20  # lines of the learning curve
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a published table."""
+
+    settings: Mapping[str, Any]
+    score: float
+    spread: float | None
+    """Standard deviation over the evaluation's rollouts."""
+
+
+def _ars(alpha: float, nu: float, pairs: int, top: int, steps: int, **more: Any) -> dict[str, Any]:  # noqa: ANN401
+    return {
+        "policy": "linear", "algorithm": "ars", "learning_rate_mu": alpha, "initial_sigma": nu,
+        "pairs": pairs, "top": top, "stop_after_steps": steps, **more,
+    }  # fmt: skip
+
+
+_KNOWN: Final[Mapping[str, Any]] = {"normalise": True}
+_BONUS: Final[Mapping[str, Any]] = {"normalise": True, "reward_offset": -1.0}
+
+TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
+    # rl-baselines3-zoo, hyperparams/ars.yml and benchmark.md: one run each, of v3 environments.
+    "ars": {
+        "Swimmer-v5": Row(_ars(0.02, 0.01, 1, 1, 2_000_000), 355.267, 12.796),
+        "Hopper-v5": Row(_ars(0.01, 0.025, 8, 4, 7_000_000, **_BONUS), 3343.919, 5.730),
+        "HalfCheetah-v5": Row(_ars(0.02, 0.03, 32, 4, 12_500_000, **_KNOWN), 4815.192, 1340.752),
+        "Walker2d-v5": Row(_ars(0.03, 0.025, 40, 30, 75_000_000, **_BONUS), 2993.582, 166.289),
+        "Ant-v5": Row(_ars(0.015, 0.025, 60, 20, 75_000_000, **_BONUS), 2333.773, 20.597),
+    },
+}
+# An ARS spread of one direction (Swimmer's pairs 1) is that of its two returns.
+
+
+@dataclass
+class Search:
+    """One seed's run."""
+
+    config: RunConfig
+    policy: Any
+    state: Any
+    moments: FloatArray
+    steps: int = 0
+    curve: list[tuple[int, float]] = field(default_factory=list)
+    eps: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def over(self) -> bool:
+        """Whether its steps are spent."""
+        return self.steps >= (self.config.stop_after_steps or 0) or self.state.generation >= self.config.generations
+
+    def ask(self) -> tuple[FloatArray, list[loop.Seed]]:
+        """Parameters of its next generation, (2 N, P), and seeds of their starts."""
+        config, generation = self.config, self.state.generation
+        self.eps = config.algorithm_config.ask(self.state, seeds.exploration(config.seed, generation))
+        theta = (self.state.mu + self.eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(2 * len(self.eps), -1)
+        return theta, [seeds.training(config.seed, generation, row // 2) for row in range(len(theta))]
+
+    def tell(self, rollouts: loop.Rollouts, offsets: FloatArray) -> None:
+        """Learn from them."""
+        returns = (rollouts.returns + offsets[rollouts.steps]).reshape(-1, 2)
+        self.state = self.config.algorithm_config.tell(self.state, self.eps, returns)
+        self.steps += int(rollouts.steps.sum())
+        if self.config.policy_config.normalise:
+            self.moments = merged(self.moments, np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments)))
+        self.curve.append((self.steps, float(rollouts.returns.mean())))
+
+    def extended(self, theta: FloatArray) -> FloatArray:
+        """Parameters (B, P), each row followed by mean and standard deviation of its observations, (B, P + 2 d)."""
+        return np.hstack([theta, np.tile(normaliser(self.moments).ravel(), (len(theta), 1))])
+
+
+class SideBySide:
+    """A policy whose parameters (P,) are followed by a mean and a standard deviation of observations (d,) each."""
+
+    def __init__(self, policy: Any) -> None:  # noqa: ANN401
+        self.policy, self.size, self.d = policy, policy.size, policy.spec.observation
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """What of the parameters does not change in a rollout: nothing, of a linear policy."""
+        return theta
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions (B, A) of observations (B, d)."""
+        mean, deviation = prepared[:, self.size : self.size + self.d], prepared[:, self.size + self.d :]
+        with np.errstate(over="ignore", invalid="ignore"):
+            z = (x - mean) / deviation
+        return self.policy.act(np.ascontiguousarray(prepared[:, : self.size]), z)
+
+
+def main() -> None:
+    """Learn, and print the lines."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", nargs="?", choices=tuple(TABLES))
+    parser.add_argument("environment", nargs="?")
+    parser.add_argument("--seed", type=int, nargs="+", default=[0])
+    parser.add_argument("--steps", type=int, help="another budget of environment steps per seed")
+    parser.add_argument("--out", type=Path, help="file to which each seed's numbers are added, as a line of JSON")
+    parser.add_argument("--list", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.list or arguments.table is None:
+        for table, rows in TABLES.items():
+            for environment, row in rows.items():
+                print(f"{table} {environment}: {row.score:.0f}; {_flags(row.settings)}")
+        return
+    row = TABLES[arguments.table].get(arguments.environment)
+    if row is None:
+        parser.error(f"{arguments.table} has no {arguments.environment}; it has {', '.join(TABLES[arguments.table])}")
+    values = dict(row.settings) | ({"stop_after_steps": arguments.steps} if arguments.steps else {})
+    task = f"gym:{arguments.environment}"
+    searches, runner = _begun(task, values, arguments.seed)
+    begun = time.monotonic()
+    _learn(searches, runner)
+    print(f"| environment | seed | settings | steps | published | ours, {STARTS} starts | parameters |")
+    print("|---|---|---|---|---|---|---|")
+    for search in searches:
+        returns, steps = _score(search, runner)
+        numbers = search.state.mu.astype("<f8").tobytes() + search.state.sigma.astype("<f8").tobytes()
+        digest = hashlib.sha256(numbers).hexdigest()[:16]
+        published = f"{row.score:.0f}" + ("" if row.spread is None else f" +/- {row.spread:.0f}")
+        print(
+            f"| {arguments.environment} | {search.config.seed} | {_flags(values)} | {search.steps} | {published} "
+            f"| {returns.mean():.0f} +/- {returns.std():.0f} | {digest} |"
+        )
+        found = {
+            "table": arguments.table, "environment": arguments.environment, "seed": search.config.seed,
+            "steps": search.steps, "generations": search.state.generation, "return": round(float(returns.mean()), 3),
+            "spread": round(float(returns.std()), 3), "length": round(float(steps.mean()), 1), "parameters": digest,
+            "curve": [[at, round(value, 1)] for at, value in _thinned(search.curve)],
+        }  # fmt: skip
+        if arguments.out:
+            with arguments.out.open("a") as file:
+                file.write(json.dumps(found) + "\n")
+    total = sum(search.steps for search in searches)
+    print(f"\nfarm run --task {task} {_flags(values)} --generations {_MOST} --seed S    gives the same parameters")
+    print(f"{total / (time.monotonic() - begun):.0f} steps/s in this process")
+
+
+_MOST: Final = 1_000_000  # generations: the steps end a run
+
+
+def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[list[Search], Runner]:
+    searches, runner = [], None
+    for number in numbers:
+        config = configure(task, seed=number, generations=_MOST, **values)
+        problem = setup.problem(config)
+        runner = runner or problem.runner()
+        state = config.algorithm_config.init(problem.policy.size)
+        searches.append(Search(config, problem.policy, state, np.zeros(1 + 2 * problem.spec.observation)))
+    assert runner is not None
+    return searches, runner
+
+
+def _learn(searches: list[Search], runner: Runner) -> None:
+    """All seeds to their ends, a generation of each at a time."""
+    config, task = searches[0].config, runner.task
+    offset = config.task_config.reward_offset
+    offsets = np.array([0.0, *itertools.accumulate([task.return_scale * offset] * task.steps)])
+    policy, shown = SideBySide(searches[0].policy), time.monotonic()
+    going = searches
+    while going := [search for search in going if not search.over]:
+        asked = [search.ask() for search in going]
+        theta = np.concatenate(
+            [np.hstack([a, np.tile(s.seen(), (len(a), 1))]) for s, (a, _) in zip(going, asked, strict=True)]
+        )
+        starts = [start for _, each in asked for start in each]
+        moments = config.policy_config.normalise
+        rollouts = loop.run(task, policy, runner.sim, theta, starts, moments=moments)
+        first = 0
+        for search, (own, _) in zip(going, asked, strict=True):
+            search.tell(rollouts.at(slice(first, first + len(own))), offsets)
+            first += len(own)
+        if time.monotonic() - shown > 60:
+            shown = time.monotonic()
+            now = ", ".join(f"{s.steps / 1e6:.2f}M {s.curve[-1][1]:.0f}" for s in going)
+            print(f"# {now}", file=sys.stderr, flush=True)
+
+
+def _score(search: Search, runner: Runner) -> tuple[FloatArray, IntArray]:
+    """Returns and lengths of the mean policy's rollouts."""
+    theta = np.tile(np.concatenate([search.state.mu, search.seen()]), (STARTS, 1))
+    found = loop.run(
+        runner.task, SideBySide(search.policy), runner.sim, theta, [seeds.trial(0, i) for i in range(STARTS)]
+    )
+    return found.returns, found.steps
+
+
+def _thinned(curve: list[tuple[int, float]]) -> list[tuple[int, float]]:
+    """Some of its points, and the last."""
+    picked = np.unique(np.linspace(0, len(curve) - 1, LOOKS).astype(int))
+    return [curve[at] for at in picked.tolist()]
+
+
+def _flags(values: Mapping[str, Any]) -> str:
+    words = []
+    for name, value in values.items():
+        flag = "--" + name.replace("_", "-")
+        words += [flag] if value is True else [flag, f"{value:g}" if isinstance(value, float) else str(value)]
+    return shlex.join(words)
+
+
+if __name__ == "__main__":
+    main()
