@@ -17,7 +17,7 @@ import shlex
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +31,6 @@ from farm.tasks import loop
 from learner import setup
 from learner.config import RunConfig, configure
 
-STARTS: Final = 100
 LOOKS: Final = 20  # lines of the learning curve
 
 
@@ -64,6 +63,33 @@ TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
         "Walker2d-v5": Row(_ars(0.03, 0.025, 40, 30, 75_000_000, **_BONUS), 2993.582, 166.289),
         "Ant-v5": Row(_ars(0.015, 0.025, 60, 20, 75_000_000, **_BONUS), 2333.773, 20.597),
     },
+    # pgpelib, README.md: its linear policy; radius 0.225 = sigma sqrt(108), step size half the maximum speed.
+    "clipup": {
+        "Walker2d-v5": Row(
+            {
+                "policy": "linear",
+                "normalise": True,
+                "algorithm": "pgpe",
+                "shaping": "ranks",
+                "optimiser": "clipup",
+                "pairs": 50,
+                "most_pairs": 400,
+                "interactions": 75_000,
+                "generations": 500,
+                "max_speed": 0.015,
+                "learning_rate_mu": 0.0075,
+                "momentum": 0.9,
+                "initial_sigma": 0.02165,
+                "sigma_rule": "capped",
+                "sigma_cap": 0.2,
+                "learning_rate_sigma": 0.1,
+                "initial_mu": 0.0,
+                "reward_offset": -1.0,
+            },
+            5232.0,
+            None,
+        ),  # fmt: skip
+    },
 }
 # An ARS spread of one direction (Swimmer's pairs 1) is that of its two returns.
 
@@ -77,26 +103,35 @@ class Search:
     state: Any
     moments: FloatArray
     steps: int = 0
+    pairs: int = 0
     curve: list[tuple[int, float]] = field(default_factory=list)
     eps: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @property
     def over(self) -> bool:
         """Whether its steps are spent."""
-        return self.steps >= (self.config.stop_after_steps or 0) or self.state.generation >= self.config.generations
+        spent = self.config.stop_after_steps is not None and self.steps >= self.config.stop_after_steps
+        return spent or self.state.generation >= self.config.generations
+
+    @property
+    def algorithm(self) -> Any:  # noqa: ANN401
+        """The algorithm, of as many pairs as this generation has."""
+        own: Any = self.config.algorithm_config
+        return replace(own, pairs=self.pairs) if self.pairs else own
 
     def ask(self) -> tuple[FloatArray, list[loop.Seed]]:
         """Parameters of its next generation, (2 N, P), and seeds of their starts."""
         config, generation = self.config, self.state.generation
-        self.eps = config.algorithm_config.ask(self.state, seeds.exploration(config.seed, generation))
+        self.eps = self.algorithm.ask(self.state, seeds.exploration(config.seed, generation))
         theta = (self.state.mu + self.eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(2 * len(self.eps), -1)
         return theta, [seeds.training(config.seed, generation, row // 2) for row in range(len(theta))]
 
     def tell(self, rollouts: loop.Rollouts, offsets: FloatArray) -> None:
         """Learn from them."""
         returns = (rollouts.returns + offsets[rollouts.steps]).reshape(-1, 2)
-        self.state = self.config.algorithm_config.tell(self.state, self.eps, returns)
-        self.steps += int(rollouts.steps.sum())
+        self.state = self.algorithm.tell(self.state, self.eps, returns)
+        steps = int(rollouts.steps.sum())
+        self.steps, self.pairs = self.steps + steps, self.config.pairs_after(self.pairs, steps)
         if self.config.policy_config.normalise:
             self.moments = merged(self.moments, np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments)))
         self.curve.append((self.steps, float(rollouts.returns.mean())))
@@ -131,6 +166,7 @@ def main() -> None:
     parser.add_argument("environment", nargs="?")
     parser.add_argument("--seed", type=int, nargs="+", default=[0])
     parser.add_argument("--steps", type=int, help="another budget of environment steps per seed")
+    parser.add_argument("--starts", type=int, default=100, help="rollouts of the score")
     parser.add_argument("--out", type=Path, help="file to which each seed's numbers are added, as a line of JSON")
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
@@ -147,10 +183,10 @@ def main() -> None:
     searches, runner = _begun(task, values, arguments.seed)
     begun = time.monotonic()
     _learn(searches, runner)
-    print(f"| environment | seed | settings | steps | published | ours, {STARTS} starts | parameters |")
+    print(f"| environment | seed | settings | steps | published | ours, {arguments.starts} starts | parameters |")
     print("|---|---|---|---|---|---|---|")
     for search in searches:
-        returns, steps = _score(search, runner)
+        returns, steps = _score(search, runner, arguments.starts)
         numbers = search.state.mu.astype("<f8").tobytes() + search.state.sigma.astype("<f8").tobytes()
         digest = hashlib.sha256(numbers).hexdigest()[:16]
         published = f"{row.score:.0f}" + ("" if row.spread is None else f" +/- {row.spread:.0f}")
@@ -168,7 +204,8 @@ def main() -> None:
             with arguments.out.open("a") as file:
                 file.write(json.dumps(found) + "\n")
     total = sum(search.steps for search in searches)
-    print(f"\nfarm run --task {task} {_flags(values)} --generations {_MOST} --seed S    gives the same parameters")
+    values = {"generations": _MOST, **values}
+    print(f"\nfarm run --task {task} {_flags(values)} --seed S    gives the same parameters")
     print(f"{total / (time.monotonic() - begun):.0f} steps/s in this process")
 
 
@@ -178,7 +215,7 @@ _MOST: Final = 1_000_000  # generations: the steps end a run
 def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[list[Search], Runner]:
     searches, runner = [], None
     for number in numbers:
-        config = configure(task, seed=number, generations=_MOST, **values)
+        config = configure(task, seed=number, **{"generations": _MOST, **values})
         problem = setup.problem(config)
         runner = runner or problem.runner()
         state = config.algorithm_config.init(problem.policy.size)
@@ -196,9 +233,7 @@ def _learn(searches: list[Search], runner: Runner) -> None:
     going = searches
     while going := [search for search in going if not search.over]:
         asked = [search.ask() for search in going]
-        theta = np.concatenate(
-            [np.hstack([a, np.tile(s.seen(), (len(a), 1))]) for s, (a, _) in zip(going, asked, strict=True)]
-        )
+        theta = np.concatenate([search.extended(own) for search, (own, _) in zip(going, asked, strict=True)])
         starts = [start for _, each in asked for start in each]
         moments = config.policy_config.normalise
         rollouts = loop.run(task, policy, runner.sim, theta, starts, moments=moments)
@@ -212,12 +247,10 @@ def _learn(searches: list[Search], runner: Runner) -> None:
             print(f"# {now}", file=sys.stderr, flush=True)
 
 
-def _score(search: Search, runner: Runner) -> tuple[FloatArray, IntArray]:
+def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntArray]:
     """Returns and lengths of the mean policy's rollouts."""
-    theta = np.tile(np.concatenate([search.state.mu, search.seen()]), (STARTS, 1))
-    found = loop.run(
-        runner.task, SideBySide(search.policy), runner.sim, theta, [seeds.trial(0, i) for i in range(STARTS)]
-    )
+    theta, starts = search.extended(np.tile(search.state.mu, (count, 1))), [seeds.trial(0, i) for i in range(count)]
+    found = loop.run(runner.task, SideBySide(search.policy), runner.sim, theta, starts)
     return found.returns, found.steps
 
 

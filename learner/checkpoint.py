@@ -63,6 +63,8 @@ class Checkpoint:
     """Arrays that its policy is made of."""
     steps: int = 0
     """Control steps of all exploring rollouts so far."""
+    pairs: int = 0
+    """Pairs of the next generation; 0: as the algorithm's settings say."""
     moments: FloatArray = array("<f8", 1, np.empty(0))
     """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
 

@@ -49,6 +49,11 @@ class RunConfig(Settings):
     """End after so many generations in a row in which the mean policy succeeded."""
     stop_after_steps: int | None = setting(None, least=1)
     """End after the generation in which the exploring rollouts have made so many control steps in all."""
+    interactions: int | None = setting(None, least=1)
+    """Control steps that a generation should have: the next one gets as many pairs as would have made so many, from
+    --pairs to --most-pairs (Toklu 2020)."""
+    most_pairs: int | None = setting(None, least=1)
+    """With interactions: the most pairs of a generation; None: eight times --pairs."""
     init_from: str | None = None
     """Start from the mean, sigma and constants of another run: its folder."""
     init_sigma: Literal["run", "fresh"] = "run"
@@ -66,12 +71,30 @@ class RunConfig(Settings):
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()
+        self._check_interactions()
         owners: dict[str, str] = {"name": "plug-in"}
         for part in ("run", *_PARTS):
             for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
                 if owners.setdefault(name, part) != part:
                     whose = f"{part} {getattr(self, part)!r}"
                     raise ConfigError(f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one")
+
+    def _check_interactions(self) -> None:
+        least = getattr(self.algorithm_config, "pairs", None)
+        if self.interactions is not None and least is None:
+            raise ConfigError(f"--interactions needs an algorithm with --pairs, which {self.algorithm} has not")
+        if self.most_pairs is not None and self.interactions is None:
+            raise ConfigError("--most-pairs is for --interactions: give both")
+        if self.most_pairs is not None and least is not None and self.most_pairs < least:
+            raise ConfigError(f"most-pairs is {self.most_pairs}; expected at least {least} (pairs)")
+
+    def pairs_after(self, pairs: int, steps: int) -> int:
+        """Pairs of the generation that follows one of so many pairs and control steps; 0: as the algorithm says."""
+        if self.interactions is None:
+            return 0
+        least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
+        most = 8 * least if self.most_pairs is None else self.most_pairs
+        return min(max(-(-self.interactions * (pairs or least) // steps), least), most)
 
 
 def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass

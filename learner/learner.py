@@ -18,7 +18,7 @@ from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.work import Jobs
 from learner import config as configs
-from learner.algorithms import SearchState
+from learner.algorithms import Algorithm, SearchState
 from learner.checkpoint import BestRollout, Checkpoint
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, Nominal, evaluation_jobs
 from learner.run_folder import RunFolder
@@ -45,13 +45,12 @@ class Learner:
         # The replay of the best is shown again: replay.rrd is written anew by whoever ends the run.
         self.problem, self.config, self.folder = problem, problem.config, folder
         self._at = replace(at, replayed=at.best is None)
-        self._algorithm = self.config.algorithm_config
         try:
             self.state: SearchState = self._algorithm.restore(at.state)
         except ValueError as error:
             raise CheckpointError(f"{folder.checkpoint}: {error}") from None
         self._before = at.reissued
-        self._signs = self._algorithm.signs()
+        self._signs = self.config.algorithm_config.signs()
         self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.traced else "none"
         folder.save(self._at)
 
@@ -69,6 +68,12 @@ class Learner:
     def canary(self) -> str | None:
         """Digest of the numbers of the machines that simulated so far."""
         return self._at.canary
+
+    @property
+    def _algorithm(self) -> Algorithm[Any]:
+        """The algorithm, of as many pairs as this generation has."""
+        own: Any = self.config.algorithm_config
+        return replace(own, pairs=self._at.pairs) if self._at.pairs else own
 
     @property
     def over(self) -> bool:
@@ -215,6 +220,7 @@ class Learner:
     ) -> None:
         """Bring the checkpoint up to date after an update."""
         best, generation = self._at.best, self._at.best_generation
+        steps = int(results.steps[: returns.size].sum())
         replayed = self._at.replayed or len(results) > len(eps) + 1
         if before.best is None or returns.max() > before.best:
             row, column = np.unravel_index(int(returns.argmax()), returns.shape)
@@ -227,7 +233,8 @@ class Learner:
             config=configs.to_dict(self.config),
             state=self.state.to_dict(),
             rollouts=self._at.rollouts + returns.size,
-            steps=self._at.steps + int(results.steps[: returns.size].sum()),
+            steps=self._at.steps + steps,
+            pairs=self.config.pairs_after(self._at.pairs, steps),
             reissued=self._before + farm.reissued,
             seconds=seconds,
             solved=self._at.solved + 1 if results.flags[returns.size, 0] else 0,

@@ -169,6 +169,20 @@ def test_classes_that_are_no_tasks_or_have_no_settings(file: Path, name: str, wo
         RunConfig(algorithm=f"{file}:Pole")
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"algorithm": "cma-es", "interactions": 9}, "--interactions needs an algorithm with --pairs, which cma-es"),
+        ({"most_pairs": 9}, "--most-pairs is for --interactions: give both"),
+        ({"pairs": 8, "interactions": 9, "most_pairs": 7}, r"most-pairs is 7; expected at least 8 \(pairs\)"),
+        ({"interactions": 0}, "interactions is 0; expected 1 or more"),
+    ],
+)
+def test_populations_that_cannot_be(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        configure(**settings)
+
+
 # ---------------------------------------------------------------- config.json
 
 

@@ -1,6 +1,7 @@
 """A run without a network: how it begins, goes on, is resumed, and what is loaded of it afterwards."""
 
 import errno
+import itertools
 import json
 import shutil
 from collections.abc import Iterator
@@ -204,6 +205,30 @@ def test_so_many_steps_are_the_end(pole: str, tmp_path: Path) -> None:
     assert len(list(learner.learn(alone))) == 1  # type: ignore[arg-type]
     assert learner.over
     assert learner.summary("finished", 1, None)["steps"] == 3 * 8 * 4
+
+
+def test_a_generation_has_the_pairs_that_make_so_many_steps(pole: str, tmp_path: Path) -> None:
+    falling = tmp_path / "falling.py"
+    falling.write_text(POLE + "\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.1\n")
+    config = configure(f"{falling}:Pole", generations=6, interactions=30)
+    learnt(config, tmp_path / "r")
+    progress = [json.loads(line) for line in (tmp_path / "r" / "progress.jsonl").read_text().splitlines()]
+    pairs = [(b["rollouts"] - a["rollouts"]) // 2 for a, b in itertools.pairwise([{"rollouts": 0}, *progress])]
+    assert pairs[0] == 4
+    assert all(4 <= each <= 32 for each in pairs)
+    assert len(set(pairs)) > 2, "it follows the rollouts' lengths"
+    learnt(replace(config, generations=3), tmp_path / "half")
+    learner, alone = taken_up(tmp_path / "half", generations=6)
+    list(learner.learn(alone))  # type: ignore[arg-type]
+    assert state(tmp_path / "half") == state(tmp_path / "r")
+
+
+def test_how_many_pairs_follow() -> None:
+    config = configure(pairs=10, interactions=1000)
+    # 10 pairs made 500 steps: 20 would make 1000. At least 10, at most 80.
+    assert [config.pairs_after(0, steps) for steps in (500, 501, 5000, 1)] == [20, 20, 10, 80]
+    assert config.pairs_after(20, 500) == 40
+    assert configure(pairs=10).pairs_after(0, 500) == 0
 
 
 def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path) -> None:
