@@ -21,7 +21,7 @@ from learner.config import configure
 TRIALS = 100
 ENOUGH = 95  # of them
 GOOD = -0.08  # return on the nominal start
-DENSE = 200  # rollouts
+DENSE = 500  # rollouts
 
 
 class Constant(Policy):

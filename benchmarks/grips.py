@@ -1,15 +1,19 @@
 """How well the grips hold by themselves: each is closed, released and left alone for 3 s; one table.
 
-python benchmarks/grips.py [--object bar]
+python benchmarks/grips.py [--object bar] [--pose opposed]
 """
 
 import argparse
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from farm.errors import ConfigError
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
-from farm.tasks.finger_gait.hand import FINGERS, JOINTS
+from farm.tasks.finger_gait import model
+from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, POSES
 from farm.tasks.finger_gait.task import CONTROL_PERIOD, TIMESTEP, FingerGait, FingerGaitConfig, moved
 from farm.tasks.loop import Batch, Rollouts, again, whole
 
@@ -20,17 +24,28 @@ def main() -> None:
     """Hold, and print what was felt and how far the object went."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--object", default="bar")
+    parser.add_argument("--pose", choices=tuple(POSES), default="opposed")
+    parser.add_argument(
+        "--option", default="", help="of MJCF, in place of the pose's: impratio=3 | noslip_iterations=5"
+    )
     arguments = parser.parse_args()
+    name, _, value = arguments.option.partition("=")
+    options = {name: value} if name else None
     fingers = " | ".join(f"{finger} [N]" for finger in FINGERS)
     print(f"| grip | s after release | {fingers} | drift [mm] | turn [deg] |\n|---|---|---|---|---|---|---|")
-    for grip in ("index+thumb", "index+middle+thumb"):
-        show(grip, hold(arguments.object, grip))
+    for grip in GRIPS:
+        try:
+            show(grip, hold(arguments.object, arguments.pose, grip, options))
+        except ConfigError as error:
+            print(f"| {grip} | {error} |")
 
 
-def hold(object_name: str, grip: str) -> Rollouts:
+def hold(object_name: str, pose: str, grip: str, options: Mapping[str, str] | None = None) -> Rollouts:
     """A rollout whose actions are zero: the start grip's commands stay as they are."""
-    config = FingerGaitConfig(object=object_name, start_grip=grip, steps=round(SECONDS[-1] / CONTROL_PERIOD))
-    task = FingerGait(config)
+    steps = round(SECONDS[-1] / CONTROL_PERIOD)
+    config = FingerGaitConfig(object=object_name, pose=pose, start_grip=grip, goal_grip=grip, steps=steps)
+    own = POSES[pose] if options is None else replace(POSES[pose], options=options)
+    task = FingerGait(config, files=model.posed(model.files(object_name, "opposed"), own))
     sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
 
     def held() -> Rollouts:

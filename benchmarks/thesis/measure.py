@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks.thesis.chain import chain
 from benchmarks.thesis.claims import SIZES
 from benchmarks.thesis.experiment import Chain, Curves, Experiment, Friction, KernelError, Transfer
 from benchmarks.thesis.folder import ExperimentFolder
@@ -24,6 +23,7 @@ from farm.tasks.base import TaskSpec
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.task import SUCCESS_STEPS, FingerGait, Perturbation
 from farm.tasks.loop import Seed
+from learner.chain import chain
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED
 from learner.replay import LoadedPolicy, loaded
 from learner.replay import load as load_policy
@@ -185,7 +185,7 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
             chained = chain(policies, _drawn(), steps)
             reached[trial] = [(chained.changes >= k).mean() for k in range(most + 1)]
             if trial == 0:
-                shown = {"acting": chained.acting[0], "force": chained.force[0]}
+                shown = {"acting": chained.acting[0], "force": chained.rollouts.frames["force"][0].sum(axis=-1)}
     return {"reached": reached, **shown}
 
 

@@ -1,5 +1,6 @@
-"""Controllers that are networks: linear, and a multilayer perceptron. Pure, batched.
+"""Controllers that are networks: linear, and a multilayer perceptron; and none at all. Pure, batched.
 
+    constant  a = b
     linear    a = W x + b
     mlp       h_1 = tanh(W_1 x + b_1), ..., h_L = tanh(W_L h_(L-1) + b_L), a = W h_L + b
               (Rumelhart, Hinton & Williams 1986, Learning representations by back-propagating errors)
@@ -73,6 +74,18 @@ class Linear(Policy):
             # Sums of another memory order would round differently.
             yield np.ascontiguousarray(rows[:, :, :-1]), rows[:, :, -1]
             first = end
+
+
+class Constant(Linear):
+    """The same action always, whatever is seen: what a controller with senses has to beat."""
+
+    @property
+    def _sizes(self) -> tuple[int, ...]:
+        return 0, self.spec.action
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions, the parameters."""
+        return super().act(prepared, x[:, :0])
 
 
 class Mlp(Linear):

@@ -124,6 +124,8 @@ class Task:
     """Factor of the return."""
     parts: tuple[int, ...] = ()
     """Sizes of the observation's parts where they differ in kind; empty: it is one."""
+    ends: tuple[str, str] | None = None
+    """Names of where rollouts begin and of where they should end; with `reached` and `lost` they can be chained."""
     takes: ClassVar[str] = ""
     """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
 
@@ -200,6 +202,14 @@ class Task:
     def success(self, sim: "Sim") -> BoolArray | None:  # noqa: ARG002
         """Which rollouts, ending here, succeeded, (B,); None where there is no success."""
         return None
+
+    def reached(self, sim: "Sim") -> BoolArray:
+        """In which rollouts the end that `ends` names is there now, (B,): the next policy of a chain may act."""
+        raise NotImplementedError
+
+    def lost(self, sim: "Sim") -> BoolArray:
+        """Which rollouts of a chain are lost for good, (B,)."""
+        raise NotImplementedError
 
     def measure(self, sim: "Sim") -> dict[str, FloatArray]:  # noqa: ARG002
         """What is kept of every frame, (B, ...) each: values of channels, or what `score` and `show` need."""

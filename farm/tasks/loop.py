@@ -72,6 +72,11 @@ class Rollouts:
         """success, ended, failed, clamped, (B, 4)."""
         return np.stack([self.success, self.ended, self.failed, self.clamped], axis=1)
 
+    @staticmethod
+    def joined(parts: Sequence["Rollouts"]) -> "Rollouts":
+        """Rollouts of one task, one part after the other."""
+        return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
+
     def at(self, rows: slice | IntArray) -> "Rollouts":
         """Some of them."""
         return _each(lambda values: values[rows], self)
@@ -229,7 +234,7 @@ def run(
     for first in range(0, len(theta), size):
         rows = slice(first, first + size)
         parts.append(again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every, moments)))
-    return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
+    return Rollouts.joined(parts)
 
 
 def _run(

@@ -2,10 +2,15 @@
 
 import socket
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
+from farm.arrays import FloatArray
 from farm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from farm.sim.trajectory import Trajectory
+    from farm.tasks.base import Task
 
 _MAGIC: Final = b"RRF"  # what a recording begins with, whichever release of Rerun wrote it
 
@@ -50,3 +55,17 @@ def target(path: Path) -> Path:
     if own and (path.parent / "config.json").exists():
         raise ConfigError(f"--to {path} would replace the run's own recording: take another name")
     return path
+
+
+def film(task: "Task", shown: "Trajectory", qpos: FloatArray, path: Path, speed: float) -> None:
+    """Write a video of a rollout whose frames had positions qpos (F, nq)."""
+    from farm.sim import rendering, video
+
+    chosen = video.moments(shown.times.tolist(), speed, rest=1.0)
+    moments = sorted(set(chosen))
+    pictures = rendering.pictures(
+        task.model, qpos[moments], video.SIZE, camera=task.camera, channels=task.channels,
+        values={name: each[moments] for name, each in shown.channels.items()},
+    )  # fmt: skip
+    drawn = dict(zip(moments, pictures, strict=True))
+    video.write(path, [drawn[moment] for moment in chosen])

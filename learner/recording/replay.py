@@ -29,7 +29,7 @@ def record_replay(
     """Write rollouts into a file of their own; it may replace one.
 
     Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1. The recording's id is
-    `<run>-replay`; config is the resolved configuration, Markdown.
+    `<run>-replay`; config is the resolved configuration, Markdown. A rollout whose return is not a number has none.
 
     Raises:
       OSError: the file cannot be written; one that was there stays.
@@ -54,5 +54,7 @@ def record_replay(
 
 
 def _caption(name: str, rollout: Trajectory) -> rr.TextDocument:
+    if np.isnan(rollout.value):
+        return markdown(f"### {name}")
     success = {True: ", success", False: ", no success", None: ""}[rollout.success]
     return markdown(f"### {name}\n\nreturn {rollout.value:.4g}{success}")

@@ -70,6 +70,7 @@ class FragileBarConfig(TaskConfig):
 
     # What the finger gait has settings for, and is fixed here: no fields, so no flags.
     object = "fragile-bar"
+    pose = "opposed"
     start_grip = "index+thumb"
     clip = True
     joints_scale = contacts_scale = tactile_scale = 1.0
@@ -95,6 +96,7 @@ class FragileBar(FingerGait):
         },
     }  # fmt: skip
     return_scale = Task.return_scale
+    ends = None  # type: ignore[assignment]  # it begins with a grip, but ends with a force
 
     def spec(self) -> TaskSpec:
         """What both sides must know, without closing a grip."""

@@ -16,9 +16,6 @@ from farm.errors import ConfigError
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, LOWER, UPPER
 from farm.tasks.finger_gait.model import Hand
 
-PRESS: Final = {"index": 4.0, "middle": 3.0, "thumb": 6.5}
-"""Force with which a finger is told to press [N]; the object's weight and friction share it out."""
-
 WAIT: Final = 0.02
 """Height over its contact at which a finger that does not grip waits [m]."""
 
@@ -108,13 +105,13 @@ class Grasping:
         return self.data.qpos[joints].copy()
 
     def _press(self, finger: str) -> FloatArray:
-        """Target offsets that press with PRESS along the approach: J' F / k [rad]."""
+        """Target offsets that press with the pose's force along the approach: J' F / k [rad]."""
         joints = FINGER_JOINTS[finger]
         self._place(finger, self.contact)
         jacobian = np.empty((3, self.scene.model.nv))
         mujoco.mj_jacSite(self.scene.model, self.data, jacobian, None, self._site(finger))
         stiffness = self.scene.model.actuator_gainprm[joints, 0]
-        return jacobian[2, joints] * _APPROACH[finger] * PRESS[finger] / stiffness
+        return jacobian[2, joints] * _APPROACH[finger] * self.scene.pose.press[finger] / stiffness
 
     def _place(self, finger: str, joints: FloatArray) -> None:
         """Put one finger's joints as given and the others as they began: nothing depends on what was asked before."""

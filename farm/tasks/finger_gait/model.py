@@ -11,7 +11,7 @@ import mujoco
 
 import farm
 from farm.errors import ConfigError
-from farm.tasks.finger_gait.hand import FINGERS
+from farm.tasks.finger_gait.hand import FINGERS, POSES, Pose
 
 CONTACTS: Final = 4
 """Contacts kept per fingertip (the strongest); a sphere on a convex body has one."""
@@ -33,8 +33,10 @@ def objects() -> list[str]:
     return sorted(file.stem for file in folder().glob("objects/*.xml"))
 
 
-def files(object_name: str) -> dict[str, str]:
+def files(object_name: str, pose: str) -> dict[str, str]:
     """The texts that the model is made of, by name: hand, what the task adds, and an object by name or file.
+
+    Hand and object are set up for a pose, one of POSES.
 
     Raises:
       ConfigError: there is no such object.
@@ -48,17 +50,43 @@ def files(object_name: str) -> dict[str, str]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read the object {path}: {error}") from None
     parts = {name: (folder() / name).read_text("utf-8") for name in ("hand.xml", "finger_gait.xml")}
-    return {**parts, "object.xml": own}
+    return posed({**parts, "object.xml": own}, POSES[pose])
+
+
+def posed(sources: Mapping[str, str], pose: Pose) -> dict[str, str]:
+    """The texts with links turned and the object placed as a pose has them."""
+    hand, thing = (_parsed(sources, name) for name in ("hand.xml", "object.xml"))
+    out = dict(sources)
+    if pose.turned or pose.options:
+        for name, quat in pose.turned.items():
+            _body(hand, name).set("quat", quat)
+        hand.find("option").attrib.update(pose.options)  # type: ignore[union-attr]
+        out["hand.xml"] = ET.tostring(hand, encoding="unicode")
+    if pose.place is not None:
+        _body(thing, OBJECT).set("pos", pose.place)
+        out["object.xml"] = ET.tostring(thing, encoding="unicode")
+    return out
+
+
+def _body(root: ET.Element, name: str) -> ET.Element:
+    for body in root.iter("body"):
+        if body.get("name") == name:
+            return body
+    raise ConfigError(f"the hand's model has no body {name!r}: an object's file has a body called {OBJECT!r}")
+
+
+def _parsed(sources: Mapping[str, str], name: str) -> ET.Element:
+    try:
+        return ET.fromstring(sources[name])
+    except (KeyError, ET.ParseError) as error:
+        raise ConfigError(f"the hand's model: {name} cannot be read: {error}") from None
 
 
 def mjcf(sources: Mapping[str, str]) -> str:
     """The texts of `files` as one MJCF text that needs no other file; a ConfigError where one is no XML."""
     whole = ET.Element("mujoco")
     for name in ("hand.xml", "finger_gait.xml", "object.xml"):
-        try:
-            whole.extend(ET.fromstring(sources[name]))
-        except (KeyError, ET.ParseError) as error:
-            raise ConfigError(f"the hand's model: {name} cannot be read: {error}") from None
+        whole.extend(_parsed(sources, name))
     return ET.tostring(whole, encoding="unicode")
 
 
@@ -72,6 +100,7 @@ class Hand:
 
     model: mujoco.MjModel
     object_name: str
+    pose: Pose = POSES["opposed"]
 
     @cached_property
     def object_body(self) -> int:

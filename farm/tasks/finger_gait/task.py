@@ -20,7 +20,7 @@ from farm.sim.sim import Sim
 from farm.tasks.base import Camera, Channel, Record, Score, Task, TaskConfig, TaskSpec
 from farm.tasks.finger_gait import model, rewards, touch
 from farm.tasks.finger_gait.grasp import Grasping
-from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, TIP_RADIUS, UPPER
+from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, POSES, TIP_RADIUS, UPPER
 from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
 
@@ -48,6 +48,15 @@ MAX_TURN: Final = np.deg2rad(30.0)
 LEAST_COSINE: Final = float(elementary.cos(np.array(0.5 * MAX_TURN)))
 """Cosine of half of that."""
 
+MOVED: Final = 0.003
+"""Shift of the object that costs as much as TURNED [m]."""
+
+TURNED: Final = np.deg2rad(6.0)
+"""Turn of the object that costs as much as MOVED [rad]."""
+
+TURNED_COSINE: Final = float(elementary.cos(np.array(0.5 * TURNED)))
+"""Cosine of half of that."""
+
 SCALE: Final = (0.8, 1.2)
 """Perturbation: friction and mass are multiplied by U(SCALE)."""
 
@@ -69,6 +78,7 @@ SETTLE: Final = 50
 HOLD: Final = 200
 """Physics steps from the release for which a grip must hold the object by itself to be taken."""
 
+_MOST_MOTION: Final = 20.0  # of the squares of a step: a lost object is punished by other terms
 _TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target a number that MuJoCo takes
 _COLOURS: Final = ((86, 180, 233), (0, 158, 115), (204, 121, 167))  # of the fingers
 _SHADES: Final = (1.25, 0.95, 0.65)  # of a finger's joints, first to last
@@ -84,6 +94,8 @@ class FingerGaitConfig(TaskConfig):
     """Train on perturbed friction, mass, object position and joint readings (both rollouts of a pair alike)."""
     object: str = "bar"
     """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own."""
+    pose: str = "opposed"
+    """How the hand is set up: opposed (thumb opposite the index finger) | between (index and middle finger)."""
     start_grip: str = "index+thumb"
     """Grip in which the object is released."""
     goal_grip: str = "index+middle+thumb"
@@ -97,6 +109,8 @@ class FingerGaitConfig(TaskConfig):
     limited (full, no action punished for more than its joint's range)."""
     weights: str = "projected"
     """Row of the thesis' Table 3.1 with the reward's weights: direct | projected."""
+    motion: float = setting(0.0, least=0.0)
+    """What moving the object costs in each step: so much times its shift / 3 mm and turn / 6 degrees, squared."""
     action: Literal["offset", "absolute", "increment"] = "offset"
     """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
     clip: bool = True
@@ -115,6 +129,7 @@ class FingerGaitConfig(TaskConfig):
         if self.object.endswith(".xml"):  # so that a run can be repeated from anywhere
             object.__setattr__(self, "object", str(Path(self.object).resolve()))
         for kind, name, known in (
+            ("pose", self.pose, POSES),
             ("grip", self.start_grip, GRIPS),
             ("grip", self.goal_grip, GRIPS),
             ("state base", self.state, STATES),
@@ -177,6 +192,18 @@ class FingerGait(Task):
             "sigma_floor": 0.02, "pairs": 5, "learning_rate_mu": 0.3, "learning_rate_sigma": 0.1, "generations": 90,
         },
         "thesis": {"policy": "projected", "normaliser": "thesis", "sigma_rule": "bare"},
+        **{
+            name: {
+                "perturb": True, "pose": "between", "start_grip": start, "goal_grip": goal, "motion": 0.3,
+                "policy": "weighted-kernel", "algorithm": "snes", "pairs": 10, "generations": 25,
+            }
+            for name, start, goal in (
+                ("middle-on", "index+thumb", "index+middle+thumb"),
+                ("index-off", "index+middle+thumb", "middle+thumb"),
+                ("index-on", "middle+thumb", "index+middle+thumb"),
+                ("middle-off", "index+middle+thumb", "index+thumb"),
+            )
+        },
     }  # fmt: skip
     start_commands: FloatArray
     """Joint targets of the start grip [rad], (8,)."""
@@ -185,7 +212,7 @@ class FingerGait(Task):
 
     def files(self) -> dict[str, str]:
         """Hand, object, and what the task adds."""
-        return model.files(self.config.object)
+        return model.files(self.config.object, self.config.pose)
 
     def mjcf(self) -> str:
         """One text of them."""
@@ -194,7 +221,7 @@ class FingerGait(Task):
     @cached_property
     def hand(self) -> model.Hand:
         """Where things are in the model."""
-        return model.Hand(self.model, self.config.object)
+        return model.Hand(self.model, self.config.object, POSES[self.config.pose])
 
     @property
     def return_scale(self) -> float:  # type: ignore[override]  # a setting here
@@ -205,7 +232,7 @@ class FingerGait(Task):
         """What both sides must know, without closing a grip."""
         return TaskSpec(
             observation=STATES[self.config.state].size, action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
-            terms=TERMS, success=True, channels=self.channels,
+            terms=(*TERMS, *(["motion"] if self.config.motion else [])), success=True, channels=self.channels,
         )  # fmt: skip
 
     @property
@@ -256,6 +283,7 @@ class FingerGait(Task):
         self._close(sim, self.start_commands, np.stack([each.displacement for each in drawn]))
         sim.own["noise"] = np.stack([each.noise for each in drawn])
         sim.own["target"] = np.tile(self.start_commands, (len(drawn), 1))
+        sim.own["released"] = sim.qpos[:, len(JOINTS) :].copy()
 
     def _drawn(self, rng: np.random.Generator) -> Perturbation:
         return Perturbation.draw(rng, self.steps)
@@ -316,8 +344,27 @@ class FingerGait(Task):
 
     def ended(self, sim: Sim) -> BoolArray:
         """Where no fingertip touches the object any more."""
-        sensors = _sensors(sim)
-        return np.asarray(~((sensors[..., 0] > 0) & (sensors[..., 1] > 0)).any(axis=(1, 2)))
+        return _dropped(sim)
+
+    # A chain of gaits
+
+    @property
+    def ends(self) -> tuple[str, str]:  # type: ignore[override]  # settings
+        """Start and goal grip."""
+        return self.config.start_grip, self.config.goal_grip
+
+    def reached(self, sim: Sim) -> BoolArray:
+        """Where the goal grip's fingers press, and no others."""
+        return np.asarray((_pressing(_force(_sensors(sim))) == self._wanted).all(axis=-1))
+
+    def lost(self, sim: Sim) -> BoolArray:
+        """Where the object has been dropped, or is out of place."""
+        return _dropped(sim) | ~stayed(sim.qpos[:, len(JOINTS) :], sim.own["released"])
+
+    @property
+    def _wanted(self) -> BoolArray:
+        """Which fingers the goal grip has, (3,)."""
+        return np.array([finger in GRIPS[self.config.goal_grip] for finger in FINGERS])
 
     # Whole rollouts
 
@@ -330,14 +377,23 @@ class FingerGait(Task):
         weights = WEIGHTS[self.config.weights]
         with np.errstate(over="ignore", invalid="ignore"):
             reward = REWARDS[self.config.reward](felt, record.actions, self.goal, weights)
+        if self.config.motion:
+            reward = np.concatenate([reward, self._motion(record)[..., None]], axis=-1)
         terms = rewards.end(reward, record.steps, dropped, record.failed, weights)
         return Score(terms, ~(dropped | record.failed) & self._success(record))
 
+    def _motion(self, record: Record) -> FloatArray:
+        """What moving the object costs, (B, T)."""
+        pose = slice(len(JOINTS), None)
+        shift, cosine = distance(record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose])
+        # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
+        moved = (shift / MOVED) ** 2 + (1.0 - cosine) / (1.0 - TURNED_COSINE)
+        return np.asarray(-self.config.motion * np.minimum(moved, _MOST_MOTION))
+
     def _success(self, record: Record) -> BoolArray:
         """Whether the goal grip's fingers, no others, press at the last steps and the object stayed where it was."""
-        wanted = np.array([finger in GRIPS[self.config.goal_grip] for finger in FINGERS])
         last = slice(-SUCCESS_STEPS, None)
-        grips = (record.frames["force"][:, last].sum(axis=-1) >= PRESSES) == wanted
+        grips = _pressing(record.frames["force"][:, last]) == self._wanted
         pose = slice(len(JOINTS), None)
         there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
         return np.asarray(grips.all(axis=(1, 2)) & there.all(axis=1))
@@ -423,6 +479,17 @@ def _sensors(sim: Sim) -> FloatArray:
 def _force(sensors: FloatArray) -> FloatArray:
     """Normal forces, zero where there is no contact, (B, 3, C) [N]."""
     return np.where(sensors[..., 0] > 0, sensors[..., 1], 0.0)
+
+
+def _dropped(sim: Sim) -> BoolArray:
+    """Where no fingertip touches the object, (B,)."""
+    sensors = _sensors(sim)
+    return np.asarray(~((sensors[..., 0] > 0) & (sensors[..., 1] > 0)).any(axis=(1, 2)))
+
+
+def _pressing(force: FloatArray) -> BoolArray:
+    """Which fingertips press, (..., 3, C) -> (..., 3)."""
+    return np.asarray(force.sum(axis=-1) >= PRESSES)
 
 
 def touching(force: FloatArray) -> BoolArray:

@@ -32,7 +32,7 @@ PLACES = [(finger, row, column) for finger in range(3) for row in range(6) for c
 def task() -> FingerGait:
     """The gait with a small ball as its object."""
     box, ball = r'(<geom name="bar" )type="box" size="[^"]*"', rf'\1type="sphere" size="{BALL}"'
-    files = model.files("bar")
+    files = model.files("bar", "opposed")
     return FingerGait(files={**files, "object.xml": re.sub(box, ball, files["object.xml"])})
 
 

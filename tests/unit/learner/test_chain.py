@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.thesis.chain import chain
 from farm.errors import ConfigError
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import GRIPS
 from farm.tasks.finger_gait.task import FingerGait
+from learner.chain import chain
 from learner.config import configure
 from learner.replay import LoadedPolicy
 from learner.setup import problem
@@ -43,7 +43,7 @@ def test_the_grip_changes_there_and_back_by_touch(gait: Make) -> None:
     done = chain([add, remove], drawn(3), 30)
     assert (done.changes >= 4).all()
     assert (done.acting[:, 0] == 0).all()
-    for acting, force in zip(done.acting, done.force, strict=True):
+    for acting, force in zip(done.acting, done.rollouts.frames["force"].sum(axis=-1), strict=True):
         for t in np.flatnonzero(np.diff(acting)):  # the next policy acts because three steps felt the goal
             pressing = force[t - 2 : t + 1] >= 0.1
             assert (pressing == (True, acting[t] == 0, True)).all()
@@ -54,12 +54,12 @@ def test_more_rollouts_than_are_stepped_together_are_the_same(gait: Make) -> Non
     policies = [gait("index+thumb", "index+middle+thumb"), gait("index+middle+thumb", "index+thumb")]
     many = chain(policies, drawn(66), 4)
     few = chain(policies, drawn(66)[65:], 4)
-    assert np.array_equal(many.force[65:], few.force)
+    assert np.array_equal(many.rollouts.frames["qpos"][65:], few.rollouts.frames["qpos"])
 
 
 def test_gaits_that_do_not_follow_each_other(gait: Make) -> None:
     add = gait("index+thumb", "index+middle+thumb")
-    with pytest.raises(ConfigError, match=r"a gait to index\+middle\+thumb is not followed by one from index\+thumb"):
+    with pytest.raises(ConfigError, match=r"ends in index\+middle\+thumb is not followed by one from index\+thumb"):
         chain([add], drawn(1), 3)
-    with pytest.raises(ConfigError, match="not followed"):
+    with pytest.raises(ConfigError, match="simulate different models"):
         chain([add, gait("index+middle+thumb", "index+thumb", "thick-bar")], drawn(1), 3)

@@ -1,0 +1,159 @@
+"""An upper level over learnt policies: it lets one act until its goal has been felt, then the next.
+
+Plage 2016, 5.2: "an upper level control policy can then control the finger gaiting". A task can be chained if it says
+where its rollouts begin and end (`ends`), when the end is reached (`reached`) and when all is lost (`lost`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+
+from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.errors import ConfigError
+from farm.policies.base import Policy
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks.base import Task
+from farm.tasks.loop import Batch, Rollouts, Seed, again
+from learner.replay import LoadedPolicy
+
+FELT: Final = 3
+"""Control steps in a row for which a goal must be felt before the next policy acts."""
+
+
+@dataclass(frozen=True)
+class Chained:
+    """Rollouts of a chain."""
+
+    changes: IntArray
+    """(B,) how often a goal was reached until the end, or until all was lost."""
+    acting: IntArray
+    """(B, T) which policy acted, -1 after the end."""
+    rollouts: Rollouts
+    """Of the first policy's task, whose actions here are controls."""
+    task: Task
+    """That task."""
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A policy, with its own observation and its own meaning of an action."""
+
+    task: Task
+    policy: Policy
+    prepared: FloatArray
+    """Of its one parameter vector, (1, ...)."""
+
+    @classmethod
+    def of(cls, learnt: LoadedPolicy, steps: int) -> "_Link":
+        """A policy that acts for up to so many steps."""
+        task = _longer(type(learnt.problem.task), learnt, steps)
+        sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
+        again(lambda: task.setup(sim))
+        policy = learnt.problem.policy
+        return cls(task, policy, policy.prepare(learnt.mu[None]))
+
+    def controls(self, sim: Sim) -> FloatArray:
+        """Controls of the rollouts still going, (n, nu)."""
+        action = self.policy.act(np.repeat(self.prepared, len(sim), axis=0), self.task.observe(sim))
+        return self.task.act(sim, action)
+
+
+def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *, every: int = 0) -> Chained:
+    """Run policies in turn, the first one first, each from where the one before it ended; the last leads to the first.
+
+    Args:
+      policies: of tasks that can be chained.
+      seeds: (B,) of the starts.
+      steps: control steps.
+      every: physics steps between two frames; 0: one frame each control step.
+
+    Raises:
+      ConfigError: the policies do not follow each other, or simulate different things.
+    """
+    check(policies)
+    first = policies[0]
+    upper: Any = type("Upper", (type(first.problem.task),), {"act": _as_given, "ended": _lost})
+    task: Any = _longer(upper, first, steps)
+    sim = Sim(task.engine(BatchEngine))
+    again(lambda: task.setup(sim))
+    links, size = [_Link.of(policy, steps) for policy in policies], sim.engine.size
+    parts = [again(lambda i=i: _run(task, sim, links, seeds[i : i + size], every)) for i in range(0, len(seeds), size)]
+    changes, acting, rollouts = zip(*parts, strict=True)
+    return Chained(np.concatenate(changes), np.concatenate(acting), Rollouts.joined(rollouts), task)
+
+
+def check(policies: Sequence[LoadedPolicy]) -> None:
+    """See that each policy ends where the next one begins.
+
+    Raises:
+      ConfigError: one does not; names the two.
+    """
+    if not policies:
+        raise ConfigError("a chain needs policies; expected one or more")
+    tasks: list[Any] = [policy.problem.task for policy in policies]
+    for policy, task in zip(policies, tasks, strict=True):
+        if task.ends is None:
+            raise ConfigError(f"{policy.problem.config.task} cannot be chained: its task has no `ends`")
+    for one, other in pairwise([*tasks, tasks[0]]):
+        if one.ends[1] != other.ends[0]:
+            raise ConfigError(f"a policy that ends in {one.ends[1]} is not followed by one from {other.ends[0]}")
+        if one.sources != other.sources:
+            raise ConfigError(
+                f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different models: learn both with "
+                "the same object and pose"
+            )
+
+
+def _as_given(_: Task, __: Sim, action: FloatArray) -> FloatArray:
+    return action
+
+
+def _lost(self: Task, sim: Sim) -> BoolArray:
+    return self.lost(sim)
+
+
+def _longer(kind: type[Task], learnt: LoadedPolicy, steps: int) -> Task:
+    known = learnt.problem.task
+    return kind(replace(known.config, steps=steps), known.variant, known.sources)
+
+
+def _run(
+    task: Task, sim: Sim, links: Sequence[_Link], seeds: Sequence[Seed], every: int
+) -> tuple[IntArray, IntArray, Rollouts]:
+    """As many rollouts as are stepped together."""
+    batch = Batch(task, sim, seeds, every)
+    turn, felt, changes = (np.zeros(len(seeds), dtype=int) for _ in range(3))
+    acting = np.full((len(seeds), task.steps), -1)
+    while not batch.over:
+        going = batch.active
+        acting[going, sim.t] = turn[going]
+        batch.step(_controls(links, sim, turn[going]))
+        going = batch.active
+        reached = np.stack([link.task.reached(sim) for link in links])[turn[going], np.arange(len(going))]
+        felt[going] = np.where(reached, felt[going] + 1, 0)
+        there = going[felt[going] >= FELT]
+        changes[there] += 1
+        turn[there] = (turn[there] + 1) % len(links)
+        felt[there] = 0
+    return changes, acting, batch.rollouts()
+
+
+def _controls(links: Sequence[_Link], sim: Sim, turn: IntArray) -> FloatArray:
+    """Controls of the rollouts still going, each by the policy whose turn it is, (n, nu)."""
+    before: Mapping[str, Any] = {name: np.array(values) for name, values in sim.own.items()}
+    given, own = [], []
+    for link in links:  # all of them for all rollouts: what a row gives does not depend on the others
+        sim.own.clear()
+        sim.own.update({name: values.copy() for name, values in before.items()})
+        given.append(link.controls(sim))
+        own.append(dict(sim.own))
+    rows = np.arange(len(turn))
+    sim.own.clear()
+    for name in dict.fromkeys(name for each in own for name in each):
+        known = next(each[name] for each in own if name in each)  # what one task alone remembers
+        sim.own[name] = np.stack([each.get(name, known) for each in own])[turn, rows]
+    return np.stack(given)[turn, rows]

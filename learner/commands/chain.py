@@ -1,0 +1,123 @@
+"""`farm chain`: learnt policies in turn, each from where the one before it ended."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from farm import seeds, settings
+from farm.commands.logs import say
+from farm.commands.screen import draw_offscreen
+from farm.errors import writing
+from farm.seeds import SEEDS
+from farm.settings import Settings, setting
+from learner.commands import recordings
+from learner.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from learner.chain import Chained
+    from learner.replay import LoadedPolicy
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainCommand(Settings):
+    """Learnt policies in turn: the next one acts when the goal of the one before has been felt, the last leads to the
+    first. Says how many cycles they make from perturbed starts, and records them."""  # noqa: D205, D209
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of the runs, in the order in which their policies act."""
+    starts: int = setting(50, least=1, most=100_000)
+    """Perturbed starts."""
+    steps: int = setting(1000, least=1, most=100_000)
+    """Control steps that a chain has at most."""
+    seed: int = setting(0, least=0, most=SEEDS - 1)
+    """Seed of the perturbations."""
+    to: Path = Path("chain.rrd")
+    """Recording to write; what is there is replaced."""
+    shown: int = setting(120, least=1, most=10_000)
+    """Control steps of the unperturbed chain that is recorded."""
+    video: Path | None = None
+    """Video of it to write as well: a name that ends in .gif or .mp4."""
+    speed: float = setting(1.0, least=0.01, most=10)
+    """Speed of the video: 1 is real time."""
+    json: bool = False
+    """Print JSON instead of a table, and record nothing."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    draw_offscreen()  # before anything imports MuJoCo
+    command = settings.parse(ChainCommand, words, "farm chain")
+    from farm.sim import video
+    from learner.chain import chain, check
+    from learner.replay import loaded
+
+    policies = [loaded(RunFolder.open(path)) for path in command.runs]
+    check(policies)
+    if command.video is not None:
+        video.check(command.video)
+    drawn = [seeds.trial(command.seed, i) for i in range(command.starts)]
+    if command.json:
+        say(json.dumps(figures(chain(policies, drawn, command.steps), len(policies)), indent=2))
+        return 0
+    from learner.run import check_rerun
+
+    check_rerun()
+    recordings.target(command.to)
+    found = figures(chain(policies, drawn, command.steps), len(policies))
+    table = Table(title=f"{len(policies)} policies in turn, {command.starts} perturbed starts")
+    table.add_column("cycles, at least")
+    table.add_column("starts", justify="right")
+    for cycles, part in found["cycles_at_least"].items():
+        table.add_row(cycles, f"{part:.0%}")
+    Console().print(table)
+    said = f"changes: median {found['changes_median']:g}, {found['changes_min']} to {found['changes_max']}"
+    say(f"{said}; {found['lost']} of {command.starts} lost within {command.steps} control steps")
+    _record(policies, command)
+    return 0
+
+
+def figures(chained: "Chained", policies: int) -> dict[str, Any]:
+    """What came out, as the JSON shows it."""
+    changes, cycles = chained.changes, chained.changes // policies
+    return {
+        "starts": len(changes),
+        "steps": chained.task.steps,
+        "changes_median": float(np.median(changes)),
+        "changes_min": int(changes.min()),
+        "changes_max": int(changes.max()),
+        "lost": int((chained.rollouts.ended | chained.rollouts.failed).sum()),
+        "cycles_at_least": {str(least): float((cycles >= least).mean()) for least in (1, 5, 10, 25)},
+    }
+
+
+def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
+    """The unperturbed chain, at physics rate."""
+    from farm.tasks import loop
+    from learner.chain import chain
+    from learner.recording.drawing import Drawing
+    from learner.recording.replay import record_replay
+    from learner.recording.run import markdown
+
+    first = policies[0].problem
+    shown = chain(policies, [None], command.shown, every=1)
+    found = loop.trajectory(shown.task, first.spec, first.scene, shown.rollouts, 0)
+    # Its reward would be the first policy's, all along.
+    trajectory = replace(found, terms=np.zeros_like(found.terms), value=float("nan"), success=None)
+    name = f"{len(policies)} policies in turn: the goal is reached {shown.changes[0]} times"
+    with writing(command.to):
+        record_replay(
+            command.to, run="chain", drawing=Drawing.of(first), config=markdown(first.config),
+            rollouts=[(name, trajectory)],
+        )  # fmt: skip
+    say(f"written to {command.to}; look at it with: farm view {command.to}")
+    if command.video is not None:
+        qpos = loop.whole(shown.rollouts, 0)["qpos"]
+        recordings.film(shown.task, trajectory, qpos, command.video, command.speed)
+        say(f"video: {command.video}")
