@@ -271,7 +271,12 @@ class FingerGait(Task):
         joints, images = sim.qpos[0, : len(JOINTS)].copy(), touch.images(felt)
         sim.step(HOLD - SETTLE)
         if not touching(self.measure(sim)["force"])[0]:
-            raise ConfigError(f"grip {grip!r} does not hold object {self.hand.object_name!r}; take another grip")
+            press = self.hand.pose.press
+            forces = " and ".join(f"{press[finger]:g} N ({finger})" for finger in GRIPS[grip])
+            raise ConfigError(
+                f"grip {grip!r} does not hold object {self.hand.object_name!r} in pose {self.config.pose!r}, pressing "
+                f"with {forces}; take another grip, pose or object"
+            )
         return Felt(joints=joints, images=images[0], points=touch.contact_points(images)[0])
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:

@@ -333,7 +333,8 @@ def test_an_object_that_cannot_be_gripped_is_a_clear_error(thing, kind, mass, li
 
 
 def test_settings_that_name_nothing_are_clear_errors(tmp_path):
-    with pytest.raises(ConfigError, match=r"'middle\+thumb' does not hold object 'bar'"):
+    words = r"'middle\+thumb' does not hold object 'bar' in pose 'opposed', pressing with 3 N \(middle\) and 6.5 N"
+    with pytest.raises(ConfigError, match=words):
         runner(start_grip="middle+thumb")
     with pytest.raises(ConfigError, match="unknown object 'spoon'; known are .*bar"):
         runner(object="spoon")
