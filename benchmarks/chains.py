@@ -1,0 +1,91 @@
+"""Four gaits, and how long they chain: learnt one by one, then in turn without losing the bar; two tables.
+
+    python benchmarks/chains.py [--seeds 20,21,22,23,24] [--policy constant] [--out runs/chains]
+
+The gaits are the presets middle-on, index-off, index-on and middle-off, learnt by the farm. A gait's rollouts are
+those after which the mean policy succeeds on at least 95 of 100 perturbed starts, and from then on always. The chain is
+tried on 50 other starts for 1000 control steps (100 s). What is there already is not learnt again.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm import seeds
+from farm.errors import ConfigError
+from learner.chain import Chained, chain
+from learner.config import configure
+from learner.replay import LoadedPolicy, load
+from learner.run import learn
+from learner.run_folder import RunFolder
+
+GAITS: Final = ("middle-on", "index-off", "index-on", "middle-off")
+SETTINGS: Final[dict[str, dict[str, Any]]] = {
+    "weighted-kernel": {"generations": 25},
+    "constant": {"policy": "constant", "initial_sigma": 0.2, "generations": 80},
+}
+"""What is other than in the presets, by policy: 500 rollouts for each gait, or 1600."""
+TRIALS: Final = 100
+ENOUGH: Final = 95  # of them
+STARTS: Final = 50
+STEPS: Final = 1000
+
+
+def main() -> None:
+    """Learn, chain, and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="20,21,22,23,24")
+    parser.add_argument("--policy", choices=tuple(SETTINGS), default="constant")
+    parser.add_argument("--out", type=Path, default=Path("runs/chains"))
+    arguments = parser.parse_args()
+    print(f"| seed | {' | '.join(GAITS)} | cycles, least / median / most | starts with 10, with 25 |")
+    print(f"|---|{'---|' * len(GAITS)}---|---|")
+    for seed in map(int, arguments.seeds.split(",")):
+        runs = [arguments.out / f"{arguments.policy}-{gait}-s{seed}" for gait in GAITS]
+        for gait, run in zip(GAITS, runs, strict=True):
+            _learnt(run, gait, seed, SETTINGS[arguments.policy])
+        policies = [load(run) for run in runs]
+        told = " | ".join(_since(run, policy) for run, policy in zip(runs, policies, strict=True))
+        found = chain(policies, [seeds.trial(1, i) for i in range(STARTS)], STEPS)
+        cycles = found.changes // len(GAITS)
+        _keep(arguments.out / f"{arguments.policy}-s{seed}.json", found)
+        print(
+            f"| {seed} | {told} | {cycles.min()} / {np.median(cycles):g} / {cycles.max()} "
+            f"| {(cycles >= 10).mean():.0%}, {(cycles >= 25).mean():.0%} |",
+            flush=True,
+        )
+
+
+def _learnt(run: Path, gait: str, seed: int, changed: dict[str, Any]) -> None:
+    if (run / "summary.json").exists():
+        return
+    if run.exists():
+        raise ConfigError(f"{run} is not finished: remove it, or give another --out")
+    for _ in learn(configure("finger-gait", gait, seed=seed, **changed), run):
+        pass
+
+
+def _since(run: Path, policy: LoadedPolicy) -> str:
+    """After how many rollouts the mean policy is robust for good."""
+    folder, robust = RunFolder.open(run), []
+    progress = folder.progress()
+    starts = [seeds.trial(0, i) for i in range(TRIALS)]
+    for line in progress:
+        mu, _ = folder.mean(line.generation)
+        found = policy.runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), starts)
+        robust.append(int(found.success.sum()))
+    below = [at for at, good in enumerate(robust) if good < ENOUGH]
+    first = below[-1] + 1 if below else 0
+    return f"{progress[first].rollouts} ({robust[-1]} %)" if first < len(progress) else f"- ({robust[-1]} %)"
+
+
+def _keep(path: Path, found: Chained) -> None:
+    told = {"changes": found.changes.tolist(), "starts": STARTS, "steps": STEPS}
+    path.write_text(json.dumps(told) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
