@@ -252,7 +252,12 @@ def _sources(module: str) -> dict[str, bytes]:
     return found
 
 
-def _imports(source: bytes, parent: str | None, package: str) -> Iterator[str]:
+@cache  # task, policy and simulation share most of their modules
+def _imports(source: bytes, parent: str | None, package: str) -> tuple[str, ...]:
+    return tuple(_imported(source, parent, package))
+
+
+def _imported(source: bytes, parent: str | None, package: str) -> Iterator[str]:
     """Modules of the top-level package that a source imports; relative to its parent."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

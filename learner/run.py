@@ -313,6 +313,7 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     recording = RunRecording(
         learner.folder.recording if place.record else None, replay=learner.folder.path / "replay.rrd", run=learner.run,
         config=learner.config, drawing=Drawing.of(learner.problem), done=learner.state.generation, serve=place.serve,
+        folder=learner.folder.path,
     )  # fmt: skip
     stack.callback(recording.finish)
     return recording

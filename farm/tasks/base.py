@@ -124,6 +124,8 @@ class Task:
     """Factor of the return."""
     parts: tuple[int, ...] = ()
     """Sizes of the observation's parts where they differ in kind; empty: it is one."""
+    ending: ClassVar[str] = "ended"
+    """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` where it is "dropped"."""
     takes: ClassVar[str] = ""
     """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
 
