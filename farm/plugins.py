@@ -1,4 +1,4 @@
-"""One look-up for tasks, policies, algorithms, backends and commands: built in, installed packages, files.
+"""One look-up for tasks, policies, algorithms, backends, loggers and commands: built in, installed packages, files.
 
 finger-gait            built in: a line in BUILT_IN
 my-task                an installed package: an entry point of the group `rolloutfarm.tasks`
@@ -45,6 +45,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "backends": {
         "cpu": "workers.backends.cpu:CpuBackend",
+    },
+    "loggers": {
+        "tensorboard": "learner.loggers.tensorboard:TensorBoard",
+        "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
     "commands": {
         "run": "learner.commands.run:main",

@@ -38,6 +38,15 @@ def test_random_actions_play_episodes(tmp_path: Path) -> None:
     assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())
 
 
+@pytest.mark.slow
+def test_curves_in_tensorboard(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboardX")
+    command = [sys.executable, LEARN.parent / "log_tensorboard.py"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert said == "logged 30 generations: tensorboard --logdir runs/logged\n"
+    assert list((tmp_path / "runs/logged/tensorboard").glob("events.*"))
+
+
 def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path) -> None:
     pytest.importorskip("cmaes")
     command = [sys.executable, LEARN.parent / "cma_es.py"]
