@@ -23,7 +23,7 @@ from learner import checkpoint as checkpoints
 from learner.algorithms import SearchState
 from learner.checkpoint import Checkpoint
 from learner.learner import explored, learnt_from
-from learner.replay import LoadedPolicy, Replay, loaded, restored, seeing
+from learner.replay import LoadedPolicy, Replay, restored, seeing
 from learner.run_folder import RunFolder
 from learner.setup import start
 
@@ -36,6 +36,8 @@ class Rewound:
 
     policy: LoadedPolicy
     """The mean that was explored around, under the run's own settings."""
+    seen: FloatArray
+    """Mean and standard deviation that its observations were normalised by, (2, d) or (2, 0)"""
     generation: int
     """Counted from 1, as the lines of progress.jsonl are: its rollouts led to update number `generation`."""
     theta: FloatArray
@@ -104,26 +106,34 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
     if not 1 <= chosen <= last:
         behind = f"it has generations 1 to {last} behind it" if last else "it has no generation behind it"
         raise ConfigError(f"generation {chosen} of the run in {folder.path} has no rollouts: {behind}")
-    policy, state = _before(folder, at, chosen)
+    state, seen = _before(folder, at, chosen)
+    policy = LoadedPolicy(seeing(restored(folder, at), seen), chosen - 1, state.mu)
     jobs = explored(config, state)[1]
     theta, seeds = jobs.theta(state.mu), jobs.seeds()
-    found = Rewound(policy, chosen, theta, seeds, policy.runner.rollouts(theta, seeds))
+    found = Rewound(policy, seen, chosen, theta, seeds, policy.runner.rollouts(theta, seeds))
     _compare(folder, found)
     return found
 
 
-def _before(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[LoadedPolicy, SearchState]:
-    """The mean that a generation explored around, and the algorithm's state there."""
+def under(folder: RunFolder, found: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
+    """The policy of a generation that was found again, with other settings of its task; a ConfigError if not so."""
+    problem = restored(folder, checkpoints.load(folder.checkpoint), task)
+    return LoadedPolicy(seeing(problem, found.seen), found.policy.generation, found.policy.mu)
+
+
+def _before(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[SearchState, FloatArray]:
+    """The algorithm's state when a generation was drawn, and the normaliser of its observations."""
     config, before = folder.read_config(), generation - 1
     algorithm: Any = config.algorithm_config
     fresh = algorithm.init(len(at.state["mu"]))
     if before == 0 and config.init_from is None:
-        return loaded(folder, 0), fresh
+        return fresh, normaliser(np.zeros_like(at.moments))
     if before and _draws_alike(algorithm, fresh, algorithm.restore(at.state)):
         rows = folder.parameters()
-        if len(row := rows[rows["generation"] == before]):
-            state = replace(fresh, mu=row["mu"][0], sigma=row["sigma"][0], generation=before)
-            return loaded(folder, before), state
+        if before in rows["generation"]:
+            mu, seen = folder.mean(before)
+            sigma = rows["sigma"][rows["generation"] == before][0]
+            return replace(fresh, mu=mu, sigma=sigma, generation=before), seen
     return _learnt_again(folder, at, before)
 
 
@@ -134,7 +144,7 @@ def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:
     return with_all.tobytes() == without.tobytes()
 
 
-def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[LoadedPolicy, SearchState]:
+def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[SearchState, FloatArray]:
     """The run once more in this process, up to so many updates: slow, but of any algorithm, and to the same bits."""
     config = folder.read_config()
     algorithm: Any = config.algorithm_config
@@ -144,16 +154,15 @@ def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[Loaded
         log.warning(
             "what %s knew before generation %d is not stored: learning up to there", config.algorithm, until + 1
         )
-    bare = restored(folder, at, config.task_config)
-    runner = bare.runner()
+    problem = restored(folder, at)
+    runner = problem.runner()
     while state.generation < until:
         eps, jobs = explored(config, state)
         found = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
-        returns = found.returns.reshape(len(eps), -1)
-        told = learnt_from(config, bare.task, returns, found.steps)
+        told = learnt_from(config, problem.task, found.returns.reshape(len(eps), -1), found.steps)
         state, moments = algorithm.tell(state, eps, told), merged(moments, found.moments)
     runner.close()
-    return LoadedPolicy(seeing(bare, normaliser(moments)), until, state.mu), state
+    return state, normaliser(moments)
 
 
 def _compare(folder: RunFolder, found: Rewound) -> None:

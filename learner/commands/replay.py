@@ -123,13 +123,10 @@ def _rollouts(
     """Show exploring rollouts of a generation: one by itself, several side by side."""
     from learner.recording.comparison import Shown, record_side_by_side
     from learner.recording.drawing import Drawing
-    from learner.replay import loaded
-    from learner.rewind import rewound
+    from learner.rewind import rewound, under
 
     found = rewound(folder, command.generation)
-    policy = found.policy
-    if changed:  # chosen by what the run saw, shown under the other settings
-        policy = loaded(folder, found.generation - 1, command.task)
+    policy = under(folder, found, command.task) if changed else found.policy  # chosen by what the run itself saw
     chosen = _chosen(command, found, ending)
     shown = found.again(chosen, policy)
     names = [f"rollout {index}" for index in chosen]

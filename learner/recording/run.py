@@ -4,6 +4,7 @@ import contextlib
 import json
 import logging
 import queue
+import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -132,12 +133,12 @@ class RunRecording(logging.Handler):
           ConfigError: the address is taken, or the file cannot be written.
         """
         super().__init__(logging.INFO)
-        self._replay = replay
+        self._replay, ending = replay, plugins.find("tasks", config.task).target.ending
         with writing(path, ConfigError):
             self._recorder = Recorder(
                 path, run=run, drawing=drawing, config=markdown(config), serve=serve, done=done,
                 properties=configs.properties(config),
-                again=partial(again, str(folder or "RUN"), plugins.find("tasks", config.task).target.ending),
+                again=partial(again, shlex.quote(str(folder or "RUN")), ending),
             )  # fmt: skip
         self.uri = self._recorder.uri
         self.thread = RecorderThread(self._recorder)

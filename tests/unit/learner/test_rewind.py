@@ -1,6 +1,7 @@
 """Exploring rollouts of a run again, from their seeds: every return, to the last bit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from farm.errors import ConfigError
 from learner import run_folder, setup
 from learner.config import configure
 from learner.learner import Learner
-from learner.rewind import rewind
+from learner.rewind import rewind, under
 from learner.run_folder import RunFolder
 
 GENERATIONS = 4
@@ -101,6 +102,15 @@ def test_the_best_the_worst_and_those_that_ended(task: str, tmp_path: Path) -> N
     assert len(ended) == line["ended"] > 0
     assert all(len(shown.trajectory.times) < 5 for shown in again.again(ended))
     assert np.array_equal(rewind(tmp_path / "r").returns, rewind(tmp_path / "r", GENERATIONS).returns)
+
+
+def test_under_other_settings_of_the_task(task: str, tmp_path: Path) -> None:
+    learnt(task, tmp_path / "r", algorithm="ars", policy="linear", normalise=True)
+    folder = RunFolder(tmp_path / "r")
+    own, again = folder.read_config().task_config, rewind(folder.path, 3)
+    for changed, same in ((own, True), (replace(own, mass=3.0), False)):  # type: ignore[call-arg]
+        values = [shown.trajectory.value for shown in again.again([4, 1], under(folder, again, changed))]
+        assert (values == again.returns[[4, 1]].tolist()) == same
 
 
 def test_rollouts_that_there_are_not(task: str, tmp_path: Path) -> None:
