@@ -29,7 +29,7 @@ MOST: Final = 12
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayCommand(Settings):
-    """Any policy or rollout of a run again, at physics rate, into a recording; its task may have other settings."""
+    """Any policy or rollout of a run again, at physics rate; its task may have other settings."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
