@@ -116,8 +116,7 @@ class Search:
     @property
     def algorithm(self) -> Any:  # noqa: ANN401
         """The algorithm, of as many pairs as this generation has."""
-        own: Any = self.config.algorithm_config
-        return replace(own, pairs=self.pairs) if self.pairs else own
+        return self.config.algorithm_of(self.pairs)
 
     def ask(self) -> tuple[FloatArray, list[loop.Seed]]:
         """Parameters of its next generation, (2 N, P), and seeds of their starts."""

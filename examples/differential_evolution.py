@@ -2,7 +2,7 @@
 
     python examples/differential_evolution.py
 
-It needs scipy. Everybody's search method goes the same way: parameters in, returns out.
+It needs scipy: pip install -c constraints.txt '.[search]'.
 """
 
 import sys
@@ -12,7 +12,7 @@ import farm
 try:
     from scipy.optimize import differential_evolution
 except ImportError:
-    sys.exit("this example needs scipy: pip install scipy")
+    sys.exit("this example needs scipy: pip install -c constraints.txt '.[search]'")
 
 if __name__ == "__main__":
     with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
@@ -20,4 +20,4 @@ if __name__ == "__main__":
             lambda x: -pool.map(x.T), [(0.0, 3.0)] * pool.size, vectorized=True, updating="deferred",
             maxiter=5, popsize=1, polish=False, rng=0,
         )  # fmt: skip
-    print(f"return {-found.fun:.3f} after {found.nfev} rollouts")
+    print(f"return {-found.fun:.3f} after {found.nfev} calls of the pool")

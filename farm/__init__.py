@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _WHERE: Final = {
     "learn": "learner.run", "Farm": "learner.pool", "load": "learner.replay",
+    "rewind": "learner.rewind",
     "RunConfig": "learner.config", "configure": "learner.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
     "Channel": "farm.sim.channels", "Camera": "farm.sim.channels",

@@ -1,4 +1,4 @@
-"""One look-up for tasks, policies, algorithms, backends and commands: built in, installed packages, files.
+"""One look-up for tasks, policies, algorithms, backends, loggers and commands: built in, installed packages, files.
 
 finger-gait            built in: a line in BUILT_IN
 my-task                an installed package: an entry point of the group `rolloutfarm.tasks`
@@ -46,6 +46,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "backends": {
         "cpu": "workers.backends.cpu:CpuBackend",
+    },
+    "loggers": {
+        "tensorboard": "learner.loggers.tensorboard:TensorBoard",
+        "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
     "commands": {
         "run": "learner.commands.run:main",
@@ -254,7 +258,12 @@ def _sources(module: str) -> dict[str, bytes]:
     return found
 
 
-def _imports(source: bytes, parent: str | None, package: str) -> Iterator[str]:
+@cache  # task, policy and simulation share most of their modules
+def _imports(source: bytes, parent: str | None, package: str) -> tuple[str, ...]:
+    return tuple(_imported(source, parent, package))
+
+
+def _imported(source: bytes, parent: str | None, package: str) -> Iterator[str]:
     """Modules of the top-level package that a source imports; relative to its parent."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

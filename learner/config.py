@@ -88,6 +88,11 @@ class RunConfig(Settings):
         if self.most_pairs is not None and least is not None and self.most_pairs < least:
             raise ConfigError(f"most-pairs is {self.most_pairs}; expected at least {least} (pairs)")
 
+    def algorithm_of(self, pairs: int) -> Algorithm[Any]:
+        """The algorithm of a generation of so many pairs; 0: as its settings say."""
+        own: Any = self.algorithm_config
+        return replace(own, pairs=pairs) if pairs else own
+
     def pairs_after(self, pairs: int, steps: int) -> int:
         """Pairs of the generation that follows one of so many pairs and control steps; 0: as the algorithm says."""
         if self.interactions is None:

@@ -2,7 +2,7 @@
 
     sweep.json                 what is varied, the seeds, and each setting's configuration
     SETTING-sSEED/             a run's folder each
-    table.csv, figure.svg      what came out
+    table.csv, .parquet, figure.svg      what came out
 
 Seeds may be added to a sweep later; nothing else of it may change.
 """

@@ -17,9 +17,11 @@ from farm.moments import merged, normaliser
 from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.work import Jobs
+from farm.tasks.base import Task
 from learner import config as configs
 from learner.algorithms import Algorithm, SearchState
 from learner.checkpoint import BestRollout, Checkpoint
+from learner.config import RunConfig
 from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, Evaluation, Nominal, evaluation_jobs
 from learner.run_folder import RunFolder
 from learner.scheduler.dispatcher import Dispatcher
@@ -72,8 +74,7 @@ class Learner:
     @property
     def _algorithm(self) -> Algorithm[Any]:
         """The algorithm, of as many pairs as this generation has."""
-        own: Any = self.config.algorithm_config
-        return replace(own, pairs=self._at.pairs) if self._at.pairs else own
+        return self.config.algorithm_of(self._at.pairs)
 
     @property
     def over(self) -> bool:
@@ -100,7 +101,7 @@ class Learner:
             rollouts = len(eps) * len(self._signs)  # the jobs behind them are the mean policy's, and perhaps the best's
             returns = results.returns[:rollouts].reshape(len(eps), len(self._signs))
             before = self.state
-            told = self._learnt_from(returns, results.steps[:rollouts])
+            told = learnt_from(self.config, self.problem.task, returns, results.steps[:rollouts])
             self.state = self._algorithm.tell(before, eps, told)
             self._note(before, eps, results, told, time.monotonic() - begun, farm)
             if not self.over:
@@ -176,25 +177,12 @@ class Learner:
 
     def _explore(self, farm: Dispatcher) -> FloatArray:
         """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
-        config, state = self.config, self.state
-        eps = self._algorithm.ask(state, seeds.exploration(config.seed, state.generation))
-        drawn = None
-        if config.task_config.perturb:
-            drawn = [seeds.training(config.seed, state.generation, i) for i in range(len(eps))]
+        state = self.state
+        eps, exploring = explored(self.config, state, self._at.pairs)
         replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
-        exploring = Jobs.exploring(eps, self._signs, drawn)
         jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay])
         farm.begin(state.generation, state.mu, jobs, self._keep, self._normalisers())
         return eps
-
-    def _learnt_from(self, returns: FloatArray, steps: IntArray) -> FloatArray:
-        """Returns with the reward's offset, of rollouts of so many steps (S,)."""
-        config, task = self.config.task_config, self.problem.task
-        if not config.reward_offset:
-            return returns
-        weights = [task.return_scale * config.gamma**t * config.reward_offset for t in range(task.steps)]
-        offsets = np.array([0.0, *itertools.accumulate(weights)])
-        return returns + offsets[steps].reshape(returns.shape)
 
     def _normalisers(self) -> FloatArray:
         """Of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
@@ -280,6 +268,26 @@ class Learner:
         mu, sigma, seen = self.state.mu, self.state.sigma, normaliser(self._at.moments)
         self.folder.append(progress, mu, sigma, self.config.generations, seen)
         self.folder.save(self._at)
+
+
+def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[FloatArray, Jobs]:
+    """A generation's eps, (rows, P), and its exploring jobs: all that is random in it, drawn from its number."""
+    algorithm = config.algorithm_of(pairs)
+    eps = algorithm.ask(state, seeds.exploration(config.seed, state.generation))
+    drawn = None
+    if config.task_config.perturb:
+        drawn = [seeds.training(config.seed, state.generation, i) for i in range(len(eps))]
+    return eps, Jobs.exploring(eps, algorithm.signs(), drawn)
+
+
+def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:
+    """Returns (rows, signs) with the reward's offset, of rollouts of so many steps (S,)."""
+    own = config.task_config
+    if not own.reward_offset:
+        return returns
+    weights = [task.return_scale * own.gamma**t * own.reward_offset for t in range(task.steps)]
+    offsets = np.array([0.0, *itertools.accumulate(weights)])
+    return returns + offsets[steps].reshape(returns.shape)
 
 
 def _traces(traces: Mapping[int, AnyArray], returns: FloatArray, keep: str) -> dict[str, AnyArray]:

@@ -1,6 +1,7 @@
 """What the runs of a sweep gave: a row each, means over the seeds, and curves."""
 
 import csv
+import importlib.util
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +16,16 @@ from farm.tasks.loop import RETURN_FLOOR
 from learner.grid import Sweep
 from learner.run_folder import RunFolder, replace_text
 
-COLUMNS: Final = (
-    "seed", "state", "generations", "rollouts", "first_mean_policy_return", "mean_policy_return",
-    "mean_policy_success", "robust_success_rate", "robust_return", "seconds", "parameters_sha256",
-)  # fmt: skip
-"""Of table.csv, behind what is varied; names of summary.json, and the return of the mean policy before learning."""
+COLUMNS: Final = {
+    "seed": "int", "state": "text", "generations": "int", "rollouts": "int", "first_mean_policy_return": "number",
+    "mean_policy_return": "number", "mean_policy_success": "truth", "robust_success_rate": "number",
+    "robust_return": "number", "seconds": "number", "parameters_sha256": "text",
+}  # fmt: skip
+"""Of the table, and their types, behind what is varied (text as it was given); names of summary.json, and the return
+of the mean policy before learning."""
+
+INSTALL: Final = "pip install 'rolloutfarm[parquet]' for table.parquet"
+"""What to say where pyarrow is missing."""
 
 
 def rows(sweep: Sweep) -> list[dict[str, Any]]:
@@ -51,6 +57,25 @@ def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None
     writer.writerows(table)
     with writing(path):
         replace_text(path, text.getvalue())
+
+
+def available() -> bool:
+    """Whether pyarrow is there."""
+    return importlib.util.find_spec("pyarrow") is not None
+
+
+def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
+    """Write table.parquet, typed, as a whole or not at all: a RunError says why not."""
+    import pyarrow
+    from pyarrow import parquet
+
+    kinds = {"int": pyarrow.int64(), "text": pyarrow.string(), "number": pyarrow.float64(), "truth": pyarrow.bool_()}
+    columns = {name: "text" for name in sweep.vary} | COLUMNS
+    schema = pyarrow.schema([(name, kinds[kind]) for name, kind in columns.items()])
+    aside = path.with_name(path.name + ".new")
+    with writing(path):
+        parquet.write_table(pyarrow.Table.from_pylist(list(table), schema), aside)
+        aside.replace(path)
 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:

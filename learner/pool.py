@@ -10,7 +10,7 @@ import logging
 import secrets
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -76,6 +76,7 @@ class Farm:
         if not endpoints and workers < 1:
             raise ConfigError(f"workers is {workers}; expected 1 or more, or connect to a farm that has some")
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
+        self._holder: int | None = None  # the thread whose call it is
         with ExitStack() as stack:
             link = stack.enter_context(connected(self._place, self._closed.is_set))
             name = f"pool-{secrets.token_hex(4)}"
@@ -105,47 +106,55 @@ class Farm:
           ConfigError: thetas or seeds are not what they should be; nothing was sent.
           RunError: an evaluation failed wherever it was tried, or the pool is closed.
         """
-        returns = np.empty(len(thetas))
-        for index, value in self.imap(thetas, seeds):
-            returns[index] = value
-        return returns
-
-    def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
-        """As `map`, but pairs (index, return) as they come; a later one of an index takes an earlier one's place."""
         theta = self._parameters(thetas)
         drawn = self._seeds(seeds, len(theta))
         if not len(theta):
-            return
-        jobs = Jobs.exploring(theta, (1,), drawn)
-        with self._taken:
+            return np.empty(0)
+        with self._turn():
+            self._begin(Jobs.exploring(theta, (1,), drawn))
+            return self._farm.collect().returns.copy()
+
+    def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
+        """As `map`, but pairs (index, return) as they come; a later one of an index takes an earlier one's place.
+
+        The call is over when its last pair was taken, or by `close` of the iterator; until then others wait.
+        """
+        theta = self._parameters(thetas)
+        drawn = self._seeds(seeds, len(theta))
+        return self._as_they_come(Jobs.exploring(theta, (1,), drawn)) if len(theta) else iter(())
+
+    def _as_they_come(self, jobs: Jobs) -> Iterator[tuple[int, float]]:
+        with self._turn():
             self._begin(jobs)
-            told = np.full(len(theta), np.nan)  # a host that is expelled has its answers taken back
-            try:
-                for results in self._farm.progress():
-                    for index in np.flatnonzero(results.done & (results.returns != told)).tolist():
-                        told[index] = results.returns[index]
-                        yield index, float(told[index])
-            except Stopped:
-                raise RunError("the pool is closed") from None
+            told = np.full(len(jobs), np.nan)  # a host that is expelled has its answers taken back
+            for results in self._farm.progress():
+                for index in np.flatnonzero(results.done & (results.returns != told)).tolist():
+                    told[index] = results.returns[index]
+                    yield index, float(told[index])
+                    if self._closed.is_set():
+                        raise Stopped
 
     def rollout(self, theta: Any, seed: int | None = None) -> Trajectory:  # noqa: ANN401
         """One rollout at physics rate, with its channels, of parameters (P,)."""
         (one,) = self._parameters([theta])
         drawn = self._seeds(None if seed is None else [seed], 1)
-        with self._taken:
+        with self._turn():
             self._begin(Jobs.single(one, "physics", None if drawn is None else drawn[0]))
-            try:
-                found = self._farm.collect().trajectory(0)
-            except Stopped:
-                raise RunError("the pool is closed") from None
+            found = self._farm.collect().trajectory(0)
         assert found is not None
         return found
 
     def close(self) -> None:
-        """End the workers that were started; whoever waits gets a RunError."""
+        """End the workers that were started; whoever waits gets a RunError. Closing twice does no harm."""
         self._closed.set()
-        with self._taken:
+        mine = self._holder == threading.get_ident()  # an imap that this thread never takes to its end
+        if not mine:
+            self._taken.acquire()
+        try:
             self._stack.close()
+        finally:
+            if not mine:
+                self._taken.release()
 
     def __enter__(self) -> "Farm":
         """Itself."""
@@ -155,6 +164,24 @@ class Farm:
         """Close."""
         self.close()
 
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """One call at a time.
+
+        Raises:
+          RunError: this thread's own imap is not over, for which it would wait for ever; or the pool is closed.
+        """
+        if self._holder == threading.get_ident():
+            raise RunError("an imap of this thread is not over: take its last pair, or close() it, before another call")
+        with self._taken:
+            self._holder = threading.get_ident()
+            try:
+                yield
+            except Stopped:
+                raise RunError("the pool is closed") from None
+            finally:
+                self._holder = None
+
     def _begin(self, jobs: Jobs) -> None:
         if self._closed.is_set():
             raise RunError("the pool is closed")
@@ -162,16 +189,18 @@ class Farm:
         self._farm.begin(self._round, np.zeros(self.size), jobs)
 
     def _parameters(self, thetas: Any) -> FloatArray:  # noqa: ANN401
+        expected = f"expected numbers of shape (B, {self.size})"
         try:
-            theta = np.ascontiguousarray(thetas, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigError(
-                f"thetas is a {type(thetas).__name__}; expected numbers of shape (B, {self.size})"
-            ) from None
-        if not theta.size and len(theta) == 0:
+            given = np.asarray(thetas)
+        except (TypeError, ValueError, RuntimeError):  # such as rows of different lengths, or a tensor with a gradient
+            raise ConfigError(f"thetas is a {type(thetas).__name__} that makes no array; {expected}") from None
+        if given.shape == (0,):
             return np.empty((0, self.size))
-        if theta.ndim != 2 or theta.shape[1] != self.size:
-            raise ConfigError(f"thetas has shape {theta.shape}; expected (B, {self.size})")
+        if given.dtype.kind not in "biuf":  # text or complex numbers would be turned into others
+            raise ConfigError(f"thetas is a {type(thetas).__name__} of {given.dtype.name}; {expected}")
+        theta = np.ascontiguousarray(given, dtype=np.float64)
+        if given.ndim != 2 or given.shape[1] != self.size:
+            raise ConfigError(f"thetas has shape {given.shape}; expected (B, {self.size})")
         if not np.isfinite(theta).all():
             row = int(np.flatnonzero(~np.isfinite(theta).all(axis=1))[0])
             raise ConfigError(f"thetas[{row}] is not finite; expected finite numbers")
@@ -185,7 +214,10 @@ class Farm:
     def _seeds(self, seeds: Iterable[int] | None, count: int) -> list[tuple[int, ...]] | None:
         if seeds is None:
             return None
-        words = list(seeds)
+        try:
+            words = list(seeds)
+        except TypeError:
+            raise ConfigError(f"seeds is a {type(seeds).__name__}; expected {count} whole numbers") from None
         if len(words) != count:
             raise ConfigError(f"there are {len(words)} seeds; expected {count}, one for each row of thetas")
         for word in words:

@@ -7,7 +7,7 @@ print(policy.rollout().trajectory.success)
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,7 @@ from farm.rollouts import Runner, build_task
 from farm.sim.trajectory import Trajectory
 from farm.tasks.loop import Rollouts, Seed, whole
 from learner import checkpoint as checkpoints
+from learner.checkpoint import Checkpoint
 from learner.config import RunConfig
 from learner.run_folder import RunFolder
 from learner.setup import Problem, problem, start
@@ -60,8 +61,13 @@ class LoadedPolicy:
     def rollout(self, theta: FloatArray | None = None, seed: Seed = None) -> Replay:
         """One rollout of it, or of other parameters (P,), from the start that a seed gives (None: nominal)."""
         chosen = self.mu if theta is None else theta
-        rollouts = self.runner.rollouts(chosen[None], [seed], physics=True)
-        return Replay(self.runner.trajectory(rollouts, 0), whole(rollouts, 0), rollouts)
+        return self.rollouts(chosen[None], [seed])[0]
+
+    def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
+        """Rollouts of parameters (B, P), from the starts that their seeds give."""
+        found = self.runner.rollouts(theta, list(seeds), physics=True)
+        rows = range(len(theta))
+        return [Replay(self.runner.trajectory(found, i), whole(found, i), found.at(slice(i, i + 1))) for i in rows]
 
 
 def load(path: str | Path, generation: int | None = None, **changed: Any) -> LoadedPolicy:  # noqa: ANN401
@@ -91,7 +97,16 @@ def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -
     chosen = last if generation is None else generation
     seen = normaliser(at.moments)
     mu, seen = (at.state["mu"], seen) if chosen == last else _earlier(folder, config, chosen, seen)
-    files = at.files
+    return LoadedPolicy(seeing(restored(folder, at, task), seen), chosen, mu)
+
+
+def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
+    """What a run searches for, from its checkpoint, with settings of the task as a whole; None for the run's own.
+
+    Raises:
+      ConfigError: it cannot be simulated like that.
+    """
+    config, files = folder.read_config(), at.files
     if task is not None and task != config.task_config:
         files = _files(config, replace(config, task_config=task), at.files)
         config = replace(config, task_config=task)
@@ -101,9 +116,12 @@ def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -
             "%s: the code of its %s has changed since the run began; these are numbers of today's",
             folder.path, " and ".join(changed),
         )  # fmt: skip
-    if seen.size:
-        found = replace(found, policy=Normalised(found.policy, seen))
-    return LoadedPolicy(found, chosen, mu)
+    return found
+
+
+def seeing(found: Problem, seen: FloatArray) -> Problem:
+    """The problem with the policy's observations normalised by (2, d); as it is where d is 0."""
+    return replace(found, policy=Normalised(found.policy, seen)) if seen.size else found
 
 
 def _files(old: RunConfig, new: RunConfig, kept: Mapping[str, str]) -> dict[str, str]:

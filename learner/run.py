@@ -12,7 +12,7 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,10 +24,12 @@ from farm.net import keys, session
 from farm.net.session import LISTEN, Session, free_endpoint
 from farm.net.tls import Bundle
 from farm.processes import Pool
+from learner import config as configs
 from learner.algorithms import Diverged
 from learner.config import RunConfig
 from learner.evaluation import Evaluation
 from learner.learner import Learner
+from learner.loggers.base import Loggers
 from learner.run_folder import RunFolder
 from learner.scheduler.dispatcher import Dispatcher, Stopped
 from learner.scheduler.membership import Admission
@@ -70,6 +72,8 @@ class Placement:
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
     """Stream live at this host and port."""
+    log: tuple[str, ...] = ()
+    """Loggers, by name."""
     scheduler: SchedulerConfig = field(default_factory=SchedulerConfig)
     """How jobs are cut into chunks, and when they are given out again."""
 
@@ -84,6 +88,7 @@ class Run:
     recording: "RunRecording | None"
     pool: Pool | None
     """The local workers."""
+    loggers: Loggers
     summary: dict[str, Any] = field(default_factory=dict)
     """What summary.json says, once it is over."""
 
@@ -109,6 +114,7 @@ class Run:
                 self.publisher.generation(report)
                 if self.recording:
                     self.recording.generation(report)
+                self.loggers.generation(report.progress)
                 yield report
             evaluation = self.learner.evaluate(self.farm)
             if self.recording:
@@ -131,6 +137,7 @@ class Run:
         self.summary = self.learner.summary(state, workers, evaluation)
         log.info("%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s", self.summary)
         try:
+            self.loggers.end(self.summary)
             self.learner.folder.write_summary(self.summary)
         except OSError as error:
             if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
@@ -140,14 +147,16 @@ class Run:
                 self.publisher.end(self.summary, evaluation, self.learner.best_generation)
 
 
-def learn(config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False) -> Iterator[Report]:
-    """Learn with local workers; the folder must not exist yet.
+def learn(
+    config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False, log: Sequence[str] = ()
+) -> Iterator[Report]:
+    """Learn with local workers; the folder must not exist yet. `log` are loggers by name, such as "tensorboard".
 
     Raises:
       ConfigError: the folder exists, or a setting makes no sense.
       RunError: the run failed.
     """
-    place = Placement(workers=workers, listen=free_endpoint(), record=record)
+    place = Placement(workers=workers, listen=free_endpoint(), record=record, log=tuple(log))
     with open_run(config, Path(folder), place) as run:
         yield from run.learn()
 
@@ -185,6 +194,8 @@ def open_run(
             learner = Learner(problem, folder, at)
             recording = _recording(place, learner, stack)
             stack.enter_context(_log_file(folder))
+            loggers = Loggers(place.log, path, configs.to_dict(config), at.state["generation"])
+            stack.callback(loggers.end, {})  # where nothing was learnt
         except (ConfigError, OSError) as error:
             if not resume:
                 folder.discard()
@@ -194,7 +205,7 @@ def open_run(
         canary = Admission(learner.canary, mixed=place.mixed)
         farm, pool = dispatch(stack, link, place, problem, folder.name, canary, config.generations, stopped)
         publisher = stack.enter_context(closing(Publisher(link, place.farm, farm.incarnation, learner)))
-        yield Run(learner, farm, publisher, recording, pool)
+        yield Run(learner, farm, publisher, recording, pool, loggers)
 
 
 def dispatch(
@@ -313,6 +324,7 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     recording = RunRecording(
         learner.folder.recording if place.record else None, replay=learner.folder.path / "replay.rrd", run=learner.run,
         config=learner.config, drawing=Drawing.of(learner.problem), done=learner.state.generation, serve=place.serve,
+        folder=learner.folder.path,
     )  # fmt: skip
     stack.callback(recording.finish)
     return recording

@@ -42,6 +42,9 @@ DOORS = {
     "onnx": ("learner/onnx.py",),
     "cmaes": ("learner/algorithms/cma.py",),
     "PIL": ("farm/sim/video.py", "learner/commands/check.py"),
+    "tensorboardX": ("learner/loggers/tensorboard.py",),
+    "wandb": ("learner/loggers/wandb.py",),
+    "pyarrow": ("learner/outcomes.py",),
     "imageio_ffmpeg": ("farm/sim/video.py",),
 }
 """The only modules that may import a package from outside."""

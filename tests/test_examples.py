@@ -1,4 +1,7 @@
+import ast
+import importlib.util
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,13 +41,39 @@ def test_random_actions_play_episodes(tmp_path: Path) -> None:
     assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())
 
 
-def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path) -> None:
-    pytest.importorskip("cmaes")
-    command = [sys.executable, LEARN.parent / "cma_es.py"]
+@pytest.mark.slow
+def test_curves_in_tensorboard(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboardX")
+    command = [sys.executable, LEARN.parent / "log_tensorboard.py"]
     said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
-    returns = [float(line.rpartition(" ")[2]) for line in said.splitlines()]
-    assert len(returns) == 10
-    assert returns[-1] > max(returns[0], -1.0), "standing still returns -5.4"
+    assert said == "logged 30 generations: tensorboard --logdir runs/logged\n"
+    assert list((tmp_path / "runs/logged/tensorboard").glob("events.*"))
+
+
+SEARCHES = {
+    "cma_es": "cmaes", "pycma": "cma", "nevergrad_search": "nevergrad", "optuna_search": "optuna",
+    "evotorch_search": "evotorch", "differential_evolution": "scipy",
+}  # fmt: skip
+"""Examples of other packages' searches on a pool of workers, and the package that each needs."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "cma_es" else pytest.mark.slow) for n in SEARCHES])
+def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str) -> None:
+    if importlib.util.find_spec(SEARCHES[name]) is None:
+        pytest.skip(f"{SEARCHES[name]} is not installed")
+    command = [sys.executable, LEARN.parent / f"{name}.py"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    returns = [float(value) for value in re.findall(r"return (-?[0-9.]+)", said)]
+    assert len(returns) == {"optuna_search": 5, "differential_evolution": 1}.get(name, 10)
+    assert returns[-1] > -1.0, "standing still returns -5.4"
+    assert returns[-1] >= returns[0]
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_takes_ten_lines(name: str) -> None:
+    (main,) = [node for node in ast.parse((LEARN.parent / f"{name}.py").read_text()).body if isinstance(node, ast.If)]
+    statements = [node for node in ast.walk(main) if isinstance(node, ast.stmt) and node is not main]
+    assert len(statements) <= 10
 
 
 _SCRIPT = """

@@ -56,6 +56,7 @@ def test_the_page_shows_the_file_that_new_task_writes() -> None:
 
 def test_every_section_has_its_example() -> None:
     wanted = {"A policy": "linear.py", "An algorithm": "elite.py", "A backend": "threads.py", "A channel": "swing.py"}
+    wanted["A logger"] = "lines.py"
     for section, name in wanted.items():
         assert list(files(section)) == [name]
         assert commands(section, "run")
@@ -96,6 +97,16 @@ def test_a_policy_an_algorithm_a_backend_and_a_channel(tmp_path: Path) -> None:
 
     entities = read(tmp_path / "runs/swing/run.rrd")
     assert {"/energy", "/world/torque", "/traces/best"} <= set(entities)
+
+
+@pytest.mark.slow
+def test_a_logger(tmp_path: Path) -> None:
+    write(tmp_path, TASK, "A logger")
+    [words] = commands("A logger", "run")
+    farm(tmp_path, *words, "--no-record", "--pairs", "2")
+    lines = [json.loads(line) for line in (tmp_path / "runs/all.jsonl").read_text().splitlines()]
+    assert [(line["run"], line["generation"]) for line in lines] == [("logged", 1.0), ("logged", 2.0)]
+    assert list((tmp_path / "runs/logged/tensorboard").iterdir())
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg; an extra, and the only door to both."""
 
 import importlib.util
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
@@ -43,6 +44,15 @@ def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:
     count = max(1, round(span / speed * FRAMES))
     shown = np.linspace(0, len(times) - 1, count + 1).round().astype(int).tolist()
     return [*shown, *[len(times) - 1] * round(rest * FRAMES)]
+
+
+def tiled(pictures: Sequence[Picture]) -> Picture:
+    """Pictures of one size in a grid that is as wide as high or one wider, row by row; what is left over is white."""
+    wide = math.ceil(math.sqrt(len(pictures)))
+    white = [np.full_like(pictures[0], 255)] * (-len(pictures) % wide)
+    cells = [*pictures, *white]
+    rows = [np.concatenate(cells[i : i + wide], axis=1) for i in range(0, len(cells), wide)]
+    return np.concatenate(rows)
 
 
 def write(path: Path, pictures: Iterable[Picture]) -> None:

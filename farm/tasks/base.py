@@ -126,6 +126,8 @@ class Task:
     """Sizes of the observation's parts where they differ in kind; empty: it is one."""
     ends: tuple[str, str] | None = None
     """Names of where rollouts begin and of where they should end; with `reached` and `lost` they can be chained."""
+    ending: ClassVar[str] = "ended"
+    """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` where it is "dropped"."""
     takes: ClassVar[str] = ""
     """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
 

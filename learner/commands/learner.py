@@ -41,7 +41,8 @@ def learn(
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up("WARNING" if chosen.quiet and chosen.log_level == "INFO" else chosen.log_level)
     place = replace(
-        place, connect=chosen.connect, farm=chosen.farm, record=chosen.record, listen=chosen.listen or place.listen,
+        place, connect=chosen.connect, farm=chosen.farm, record=chosen.record, log=chosen.log,
+        listen=chosen.listen or place.listen,
         trusted=chosen.trust_network, mixed=chosen.mixed, scheduler=SchedulerConfig(audit=chosen.audit),
         tls=None if chosen.tls is None else find(chosen.tls, "learner"),
         serve=None if chosen.serve is None else options.address(chosen.serve),

@@ -34,6 +34,8 @@ class LearnerOptions:
     """Name of the run and its folder; without one: task-preset-sSEED-UTC time."""
     record: bool = True
     """Record the run with Rerun."""
+    log: tuple[str, ...] = ()
+    """Log the run with tensorboard, wandb or a logger of your own (FILE.py:CLASS) as well, repeatable."""
     serve: str | None = None
     """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
     listen: str | None = None

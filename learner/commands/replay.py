@@ -1,85 +1,196 @@
-"""`farm replay`: any policy that a run stored again, at physics rate, into a recording and a video."""
+"""`farm replay`: any policy that a run stored again, or any rollout of it, into a recording and a video."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
-from farm import settings
+from farm import plugins, settings
+from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
-from farm.errors import writing
+from farm.errors import ConfigError, RunError, writing
 from farm.settings import Settings, setting
-from farm.tasks.base import TaskConfig
+from farm.tasks.base import Task, TaskConfig
 from learner.commands import recordings
+from learner.config import RunConfig
 from learner.run_folder import RunFolder
 
 if TYPE_CHECKING:
+    from farm.sim.rendering import Picture
     from learner.replay import LoadedPolicy, Replay
+    from learner.rewind import Rewound
+
+MOST: Final = 12
+"""Rollouts side by side, at most: more would be too small to see."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayCommand(Settings):
-    """Any policy of a run again, at physics rate, into a recording; its task may have other settings."""
+    """Any policy or rollout of a run again, at physics rate; its task may have other settings."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: Path | None = None
     """Recording to write; None: rollout.rrd in the run's folder."""
     generation: int | None = setting(None, least=0)
-    """Generation whose mean policy is shown, 0 for the first; None: the last."""
+    """Generation whose mean policy is shown, 0 for the first, or whose rollouts are; None: the last."""
+    rollout: tuple[int, ...] = ()
+    """Show this exploring rollout of the generation, from 0 on; repeatable."""
+    best: int | None = setting(None, least=1, most=MOST)
+    """Show so many exploring rollouts of the generation, those of the highest returns, side by side."""
+    worst: int | None = setting(None, least=1, most=MOST)
+    """Show so many of the lowest returns."""
     video: Path | None = None
     """Video to write as well: a name that ends in .gif or .mp4."""
     speed: float = setting(0.25, least=0.01, most=10)
     """Speed of the video: 1 is real time."""
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task, the run's own unless given."""
+    ended: int | None = None
+    """Show so many rollouts that the task ended; the flag has the task's own word for it, see `_command`."""
+
+    @property
+    def rewinds(self) -> bool:
+        """Whether exploring rollouts are shown, not the mean policy."""
+        return bool(self.rollout) or any((self.best, self.worst, self.ended))
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
-    own = task_of(words)
-    default = ReplayCommand(run=tyro.MISSING, task=own or TaskConfig())
-    command = settings.parse(ReplayCommand, words, "farm replay", default)
+    config = config_of(words)
+    own, kind = (config.task_config, plugins.find("tasks", config.task).target) if config else (TaskConfig(), Task)
+    settings_class = _command(kind.ending)
+    default = settings_class(run=tyro.MISSING, task=own)
+    command = settings.parse(settings_class, words, "farm replay", default)
+    logs.set_up("WARNING")
     from farm.sim import video
-    from learner.replay import loaded
     from learner.run import check_rerun
 
     check_rerun()
-    from learner.recording.drawing import Drawing
-    from learner.recording.replay import record_replay
-    from learner.recording.run import markdown
-
     if command.video is not None:
         video.check(command.video)
     folder = RunFolder.open(command.run)
     path = recordings.target(command.to or folder.path / "rollout.rrd")
-    policy = loaded(folder, command.generation, command.task)
-    shown = policy.rollout()
-    changed = differing(own or command.task, command.task)
-    name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
-    with writing(path):
-        record_replay(
-            path, run=folder.name, drawing=Drawing.of(policy.problem), config=markdown(policy.problem.config),
-            rollouts=[(name, shown.trajectory)],
-        )  # fmt: skip
-    success = {True: ", it succeeds", False: ", it does not succeed", None: ""}[shown.trajectory.success]
-    say(f"return {shown.trajectory.value:.3f}{success}", f"written to {path}; look at it with: farm view {path}")
+    changed = differing(own, command.task)
+    if command.rewinds:
+        policy, shown = _rollouts(command, folder, path, kind.ending, changed)
+    else:
+        policy, shown = _mean(command, folder, path, changed)
+    say(f"written to {path}; look at it with: farm view {path}")
     if command.video is not None:
         _film(policy, shown, command.video, command.speed)
         say(f"video: {command.video}")
     return 0
 
 
-def task_of(words: Sequence[str]) -> TaskConfig | None:
-    """The task's settings of the run that the words name, so that its flags are known; None where they name none."""
+def _command(ending: str) -> type[ReplayCommand]:
+    """The command, whose flag for rollouts that ended is called as the task calls them."""
+    about = f"Show so many exploring rollouts of the generation that {_were(ending)}, the first ones."
+    named = Annotated[int | None, tyro.conf.arg(name=ending, help=about)]
+    return make_dataclass(
+        "ReplayCommand", [("ended", named, setting(None, least=1, most=MOST))], bases=(ReplayCommand,), frozen=True,
+        kw_only=True, namespace={"__doc__": ReplayCommand.__doc__},
+    )  # fmt: skip
+
+
+def _were(ending: str) -> str:
+    return "the task ended" if ending == Task.ending else ending
+
+
+def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -> tuple["LoadedPolicy", list["Replay"]]:
+    """Show a mean policy."""
+    from learner.replay import loaded
+
+    policy = loaded(folder, command.generation, command.task)
+    shown = policy.rollout()
+    name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
+    _record_one(folder, path, policy, name, shown)
+    say(f"return {shown.trajectory.value:.3f}{_succeeds(shown)}")
+    return policy, [shown]
+
+
+def _succeeds(shown: "Replay") -> str:
+    return {True: ", it succeeds", False: ", it does not succeed", None: ""}[shown.trajectory.success]
+
+
+def _rollouts(
+    command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
+) -> tuple["LoadedPolicy", list["Replay"]]:
+    """Show exploring rollouts of a generation: one by itself, several side by side."""
+    from learner.recording.comparison import Shown, record_side_by_side
+    from learner.recording.drawing import Drawing
+    from learner.rewind import rewound, under
+
+    found = rewound(folder, command.generation)
+    policy = under(folder, found, command.task) if changed else found.policy  # chosen by what the run itself saw
+    chosen = _chosen(command, found, ending)
+    shown = found.again(chosen, policy)
+    names = [f"rollout {index}" for index in chosen]
+    lines = [f"return {each.trajectory.value:.3f}{_succeeds(each)}" for each in shown]
+    title = f"generation {found.generation}" + (f", {changed}" if changed else "")
+    if len(shown) == 1:
+        _record_one(folder, path, policy, f"{names[0]} of {title}", shown[0])
+    else:
+        drawing = Drawing.of(policy.problem)
+        rows = [f"| {name} | {line} |" for name, line in zip(names, lines, strict=True)]
+        again = f"`farm replay {command.run} --generation {found.generation} --rollout I`"
+        table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
+        side = [Shown(name, drawing, (), each.trajectory) for name, each in zip(names, shown, strict=True)]
+        with writing(path):
+            record_side_by_side(path, folder.name, side, table)
+    say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
+    return policy, shown
+
+
+def _chosen(command: ReplayCommand, found: "Rewound", ending: str) -> list[int]:
+    """Which rollouts: those that are named, the best, the worst, those that ended; each once, at most MOST.
+
+    Raises:
+      ConfigError: too many are wanted.
+      RunError: none ended.
+    """
+    ended = found.ended(command.ended or 0)
+    if command.ended and not ended:
+        raise RunError(
+            f"no rollout of generation {found.generation} {ending if ending != Task.ending else 'was ended'}"
+        )
+    if command.ended and len(ended) < command.ended:
+        say(f"{len(ended)} of the {len(found.returns)} rollouts of generation {found.generation} {_were(ending)}")
+    wanted = [*command.rollout, *found.best(command.best or 0), *found.worst(command.worst or 0), *ended]
+    chosen = list(dict.fromkeys(wanted))
+    if len(chosen) > MOST:
+        raise ConfigError(f"{len(chosen)} rollouts are wanted; at most {MOST} are shown side by side")
+    return chosen
+
+
+def _record_one(folder: RunFolder, path: Path, policy: "LoadedPolicy", name: str, shown: "Replay") -> None:
+    from learner.recording.drawing import Drawing
+    from learner.recording.replay import record_replay
+    from learner.recording.run import markdown
+
+    with writing(path):
+        record_replay(
+            path, run=folder.name, drawing=Drawing.of(policy.problem), config=markdown(policy.problem.config),
+            rollouts=[(name, shown.trajectory)],
+        )  # fmt: skip
+
+
+def config_of(words: Sequence[str]) -> RunConfig | None:
+    """The configuration of the run that the words name, so that its task's flags are known; None without one."""
     for word in words:
         if not word.startswith("-") and (Path(word) / "config.json").is_file():
-            return RunFolder(Path(word)).read_config().task_config
+            return RunFolder(Path(word)).read_config()
     return None
+
+
+def task_of(words: Sequence[str]) -> TaskConfig | None:
+    """The task's settings of that run."""
+    config = config_of(words)
+    return config.task_config if config else None
 
 
 def differing(own: TaskConfig, chosen: TaskConfig) -> str:
@@ -88,15 +199,25 @@ def differing(own: TaskConfig, chosen: TaskConfig) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {getattr(chosen, name)}" for name in names)
 
 
-def _film(policy: "LoadedPolicy", shown: "Replay", path: Path, speed: float) -> None:
+def _film(policy: "LoadedPolicy", shown: Sequence["Replay"], path: Path, speed: float) -> None:
+    """A video of rollouts side by side; one that ended early rests at its end."""
+    from farm.sim import video
+
+    longest = max(shown, key=lambda each: len(each.trajectory.times))
+    chosen = video.moments(longest.trajectory.times.tolist(), speed, rest=1.0)
+    drawn = [list(_pictures(policy, each, chosen)) for each in shown]
+    video.write(path, [video.tiled(together) for together in zip(*drawn, strict=True)])
+
+
+def _pictures(policy: "LoadedPolicy", shown: "Replay", moments: Sequence[int]) -> Iterator["Picture"]:
     from farm.sim import rendering, video
 
-    chosen = video.moments(shown.trajectory.times.tolist(), speed, rest=1.0)
-    moments = sorted(set(chosen))
+    last = len(shown.trajectory.times) - 1
+    unique = sorted({min(moment, last) for moment in moments})
     task, values = policy.problem.task, shown.trajectory.channels
     pictures = rendering.pictures(
-        task.model, shown.frames["qpos"][moments], video.SIZE, camera=task.camera, channels=task.channels,
-        values={name: each[moments] for name, each in values.items()},
+        task.model, shown.frames["qpos"][unique], video.SIZE, camera=task.camera, channels=task.channels,
+        values={name: each[unique] for name, each in values.items()},
     )  # fmt: skip
-    drawn = dict(zip(moments, pictures, strict=True))
-    video.write(path, [drawn[moment] for moment in chosen])
+    drawn = dict(zip(unique, pictures, strict=True))
+    return (drawn[min(moment, last)] for moment in moments)

@@ -1,5 +1,7 @@
 """`farm runs`: a table of the runs in a folder."""
 
+import csv
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,16 +25,28 @@ class RunsCommand:
     """Folder that holds run folders."""
     json: bool = False
     """Print JSON instead of a table."""
+    csv: bool = False
+    """Print CSV instead of a table: a column for each name in summary.json."""
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(RunsCommand, words, "farm runs")
+    if command.json and command.csv:
+        raise ConfigError("--json and --csv exclude each other")
     if not command.dir.is_dir():
         raise ConfigError(f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}")
     rows = [_row(RunFolder(path.parent)) for path in sorted(command.dir.glob("*/config.json"))]
     if command.json:
         say(json.dumps(rows, indent=2))
+        return 0
+    if command.csv:
+        text = io.StringIO()
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        say(*text.getvalue().splitlines())
         return 0
     table = compact()
     for name in ("run", "state", "done", "return", "success", "robust", "hash"):

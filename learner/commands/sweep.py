@@ -32,7 +32,7 @@ class SweepCommand:
     seeds: str = "0-4"
     """Seeds of every setting: A-B or A,B,C."""
     out: Path = Path("sweeps/sweep")
-    """Folder of the sweep: its runs, table.csv, figure.svg."""
+    """Folder of the sweep: its runs, table.csv, table.parquet, figure.svg."""
     preset: str | None = None
     """Settings to begin with, by name (farm tasks NAME lists a task's); None: the task's first."""
     config: Path | None = None
@@ -63,6 +63,8 @@ def main(words: Sequence[str]) -> int:
             complete = sweep.run(chosen.runs, command.sharing, shown, stop.is_set)
         table = outcomes.rows(chosen)
         outcomes.write_csv(chosen.path / "table.csv", chosen, table)
+        if outcomes.available():
+            outcomes.write_parquet(chosen.path / "table.parquet", chosen, table)
         if stop.is_set():
             say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command goes on with them")
             return INTERRUPTED
@@ -133,6 +135,8 @@ def _print(chosen: Sweep, table: Sequence[dict[str, Any]]) -> None:
         shown.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")
     wide().print(shown)
     say(f"mean ± standard deviation over seeds; untrained: the mean policy before learning; {chosen.path}/table.csv")
+    if not outcomes.available():
+        say(f"no table.parquet: {outcomes.INSTALL}")
 
 
 def _spread(found: tuple[float, float] | None, *, percent: bool) -> str:

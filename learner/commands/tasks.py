@@ -16,12 +16,18 @@ from farm.policies.base import Policy
 from farm.tasks.base import Task
 from learner import config as configs
 
-_KINDS = {"tasks": "--task", "policies": "--policy", "algorithms": "--algorithm", "backends": "--backend"}
+_KINDS = {
+    "tasks": "--task",
+    "policies": "--policy",
+    "algorithms": "--algorithm",
+    "backends": "--backend",
+    "loggers": "--log",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TasksCommand:
-    """Lists tasks, policies, algorithms and backends; with a name, its settings and presets."""
+    """Lists tasks, policies, algorithms, backends and loggers; with a name, its settings and presets."""
 
     name: tyro.conf.Positional[str] = ""
     """One of them, or FILE.py:CLASS; without: all."""
@@ -66,9 +72,9 @@ def _plugin(kind: str, name: str) -> plugins.Plugin:
 def described(name: str) -> str:
     """Where a plug-in is from, its presets and settings; a ConfigError where nothing has this name."""
     kind = _kind(name)
-    plugin = plugins.find(kind, name) if kind == "backends" else _plugin(kind, name)
+    plugin = _plugin(kind, name)
     lines = [f"{_KINDS[kind]} {plugin.wire}, {plugin.origin}", _doc(plugin), ""]
-    if kind == "backends":
+    if kind in ("backends", "loggers"):
         return "\n".join(lines)
     if kind == "tasks":
         for preset, values in configs.presets(plugin.name).items():

@@ -53,7 +53,8 @@ def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
     traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
     parts = [part for part, there in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if there]
     left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
-    tabs = rrb.Tabs(_learning(success=spec.success), _rollout(spec, spec.steps * spec.period), _config())
+    again = rrb.TextDocumentView(origin="/again", name="Again")
+    tabs = rrb.Tabs(_learning(success=spec.success), _rollout(spec, spec.steps * spec.period), again, _config())
     return _blueprint(_beside(left, _PICTURES, tabs, 0.45), "generation", "following")
 
 
@@ -67,18 +68,23 @@ def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
     return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), "sim_time", "playing")
 
 
-def comparison(roots: Sequence[str], eye: Eye, compared: Channel | None, *, success: bool) -> rrb.Blueprint:
-    """Layout of several runs, each below its root; `compared` are scalars that all have, drawn label by label."""
+def comparison(
+    roots: Sequence[str], eye: Eye, compared: Channel | None, *, success: bool, learning: bool
+) -> rrb.Blueprint:
+    """Layout of several runs, each below its root; `compared` are scalars that all have, drawn label by label.
+
+    Without `learning` they are rollouts, which have no learning curves.
+    """
     drawn = [f"+ {root}/{part}" for root in roots for part in ("world/**", "label")]
-    scenes = _scene("Final policies: play the timeline sim_time", eye, "/", drawn)
+    scenes = _scene("Final policies: play the timeline sim_time" if learning else "Rollouts", eye, "/", drawn)
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))  # also after a change of the timeline
-    left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs")]
+    left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs" if learning else "Rollouts")]
 
     def plot(name: str, entity: str, legend: rrb.Corner2D | None = None) -> rrb.View:
         return _plot(name, *(f"{root}/{entity}" for root in roots), legend=legend, axis_x=whole)
 
-    learning = rrb.Vertical(
+    whole_run = rrb.Vertical(
         plot("Return of the mean policy", "return", legend=rrb.Corner2D.RightBottom),
         plot("Return of the exploring rollouts, mean ± std", "band"),
         rrb.Horizontal(
@@ -96,8 +102,10 @@ def comparison(roots: Sequence[str], eye: Eye, compared: Channel | None, *, succ
         ]
     )
     reward = plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom)
-    tabs = rrb.Tabs(learning, _stacked([reward, *curves], [], "Rollout (sim_time)"))
-    return _blueprint(_beside(left, 1.0, tabs, 0.5), "generation", "following")
+    rollout = _stacked([reward, *curves], [], "Rollout (sim_time)")
+    if not learning:
+        return _blueprint(_beside(left, _PICTURES, rollout, 0.6), "sim_time", "playing")
+    return _blueprint(_beside(left, 1.0, rrb.Tabs(whole_run, rollout), 0.5), "generation", "following")
 
 
 def _blueprint(root: rrb.Container, timeline: str, play: Literal["following", "playing"]) -> rrb.Blueprint:

@@ -1,12 +1,13 @@
-"""Several runs in one recording: learning curves over each other, scenes side by side.
+"""Several runs, or rollouts of one, in one recording: scenes side by side, curves over each other.
 
     /runs/<name>                 where its scene stands (static)
     /runs/<name>/world/...       the final policy's rollout, as in a run's own recording
-    /runs/<name>/return, /band, /success, /sigma     learning curves
+    /runs/<name>/return, /band, /success, /sigma     learning curves (of runs)
     /runs/<name>/reward, /<channel>/<label>          of the rollout
 
 Of the channels, the first one of scalars is drawn, where all runs have it. Curves stand on the timelines `generation`
-and `rollouts`, rollouts on `sim_time`; on the first two the scenes stay as they are at the rollouts' ends.
+and `rollouts`, rollouts on `sim_time`; on the first two the scenes stay as they are at the rollouts' ends. Rollouts of
+one run stand below `/rollouts` in the same way.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,7 +26,7 @@ from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.channels import entities
-from learner.recording.curves import PALETTE, Colour, lines
+from learner.recording.curves import PALETTE, Colour, lines, palette
 from learner.recording.drawing import Drawing
 from learner.recording.rows import begin, flush, log_static, markdown, times
 
@@ -33,6 +34,7 @@ COLOURS: Final = PALETTE
 """One a run."""
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a layout of its own, which never becomes that of a run
+_BESIDE: Final = "rolloutfarm rollouts"
 _VIEW: Final = (160.0, -15.0)  # azimuth and elevation [deg]: robots that walk along x come towards the eye
 _SPACING: Final = 1.35  # in radii of the largest scene
 _WIDER: Final = 0.55  # so much farther away is the eye for each further scene, in spacings
@@ -40,7 +42,7 @@ _WIDER: Final = 0.55  # so much farther away is the eye for each further scene, 
 
 @dataclass(frozen=True)
 class Shown:
-    """A run and its final policy's rollout."""
+    """A run and its final policy's rollout; or any rollout under a name of its own."""
 
     name: str
     drawing: Drawing
@@ -54,20 +56,36 @@ def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
     Raises:
       OSError: the file cannot be written.
     """
+    _record(path, "comparison", "/runs", runs, table)
+
+
+def record_side_by_side(path: Path, run: str, rollouts: Sequence[Shown], table: str) -> None:
+    """Write a run's rollouts with a table of them (Markdown); `progress` is not looked at.
+
+    Raises:
+      OSError: the file cannot be written.
+    """
+    _record(path, f"{run}-replay", "/rollouts", rollouts, table, learning=False)
+
+
+def _record(
+    path: Path, recording: str, above: str, runs: Sequence[Shown], table: str, *, learning: bool = True
+) -> None:
     path.touch()  # fails with an errno; Rerun's own error has none
-    roots = [f"/runs/{rr.escape_entity_path_part(run.name)}" for run in runs]
+    roots = [f"{above}/{rr.escape_entity_path_part(run.name)}" for run in runs]
     step, eye = _arrangement(runs)
     compared = _compared(runs)
     success = any(run.drawing.spec.success for run in runs)
-    layout = blueprint.comparison(roots, eye, compared, success=success)
-    stream = begin("comparison", [rr.FileSink(path)], layout, _APPLICATION)
+    layout = blueprint.comparison(roots, eye, compared, success=success, learning=learning)
+    stream = begin(recording, [rr.FileSink(path)], layout, _APPLICATION if learning else _BESIDE)
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log("/table", markdown(table), static=True)
-    for number, (root, run, colour) in enumerate(zip(roots, runs, COLOURS, strict=False)):
+    for number, (root, run, colour) in enumerate(zip(roots, runs, palette(len(runs)), strict=True)):
         world = [(root + entity, value) for entity, value in run.drawing.static() if entity.startswith("/world/")]
-        names = [(root + entity, value) for entity, value in _names(run, colour, compared)]
+        names = [(root + entity, value) for entity, value in _names(run, colour, compared, learning=learning)]
         log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
-        _send_curves(stream, root, run.progress)
+        if learning:
+            _send_curves(stream, root, run.progress)
         _send_rollout(stream, root, run, compared)
     flush(stream)
     stream.disconnect()
@@ -93,15 +111,17 @@ def _compared(runs: Sequence[Shown]) -> Channel | None:
     return first if first and all((first.name, first.kind, first.names) in names for names in known) else None
 
 
-def _names(run: Shown, colour: Colour, compared: Channel | None) -> Iterator[tuple[str, Any]]:
+def _names(run: Shown, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:
     """What never changes but the scene: names and the run's colour."""
     size = run.drawing.scene.radius
     above = Eye.of(run.drawing.scene, run.drawing.camera).target + (0.0, 0.0, size)
     point = rr.Points3D([above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True)
     yield "/label", point
-    yield "/return", lines((run.name,), (colour,), width=2.5)
-    yield "/band", rr.Measurements.from_fields(names=f"{run.name}, exploring ± std", colors=[colour], widths=[1.0])
-    for entity in ("/success", "/sigma", "/reward", *(() if compared is None else entities(compared))):
+    if learning:
+        yield "/return", lines((run.name,), (colour,), width=2.5)
+        yield "/band", rr.Measurements.from_fields(names=f"{run.name}, exploring ± std", colors=[colour], widths=[1.0])
+    curves = ("/success", "/sigma") if learning else ()
+    for entity in (*curves, "/reward", *(() if compared is None else entities(compared))):
         yield entity, lines((run.name,), (colour,))
 
 

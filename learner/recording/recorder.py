@@ -15,7 +15,7 @@ import logging
 import shutil
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -60,6 +60,7 @@ class Recorder:
         serve: tuple[str, int] | None = None,
         done: int = 0,
         properties: Mapping[str, object] | None = None,
+        again: Callable[[GenerationStats], str] | None = None,
     ) -> None:
         """Open the file, its next part where it is there already, and the server.
 
@@ -71,6 +72,7 @@ class Recorder:
           serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
           properties: what tells the run from others.
+          again: how a generation is seen again, Markdown.
 
         Raises:
           ConfigError: neither path nor address, or the address is taken.
@@ -83,7 +85,7 @@ class Recorder:
         self._last = time.time() - self._horizon
         self._held: list[_Held] = []
         self._broken = False
-        self._drawing = drawing
+        self._drawing, self._again = drawing, again
         self.replay = partial(record_replay, run=run, drawing=drawing, config=config)
         """Records named rollouts into a file of their own."""
         if scene.left_out:
@@ -130,6 +132,8 @@ class Recorder:
         at = self._at(now)
         for entity, values in curves.statistics(stats, rate):
             self._stream.send_columns(entity, at, row(values))
+        if self._again is not None:
+            self._stream.send_columns("/again", at, row(markdown(self._again(stats))))
         for name, values in traces.items():
             self._stream.send_columns(f"/traces/{name}", at, row(self._trace(name, values)))
         if sample is not None:

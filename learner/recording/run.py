@@ -4,11 +4,14 @@ import contextlib
 import json
 import logging
 import queue
+import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
+from farm import plugins
 from farm.arrays import AnyArray
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
@@ -120,18 +123,22 @@ class RunRecording(logging.Handler):
         drawing: Drawing,
         done: int,
         serve: tuple[str, int] | None,
+        folder: Path | None = None,
     ) -> None:
         """Open the file and, if wanted, the server; see `Recorder`. `replay` is of the recording at physics rate.
+
+        `folder` is the run's own, which commands in the recording's text name; None where it is on another machine.
 
         Raises:
           ConfigError: the address is taken, or the file cannot be written.
         """
         super().__init__(logging.INFO)
-        self._replay = replay
+        self._replay, ending = replay, plugins.find("tasks", config.task).target.ending
         with writing(path, ConfigError):
             self._recorder = Recorder(
                 path, run=run, drawing=drawing, config=markdown(config), serve=serve, done=done,
                 properties=configs.properties(config),
+                again=partial(again, shlex.quote(str(folder or "RUN")), ending),
             )  # fmt: skip
         self.uri = self._recorder.uri
         self.thread = RecorderThread(self._recorder)
@@ -186,3 +193,17 @@ class RunRecording(logging.Handler):
 def markdown(config: RunConfig) -> str:
     """A configuration as the recording shows it."""
     return f"```json\n{json.dumps(configs.to_dict(config), indent=2)}\n```"
+
+
+def again(folder: str, ending: str, stats: GenerationStats) -> str:
+    """The commands that show a generation again, Markdown; `ending` is the task's word for what it ended.
+
+    What is in view is the mean that was explored around: that of the generation before.
+    """
+    replay = f"farm replay {folder} --generation"
+    chosen = ["--best 5", "--worst 5", *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else [])]
+    side = "\n".join(f"{replay} {stats.generation} {which}" for which in chosen)
+    return (
+        f"### Generation {stats.generation} again\n\nThe rollout in view, at physics rate:\n\n"
+        f"```\n{replay} {stats.generation - 1}\n```\n\nExploring rollouts, side by side:\n\n```\n{side}\n```"
+    )

@@ -143,6 +143,9 @@ class Dispatcher:
           traces: which traces of the exploring rollouts are wanted, one of TRACES.
           normaliser: of the observations, as a RoundHeader has it, (2, 2, d).
         """
+        if self._round is not None:  # who said between two rounds that it has nothing to do does not mean this one
+            for event in self._session.events.waiting(0.0):
+                self._take(event)
         self._header = RoundHeader(
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
             generation=generation, spec=self._header.spec, traces=traces, mu=mu, normaliser=normaliser,
@@ -171,7 +174,8 @@ class Dispatcher:
         while not self._over():
             for event in self._events():
                 self._take(event)
-            self._issue()
+            if not self._scheduler.complete:
+                self._issue()
             self._tell_when_alone()
             self._tell_status()
             if self._stopped():

@@ -5,6 +5,7 @@ import ctypes.util
 import importlib.metadata
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -114,7 +115,65 @@ def test_a_replay_says_what_it_shows(done: Farm, tmp_path: Path) -> None:
     assert "mean policy after generation 2, friction 0.5" in batch.column(name).to_pylist()[0][0]
 
 
+# ---------------------------------------------------------------- rewind
+
+
+def texts(path: Path, entity: str) -> list[str]:
+    found = []
+    for batch in read(path)[entity]:
+        (name,) = [n for n in batch.schema.names if n.endswith(":text")]
+        found += [text for (text,) in batch.column(name).to_pylist()]
+    return found
+
+
+def test_rollouts_side_by_side(done: Farm, tmp_path: Path) -> None:
+    path = tmp_path / "again.rrd"
+    line = done.progress("a")[1]
+    said = done.call("replay", "runs/a", "--generation", "2", "--worst", "2", "--best", "1", "--to", str(path))
+    first, second, third, written = said.splitlines()
+    assert f"return {line['return_max']:.3f}" in first
+    assert f"return {line['return_min']:.3f}" in second
+    assert written == f"written to {path}; look at it with: farm view {path}"
+    (table,) = texts(path, "/table")
+    for shown in (first, second, third):
+        title, name, result = re.fullmatch(r"(generation 2), (rollout \d): (return .*)", shown).groups()  # type: ignore[union-attr]
+        assert f"### {title} of a" in table
+        assert f"| {name} | {result} |" in table
+        assert f"/rollouts/{name.replace(' ', chr(92) + ' ')}/world/object" in read(path)
+    assert "`farm replay runs/a --generation 2 --rollout I`" in table
+
+
+def test_one_rollout_and_those_that_the_task_ended(
+    done: Farm, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run = tmp_path / "again.rrd", str(folder(done).path)
+    assert main(["replay", run, "--rollout", "3", "--to", str(path)]) == 0
+    assert texts(path, "/rollout")[0].startswith(f"### rollout 3 of generation {GENERATIONS}\n\nreturn ")
+    dropped = [line["ended"] for line in done.progress("a")]
+    generation = str(1 + int(np.argmax(dropped)))
+    status = main(["replay", run, "--generation", generation, "--dropped", "3", "--to", str(path)])
+    said = capsys.readouterr()
+    assert status == int(not any(dropped))
+    assert said.out.count(f"generation {generation}, rollout") == min(3, max(dropped))
+    assert (f"no rollout of generation {generation} dropped" in said.err) == (status == 1)
+
+
+def test_the_recording_offers_the_commands(done: Farm) -> None:
+    offered = texts(folder(done).recording, "/again")
+    assert len(offered) == GENERATIONS
+    assert "farm replay runs/a --generation 0\n" in offered[0]
+    assert "farm replay runs/a --generation 1 --best 5\nfarm replay runs/a --generation 1 --worst 5" in offered[0]
+    for line, text in zip(done.progress("a"), offered, strict=True):
+        assert ("--dropped" in text) == bool(line["ended"])
+
+
 # ---------------------------------------------------------------- video
+
+
+def test_pictures_in_a_grid() -> None:
+    assert [video.tiled([np.zeros((3, 4, 3), np.uint8)] * n).shape[:2] for n in (1, 2, 5)] == [(3, 4), (3, 8), (6, 12)]
+    assert video.tiled([np.zeros((3, 4, 3), np.uint8)] * 5)[-1, -1].tolist() == [255] * 3
+
 
 needs_drawing = pytest.mark.skipif(
     not any(ctypes.util.find_library(name) for name in ("OSMesa", "EGL")),
@@ -414,6 +473,9 @@ def test_play_needs_a_display(done: Farm, monkeypatch: pytest.MonkeyPatch) -> No
 
 MISTAKES = [
     (("replay", "runs/a", "--generation", "99"), 2, "generation 99 is not stored"),
+    (("replay", "runs/a", "--generation", "0", "--best", "1"), 2, "generation 0 of the run in runs/a has no rollouts"),
+    (("replay", "runs/a", "--rollout", "8"), 2, "generation 6 has no rollout 8: there are 0 to 7"),
+    (("replay", "runs/a", "--worst", "13"), 2, "worst is 13; expected 1 to 12"),
     (("replay", "runs/a", "--generation", "-1"), 2, "generation is -1; expected 0 or more"),
     (("replay", "runs/a", "--object", "cat"), 2, "unknown object 'cat'; known are bar"),
     (("replay", "runs/a", "--friction", "0"), 2, "friction is 0.0; expected a positive number"),

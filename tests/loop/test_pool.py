@@ -1,18 +1,26 @@
 """A pool of workers for search methods of one's own: real processes over loopback."""
 
 import os
+import queue
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import farm
 from farm.arrays import FloatArray
+from farm.commands import certificates
 from farm.net.session import free_endpoint, listen
+from farm.net.tls import find
 from learner.config import configure
+from learner.run import Placement, open_run
+from learner.scheduler import dispatcher
 from learner.setup import problem
 from workers.worker import WorkerConfig, work
 
@@ -57,6 +65,31 @@ def test_a_worker_that_is_killed_changes_nothing(pool: farm.Farm, thetas: FloatA
     assert sorted(found) == list(enumerate(alone.tolist()))
 
 
+@pytest.mark.slow
+def test_two_of_three_workers_that_are_killed_change_nothing(thetas: FloatArray, alone: FloatArray) -> None:
+    with farm.Farm("finger-gait", policy="linear", workers=3) as pool:
+        assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
+        many = np.tile(thetas, (6, 1))
+        results = pool.imap(many, seeds=np.tile(np.arange(COUNT), 6))
+        found = dict([next(results)])
+        for pid in pool.worker_pids[:2]:
+            os.kill(pid, signal.SIGKILL)
+        found |= dict(results)
+        assert [found[i] for i in range(len(many))] == np.tile(alone, 6).tolist()
+
+
+def test_an_imap_that_is_left_stands_in_nobodys_way(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
+    for index, value in pool.imap(thetas, seeds=range(COUNT)):
+        assert value == alone[index]
+        break  # what is out is void
+    results = pool.imap(thetas, seeds=range(COUNT))
+    next(results)
+    with pytest.raises(farm.RunError, match=r"an imap of this thread is not over: take its last pair, or close\(\)"):
+        pool.map(thetas)
+    results.close()  # type: ignore[attr-defined]
+    assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
+
+
 def test_a_rollout_shows_its_channels(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
     shown = pool.rollout(thetas[3], seed=3)
     assert shown.value == alone[3]
@@ -90,7 +123,11 @@ def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: Fl
     [
         ([1.0], None, r"thetas has shape \(1,\); expected \(B, 72\)"),
         (np.zeros((2, 3)), None, r"thetas has shape \(2, 3\); expected \(B, 72\)"),
-        ([["a"] * 72], None, r"thetas is a list; expected numbers of shape \(B, 72\)"),
+        ([["a"] * 72], None, r"thetas is a list of str32; expected numbers of shape \(B, 72\)"),
+        (np.zeros((2, 72), complex), None, "thetas is a ndarray of complex128; expected numbers"),
+        ([[0.0] * 72, [0.0]], None, "thetas is a list that makes no array; expected numbers"),
+        (None, None, "thetas is a NoneType of object; expected numbers"),
+        (np.zeros((2, 72)), 3, "seeds is a int; expected 2 whole numbers"),
         (np.full((2, 72), np.nan), None, r"thetas\[0\] is not finite"),
         (np.zeros((2, 72)), [1], "there are 1 seeds; expected 2"),
         (np.zeros((1, 72)), [-1], "seed '-1'; expected a whole number from 0"),
@@ -99,8 +136,10 @@ def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: Fl
     ],
 )
 def test_arrays_that_do_not_fit(pool: farm.Farm, thetas: object, seeds: object, said: str) -> None:
-    with pytest.raises(farm.ConfigError, match=said):
-        pool.map(thetas, seeds)  # type: ignore[arg-type]
+    for call in (pool.map, pool.imap):
+        with pytest.raises(farm.ConfigError, match=said) as error:
+            call(thetas, seeds)  # type: ignore[arg-type]
+        assert "\n" not in str(error.value)
 
 
 def test_no_workers_at_all() -> None:
@@ -126,3 +165,110 @@ def test_closing_ends_whoever_waits(thetas: FloatArray) -> None:
     assert ended.is_set()
     with pytest.raises(farm.RunError, match="the pool is closed"):
         pool.map(thetas)
+
+
+def test_it_closes_with_an_imap_that_is_not_over(thetas: FloatArray) -> None:
+    with farm.Farm("finger-gait", policy="linear", workers=1) as pool:
+        results = pool.imap(thetas)
+        next(results)
+        (pid,) = pool.worker_pids
+    assert not Path(f"/proc/{pid}").exists()
+    pool.close()
+    with pytest.raises(farm.RunError, match="the pool is closed"):
+        list(results)
+
+
+def test_it_waits_and_says_so_while_no_worker_is_there(
+    thetas: FloatArray, alone: FloatArray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatcher, "_PATIENCE", 0.1)
+    endpoint, stop, said = free_endpoint(), threading.Event(), queue.Queue[str]()
+    worker = threading.Thread(target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set))
+    monkeypatch.setattr(dispatcher.log, "warning", lambda text, *values: said.put(text % values))
+    with listen(endpoint, "farm"), farm.Farm("finger-gait", policy="linear", connect=endpoint) as pool:
+        with ThreadPoolExecutor(1) as thread:
+            waits = thread.submit(pool.map, thetas, range(COUNT))
+            assert said.get(timeout=30) == f"no workers; start some with: farm worker --connect {endpoint}"
+            assert not waits.done()
+            worker.start()
+            try:
+                assert waits.result(60).tobytes() == alone.tobytes()
+            finally:
+                stop.set()
+                worker.join(30)
+
+
+def test_with_certificates(thetas: FloatArray, alone: FloatArray, tmp_path: Path) -> None:
+    certificates.main(["new", str(tmp_path), "--learner", "127.0.0.1", "--worker", "w"])
+    endpoint, stop = free_endpoint().replace("tcp/", "tls/"), threading.Event()
+    config = WorkerConfig(connect=(endpoint,), tls=tmp_path / "worker-w")
+    worker = threading.Thread(target=work, args=(config, stop.is_set))
+    with listen(endpoint, "farm", find(tmp_path, "learner")):
+        worker.start()
+        try:
+            with farm.Farm("finger-gait", policy="linear", connect=endpoint, tls=tmp_path / "learner") as joined:
+                assert joined.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
+        finally:
+            stop.set()
+            worker.join(30)
+
+
+_INTERRUPTED = """
+import sys
+import numpy as np
+import farm
+
+with farm.Farm("finger-gait", policy="linear", workers=2) as pool:
+    try:
+        while True:
+            pool.map(np.zeros((50, 72)))
+            print(*pool.worker_pids, flush=True)
+    except KeyboardInterrupt:
+        print(pool.map(np.zeros((1, 72))), flush=True)
+        raise
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_call_and_the_workers() -> None:
+    script = subprocess.Popen(
+        [sys.executable, "-c", _INTERRUPTED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert script.stdout
+    pids = script.stdout.readline().split()
+    script.send_signal(signal.SIGINT)
+    said, errors = script.communicate(timeout=60)
+    assert script.returncode == -signal.SIGINT
+    assert said.splitlines()[-1].startswith("["), "after Ctrl-C the pool is usable"
+    assert errors.splitlines()[-1] == "KeyboardInterrupt"
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+@pytest.mark.slow
+def test_standing_workers_serve_it_beside_a_learner(thetas: FloatArray, alone: FloatArray, tmp_path: Path) -> None:
+    endpoint, stop = free_endpoint(), threading.Event()
+    worker = threading.Thread(target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set))
+    config = configure("finger-gait", generations=10_000)
+    place = Placement(connect=(endpoint,), record=False)
+    with listen(endpoint, "farm"), open_run(config, tmp_path / "r", place, stopped=stop.is_set) as run:
+        done = [0]
+
+        def learn() -> None:
+            for report in run.learn():
+                done[0] = report.progress.rollouts
+
+        learner = threading.Thread(target=learn)
+        worker.start()
+        learner.start()
+        try:
+            with farm.Farm("finger-gait", policy="linear", connect=endpoint) as pool:
+                pool.map(thetas)
+                before = done[0]
+                for _ in range(10):
+                    assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
+                theirs = done[0] - before
+        finally:
+            stop.set()
+            learner.join(60)
+            worker.join(30)
+    assert COUNT < theirs < 40 * COUNT, "each has had its share of the worker"

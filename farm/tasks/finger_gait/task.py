@@ -185,6 +185,7 @@ class FingerGait(Task):
     Config = FingerGaitConfig
     steps = 15
     substeps = SUBSTEPS
+    ending = "dropped"
     camera = Camera(lookat=(0.035, 0.014, 0.01), distance=0.34, azimuth=150.0, elevation=-14.0)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {

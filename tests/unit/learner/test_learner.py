@@ -7,17 +7,17 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from alone import POLE, Alone
 
 import farm
 from farm import plugins
 from farm.errors import CheckpointError, ConfigError, RunError
 from farm.moments import normaliser
-from farm.net.work import NOT_NORMALISED, Jobs, Results
+from farm.net.work import Jobs
 from farm.policies.normalised import Normalised
 from farm.rollouts import served
 from learner import checkpoint as checkpoints
@@ -26,81 +26,7 @@ from learner.config import RunConfig, configure
 from learner.learner import REPLAY_EVERY, Learner
 from learner.replay import load
 from learner.run_folder import RunFolder
-from learner.scheduler.round import RoundResults
 from learner.telemetry.report import Report
-
-POLE = """
-from dataclasses import dataclass
-from typing import ClassVar
-import numpy as np
-import farm
-
-MODEL = '''<mujoco><option timestep="0.02"/><worldbody><body><joint name="j" axis="0 1 0" damping="0.1"/>
-  <geom size="0.1" mass="MASS"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
-
-class Pole(farm.Task):
-    presets: ClassVar = {"default": {"features": 3, "pairs": 4, "generations": 3}}
-    steps = 4
-    channels = (farm.Channel(name="angle", kind="scalars", shape=(1,), trace=True),)
-
-    @dataclass(frozen=True, kw_only=True)
-    class Config(farm.TaskConfig):
-        mass: float = farm.setting(1.0, above=0.0)
-
-    def files(self):
-        return {"model.xml": MODEL, "note": "read by nobody"}
-
-    def mjcf(self):
-        return self.sources["model.xml"].replace("MASS", str(self.config.mass))
-
-    def reset(self, sim, row, rng):
-        sim.qpos[row, 0] = 0.2 if rng is None else rng.uniform(-0.3, 0.3)
-
-    def reward(self, sim, action):
-        return -np.abs(sim.qpos[:, 0])
-
-    def success(self, sim):
-        return sim.qpos[:, 0] > -9.0
-
-    def measure(self, sim):
-        return {"angle": sim.qpos}
-"""
-
-
-class Alone:
-    """In the dispatcher's place: does a round's jobs here and now, some of them at a time, in any order."""
-
-    def __init__(self, found: setup.Problem, seed: int = 0) -> None:
-        self.admission, self.workers, self.reissued = SimpleNamespace(canary="c"), ("w/1",), 0
-        self.problem, self._runner, self._rng = found, found.runner(), np.random.default_rng(seed)
-        self.rounds: list[tuple[int, Jobs, str]] = []
-        self.normalisers: list[np.ndarray] = []
-
-    def begin(
-        self,
-        generation: int,
-        mu: np.ndarray,
-        jobs: Jobs,
-        traces: str = "none",
-        normaliser: np.ndarray = NOT_NORMALISED,
-    ) -> None:
-        self.rounds.append((generation, jobs, traces))
-        self.normalisers.append(normaliser)
-        shapes = self.problem.spec.shapes(len(self.problem.scene.bodies))
-        self._round = RoundResults(jobs, traces, self.problem.spec.trace, shapes, normaliser.shape[-1])
-        for some in np.array_split(self._rng.permutation(len(jobs)), 3):
-            part = jobs.take(sorted(some.tolist()))
-            given = self._runner.run(mu, part, traces, normaliser)
-            said = Results.carrying(given, part, run="r", incarnation="i", round=0, worker="w/1")
-            place = self._round.place(said)
-            assert place is not None
-            self._round.put(said, place, np.ones(len(part), bool))
-
-    def collect(self) -> RoundResults:
-        return self._round
-
-    def report(self, progress: object) -> None:
-        pass
 
 
 @pytest.fixture

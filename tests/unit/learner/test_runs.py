@@ -1,5 +1,6 @@
 """`farm runs`: one run with damaged files costs its own row, not the table."""
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -63,3 +64,15 @@ def test_a_value_is_missing(runs: Path, missing: str, capsys: pytest.CaptureFixt
 def test_names_are_shown_as_they_are(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     damage(runs, json.dumps({**GOOD, "run": "[red]a\x1b[2J", "state": "\u202e"}))
     assert table(runs, capsys)[0].split()[:2] == ["[red]a\\x1b[2J", "\\u202e"]
+
+
+def test_csv_has_a_column_for_each_name_in_a_summary(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (runs / "a" / "summary.json").unlink()
+    (runs / "z" / "summary.json").write_text(json.dumps({**GOOD, "run": 'a "z", indeed', "steps": 7}))
+    assert main(["runs", str(runs), "--csv"]) == 0
+    first, good, last = csv.DictReader(capsys.readouterr().out.splitlines())
+    assert (first["state"], first["mean_policy_return"], first["steps"]) == ("running or killed", "", "")
+    assert {name: good[name] for name in GOOD} == {name: str(value) for name, value in GOOD.items()}
+    assert (last["run"], last["steps"]) == ('a "z", indeed', "7")
+    assert main(["runs", str(runs), "--csv", "--json"]) == 2
+    assert "--json and --csv exclude each other" in capsys.readouterr().err

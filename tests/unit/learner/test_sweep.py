@@ -196,6 +196,9 @@ def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path
     ]  # fmt: skip
     assert (read[0]["generations"], read[0]["rollouts"], read[0]["seconds"]) == ("2", "60", "4.0")
     assert (read[0]["first_mean_policy_return"], read[2]["mean_policy_return"]) == ("-5.0", "")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    outcomes.write_parquet(tmp_path / "table.parquet", sweep, table)
+    assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == table, "typed, and None where nothing is known"
     assert outcomes.spread(table[:2], "mean_policy_return") == (-2.0, 1.0)
     assert outcomes.spread(table[2:], "mean_policy_return") is None
 

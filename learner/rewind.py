@@ -1,0 +1,195 @@
+"""A generation's exploring rollouts again, from their seeds: nothing of them was stored.
+
+import farm
+
+again = farm.rewind("runs/first", 12)
+print(again.returns, again.rollout(again.worst(1)[0]).trajectory.success)
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from farm import seeds as streams
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+from farm.moments import merged, normaliser
+from farm.tasks.loop import Rollouts, Seed
+from learner import checkpoint as checkpoints
+from learner.algorithms import SearchState
+from learner.checkpoint import Checkpoint
+from learner.learner import explored, learnt_from
+from learner.replay import LoadedPolicy, Replay, restored, seeing
+from learner.run_folder import RunFolder
+from learner.setup import start
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Rewound:
+    """The exploring rollouts of a generation, simulated again at control rate; S of them, in the run's order."""
+
+    policy: LoadedPolicy
+    """The mean that was explored around, under the run's own settings."""
+    seen: FloatArray
+    """Mean and standard deviation that its observations were normalised by, (2, d) or (2, 0)"""
+    generation: int
+    """Counted from 1, as the lines of progress.jsonl are: its rollouts led to update number `generation`."""
+    theta: FloatArray
+    """Parameters of each, (S, P)"""
+    seeds: Sequence[Seed]
+    """Of each one's start and conditions; None: nominal"""
+    rollouts: Rollouts
+    """What came out"""
+
+    @property
+    def returns(self) -> FloatArray:
+        """Of each, (S,): to the last bit those that the run learnt from, before the reward's offset."""
+        return self.rollouts.returns
+
+    def best(self, count: int) -> list[int]:
+        """The rollouts of the highest returns, the highest first; of equal ones the first."""
+        return np.argsort(-self.returns, kind="stable")[:count].tolist()
+
+    def worst(self, count: int) -> list[int]:
+        """The rollouts of the lowest returns, the lowest first; of equal ones the first."""
+        return np.argsort(self.returns, kind="stable")[:count].tolist()
+
+    def ended(self, count: int) -> list[int]:
+        """The first rollouts that the task ended before their last step, such as by a drop."""
+        return np.flatnonzero(self.rollouts.ended)[:count].tolist()
+
+    def again(self, chosen: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
+        """Some of them at physics rate; with a policy that was loaded with other settings of the task, under those.
+
+        Raises:
+          ConfigError: there is no such rollout.
+        """
+        for index in chosen:
+            if not 0 <= index < len(self.theta):
+                last = len(self.theta) - 1
+                raise ConfigError(f"generation {self.generation} has no rollout {index}: there are 0 to {last}")
+        rows = list(chosen)
+        return (policy or self.policy).rollouts(self.theta[rows], [self.seeds[i] for i in rows])
+
+    def rollout(self, index: int) -> Replay:
+        """One of them at physics rate; a ConfigError where there is none."""
+        return self.again([index])[0]
+
+
+def rewind(path: str | Path, generation: int | None = None) -> Rewound:
+    """The exploring rollouts of a generation (None: the last) of the run in a folder.
+
+    Raises:
+      ConfigError: the run has no such generation behind it.
+    """
+    return rewound(RunFolder.open(Path(path)), generation)
+
+
+def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
+    """The same of a folder that is open.
+
+    The state before the generation is made of mu and sigma in `parameters` where `ask` looks at nothing else; for
+    other algorithms, and where that generation is not stored, the run is learnt again up to there.
+
+    Raises:
+      ConfigError: the run has no such generation behind it.
+    """
+    config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
+    last = int(at.state["generation"])
+    chosen = last if generation is None else generation
+    if not 1 <= chosen <= last:
+        behind = f"it has generations 1 to {last} behind it" if last else "it has no generation behind it"
+        raise ConfigError(f"generation {chosen} of the run in {folder.path} has no rollouts: {behind}")
+    state, seen = _before(folder, at, chosen)
+    policy = LoadedPolicy(seeing(restored(folder, at), seen), chosen - 1, state.mu)
+    jobs = explored(config, state, _pairs(folder, chosen))[1]
+    theta, seeds = jobs.theta(state.mu), jobs.seeds()
+    found = Rewound(policy, seen, chosen, theta, seeds, policy.runner.rollouts(theta, seeds))
+    _compare(folder, found)
+    return found
+
+
+def under(folder: RunFolder, found: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
+    """The policy of a generation that was found again, with other settings of its task; a ConfigError if not so."""
+    problem = restored(folder, checkpoints.load(folder.checkpoint), task)
+    return LoadedPolicy(seeing(problem, found.seen), found.policy.generation, found.policy.mu)
+
+
+def _before(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[SearchState, FloatArray]:
+    """The algorithm's state when a generation was drawn, and the normaliser of its observations."""
+    config, before = folder.read_config(), generation - 1
+    algorithm: Any = config.algorithm_config
+    fresh = algorithm.init(len(at.state["mu"]))
+    if before == 0 and config.init_from is None:
+        return fresh, normaliser(np.zeros_like(at.moments))
+    if before and _draws_alike(algorithm, fresh, algorithm.restore(at.state)):
+        rows = folder.parameters()
+        if before in rows["generation"]:
+            mu, seen = folder.mean(before)
+            sigma = rows["sigma"][rows["generation"] == before][0]
+            return replace(fresh, mu=mu, sigma=sigma, generation=before), seen
+    return _learnt_again(folder, at, before)
+
+
+def _pairs(folder: RunFolder, generation: int) -> int:
+    """Pairs of a generation whose number followed from the one before; 0: as the algorithm's settings say."""
+    config = folder.read_config()
+    if config.interactions is None:
+        return 0
+    rollouts = {line.generation: line.rollouts for line in folder.progress()} | {0: 0}
+    if not {generation - 1, generation} <= rollouts.keys():
+        raise ConfigError(f"{folder.path}: progress.jsonl does not say how many pairs generation {generation} had")
+    signs = len(config.algorithm_config.signs())
+    rows = (rollouts[generation] - rollouts[generation - 1]) // signs
+    least: int = config.algorithm_config.pairs  # type: ignore[attr-defined]
+    return rows * least // len(explored(config, config.algorithm_config.init(1))[0])
+
+
+def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:  # noqa: ANN401
+    """Whether `ask` draws the same without what the state has besides mu and sigma, such as a covariance."""
+    bare = replace(fresh, mu=last.mu, sigma=last.sigma, generation=last.generation)
+    with_all, without = (algorithm.ask(state, streams.exploration(0, 0)) for state in (last, bare))
+    return with_all.tobytes() == without.tobytes()
+
+
+def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[SearchState, FloatArray]:
+    """The run once more in this process, up to so many updates: slow, but of any algorithm, and to the same bits."""
+    config = folder.read_config()
+    algorithm: Any = config.algorithm_config
+    first = start(config, folder.name)[1]
+    state, moments = algorithm.restore(first.state), first.moments
+    pairs = 0
+    if until:
+        log.warning(
+            "what %s knew before generation %d is not stored: learning up to there", config.algorithm, until + 1
+        )
+    problem = restored(folder, at)
+    runner = problem.runner()
+    while state.generation < until:
+        eps, jobs = explored(config, state, pairs)
+        found = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
+        told = learnt_from(config, problem.task, found.returns.reshape(len(eps), -1), found.steps)
+        state, moments = config.algorithm_of(pairs).tell(state, eps, told), merged(moments, found.moments)
+        pairs = config.pairs_after(pairs, int(found.steps.sum()))
+    runner.close()
+    return state, normaliser(moments)
+
+
+def _compare(folder: RunFolder, found: Rewound) -> None:
+    """Say so where the returns are not the run's: its line of progress.jsonl knows their mean, extremes and spread."""
+    values = found.returns
+    for line in folder.progress():
+        if line.generation == found.generation:
+            stored = (line.return_mean, line.return_min, line.return_max, line.return_std)
+            if stored != (float(values.mean()), float(values.min()), float(values.max()), float(values.std())):
+                log.warning(
+                    "%s: these are not the rollouts of generation %d to the last bit, whose mean return was %.6g and "
+                    "is %.6g here: its code or the run it began from has changed, or this processor rounds differently",
+                    folder.path, found.generation, line.return_mean, values.mean(),
+                )  # fmt: skip
