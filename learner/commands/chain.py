@@ -119,5 +119,5 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.video is not None:
         qpos = loop.whole(shown.rollouts, 0)["qpos"]
-        recordings.film(shown.task, trajectory, qpos, command.video, command.speed)
+        recordings.film(shown.task, [(trajectory, qpos)], command.video, command.speed)
         say(f"video: {command.video}")

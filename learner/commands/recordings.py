@@ -1,6 +1,7 @@
 """What several commands say of recordings: how to look on, which files they are, where one may be written."""
 
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -9,6 +10,7 @@ from farm.arrays import FloatArray
 from farm.errors import ConfigError
 
 if TYPE_CHECKING:
+    from farm.sim.rendering import Picture
     from farm.sim.trajectory import Trajectory
     from farm.tasks.base import Task
 
@@ -57,15 +59,24 @@ def target(path: Path) -> Path:
     return path
 
 
-def film(task: "Task", shown: "Trajectory", qpos: FloatArray, path: Path, speed: float) -> None:
-    """Write a video of a rollout whose frames had positions qpos (F, nq)."""
+def film(task: "Task", shown: "Sequence[tuple[Trajectory, FloatArray]]", path: Path, speed: float) -> None:
+    """Write a video of rollouts side by side, each with its positions qpos (F, nq); one that ended early rests."""
+    from farm.sim import video
+
+    longest = max((rollout for rollout, _ in shown), key=lambda each: len(each.times))
+    chosen = video.moments(longest.times.tolist(), speed, rest=1.0)
+    drawn = [_pictures(task, rollout, qpos, chosen) for rollout, qpos in shown]
+    video.write(path, [video.tiled(together) for together in zip(*drawn, strict=True)])
+
+
+def _pictures(task: "Task", rollout: "Trajectory", qpos: FloatArray, moments: Sequence[int]) -> "list[Picture]":
     from farm.sim import rendering, video
 
-    chosen = video.moments(shown.times.tolist(), speed, rest=1.0)
-    moments = sorted(set(chosen))
+    last = len(rollout.times) - 1
+    unique = sorted({min(moment, last) for moment in moments})
     pictures = rendering.pictures(
-        task.model, qpos[moments], video.SIZE, camera=task.camera, channels=task.channels,
-        values={name: each[moments] for name, each in shown.channels.items()},
+        task.model, qpos[unique], video.SIZE, camera=task.camera, channels=task.channels,
+        values={name: each[unique] for name, each in rollout.channels.items()},
     )  # fmt: skip
-    drawn = dict(zip(moments, pictures, strict=True))
-    video.write(path, [drawn[moment] for moment in chosen])
+    drawn = dict(zip(unique, pictures, strict=True))
+    return [drawn[min(moment, last)] for moment in moments]

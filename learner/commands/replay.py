@@ -1,6 +1,6 @@
 """`farm replay`: any policy that a run stored again, or any rollout of it, into a recording and a video."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -19,7 +19,6 @@ from learner.config import RunConfig
 from learner.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from farm.sim.rendering import Picture
     from learner.replay import LoadedPolicy, Replay
     from learner.rewind import Rewound
 
@@ -82,7 +81,8 @@ def main(words: Sequence[str]) -> int:
         policy, shown = _mean(command, folder, path, changed)
     say(f"written to {path}; look at it with: farm view {path}")
     if command.video is not None:
-        _film(policy, shown, command.video, command.speed)
+        frames = [(each.trajectory, each.frames["qpos"]) for each in shown]
+        recordings.film(policy.problem.task, frames, command.video, command.speed)
         say(f"video: {command.video}")
     return 0
 
@@ -197,27 +197,3 @@ def differing(own: TaskConfig, chosen: TaskConfig) -> str:
     """Settings that were changed, as a caption says them."""
     names = [f.name for f in fields(own) if getattr(own, f.name) != getattr(chosen, f.name)]
     return ", ".join(f"{name.replace('_', ' ')} {getattr(chosen, name)}" for name in names)
-
-
-def _film(policy: "LoadedPolicy", shown: Sequence["Replay"], path: Path, speed: float) -> None:
-    """A video of rollouts side by side; one that ended early rests at its end."""
-    from farm.sim import video
-
-    longest = max(shown, key=lambda each: len(each.trajectory.times))
-    chosen = video.moments(longest.trajectory.times.tolist(), speed, rest=1.0)
-    drawn = [list(_pictures(policy, each, chosen)) for each in shown]
-    video.write(path, [video.tiled(together) for together in zip(*drawn, strict=True)])
-
-
-def _pictures(policy: "LoadedPolicy", shown: "Replay", moments: Sequence[int]) -> Iterator["Picture"]:
-    from farm.sim import rendering, video
-
-    last = len(shown.trajectory.times) - 1
-    unique = sorted({min(moment, last) for moment in moments})
-    task, values = policy.problem.task, shown.trajectory.channels
-    pictures = rendering.pictures(
-        task.model, shown.frames["qpos"][unique], video.SIZE, camera=task.camera, channels=task.channels,
-        values={name: each[unique] for name, each in values.items()},
-    )  # fmt: skip
-    drawn = dict(zip(unique, pictures, strict=True))
-    return (drawn[min(moment, last)] for moment in moments)
