@@ -23,9 +23,10 @@ class BatchEngine:
     def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
         """Make room for `size` rows; the physics runs on `threads`."""
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # what has blown up stays so
-        self.model, self.size = model, size
+        self.model, self.size, self._threads = model, size, threads
         self._batch = mujoco.batch.Batch(model, size, threads)
         self._fields: dict[str, AnyArray] = {}
+        self._data: mujoco.MjData | None = None
 
     def field(self, name: str) -> AnyArray:
         """A live array over all rows."""
@@ -71,6 +72,20 @@ class BatchEngine:
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number."""
         return failed_rows(self._batch.state[ids])
+
+    def contact_forces(self, ids: IntArray) -> FloatArray:
+        """Forces of contacts on every body of rows, (n, nbody, 6)."""
+        if self._data is None:  # each row needs an MjData of its own, which is left as the last step left it
+            self._data = mujoco.MjData(self.model)
+            self._batch = mujoco.batch.Batch(self.model, self.size, self._threads, persistent=True)
+            self._fields.clear()
+            raise Rebound
+        out = np.empty((len(ids), self.model.nbody, 6))
+        for row, sim in enumerate(ids.tolist()):
+            self._batch.get_data(sim, self._data)
+            mujoco.mj_rnePostConstraint(self.model, self._data)
+            out[row] = self._data.cfrc_ext
+        return out
 
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row."""
@@ -136,6 +151,11 @@ class DataEngine:
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return failed_rows(state[None])
+
+    def contact_forces(self, ids: IntArray) -> FloatArray:  # noqa: ARG002
+        """Forces of contacts on every body, (1, nbody, 6)."""
+        mujoco.mj_rnePostConstraint(self.model, self.data)
+        return self.data.cfrc_ext[None].copy()
 
     def expand(self, name: str) -> AnyArray:
         """A field of the model, as one row."""

@@ -56,6 +56,9 @@ class Engine(Protocol):
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number, (n,)."""
 
+    def contact_forces(self, ids: IntArray) -> FloatArray:
+        """MuJoCo's cfrc_ext of rows as their last step left it, (n, nbody, 6); may raise Rebound as `field` does."""
+
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row, live, (size, ...)."""
 
@@ -198,6 +201,13 @@ class Sim:
         self._constants()
         self._moved()
         self.engine.play(self._ids, np.broadcast_to(controls, (len(self), *controls.shape)))
+
+    def contact_forces(self) -> FloatArray:
+        """Forces of contacts on every body as the last physics step left them (MuJoCo's cfrc_ext), (B, nbody, 6)."""
+        known = self._now.get("contact_forces")
+        if known is None:
+            known = self._now["contact_forces"] = self.engine.contact_forces(self._ids)
+        return known
 
     def forward(self) -> None:
         """Compute outputs from the states as they were written."""

@@ -180,7 +180,7 @@ class Environment(Task):
     def act(self, sim: Sim, action: FloatArray) -> FloatArray:
         """Actions rescaled to the environment's bounds and rounded to its precision, (B, A)."""
         if self.batched is not None:
-            sim.own["before"] = np.array(sim.qpos)
+            sim.own["before"] = self.batched.before(sim)
         return rescaled(action, *self.limits).astype(self._first.action_space.dtype).astype(float)
 
     def reward(self, sim: Sim, action: FloatArray) -> FloatArray:  # noqa: ARG002
@@ -297,6 +297,10 @@ class EnvironmentEngine:
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Where the physics blew up, or a number is not finite."""
         return self._bad[ids]
+
+    def contact_forces(self, ids: IntArray) -> FloatArray:
+        """An environment observes them itself."""
+        raise NotImplementedError
 
     def expand(self, name: str) -> AnyArray:
         """An environment's model is its own."""

@@ -4,9 +4,6 @@ The environment itself steps one simulation at a time. Where its model is steppe
 adds to the physics. Settings are read from an environment that was made with the run's arguments. Each class does what
 the environment of its name does in release 5 (gymnasium/envs/mujoco/NAME_v5.py, Farama Foundation), in its order and
 precision: actions count in single precision. Its sines, cosines and lengths may differ in the last bit.
-
-Ant and Humanoid are not here: their contact forces are of the last stage of an integration step, which a batch does
-not give.
 """
 
 from collections.abc import Mapping
@@ -43,12 +40,16 @@ class Batched:
             return qpos, self.qvel + scale * rng.standard_normal(self.model.nv)
         return qpos, self.qvel + rng.uniform(-scale, scale, self.model.nv)
 
+    def before(self, sim: Sim) -> FloatArray:
+        """What `reward` compares with, of the moment before a control step, (B, ...)."""
+        return np.array(sim.qpos)
+
     def observe(self, sim: Sim) -> FloatArray:
         """The observation, (B, d)."""
         return np.concatenate([sim.qpos[:, self.left_out :], np.clip(sim.qvel, -self.most, self.most)], axis=1)
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
-        """The reward of the control step that just ended, from positions (B, nq) before it, (B,)."""
+        """The reward of the control step that just ended, with what `before` gave before it, (B,)."""
         forward: FloatArray = self.env._forward_reward_weight * ((sim.qpos[:, 0] - before[:, 0]) / self.env.dt)
         return forward - self.env._ctrl_cost_weight * self.effort(sim)
 
@@ -103,6 +104,99 @@ class Hopper(Walker2d):
         """Where it stands, and no other number is out of range."""
         others = np.concatenate([sim.qpos, sim.qvel], axis=1)[:, 2:]
         return super().healthy(sim) & _within(others, self.env._healthy_state_range).all(axis=1)
+
+
+class Ant(Batched):
+    """Ant-v5."""
+
+    hidden, normal = 2, True
+
+    def __init__(self, env: Any) -> None:  # noqa: ANN401
+        """Take its settings."""
+        super().__init__(env)
+        self.main = env.data.body(env._main_body).id
+
+    def before(self, sim: Sim) -> FloatArray:
+        """Where its main body is, (B, 2)."""
+        return np.array(sim.xpos[:, self.main, :2])
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """Positions, velocities, and the forces of contacts."""
+        parts = [sim.qpos[:, self.left_out :], sim.qvel]
+        if self.env._include_cfrc_ext_in_observation:
+            parts.append(self.forces(sim)[:, 1:].reshape(len(sim), -1))
+        return np.concatenate(parts, axis=1)
+
+    def forces(self, sim: Sim) -> FloatArray:
+        """Forces of contacts on the bodies within their limits, (B, nbody, 6)."""
+        return np.clip(_contact_forces(sim), *self.env._contact_force_range)
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
+        """Speed, and a bonus for standing, less the effort and the contacts."""
+        speed = (sim.xpos[:, self.main, 0] - before[:, 0]) / self.env.dt
+        gained = speed * self.env._forward_reward_weight + self.healthy(sim) * self.env._healthy_reward
+        touch = _flat(self.forces(sim))
+        return gained - (
+            self.env._ctrl_cost_weight * self.effort(sim) + self.env._contact_cost_weight * _squared(touch)
+        )
+
+    def healthy(self, sim: Sim) -> BoolArray:
+        """Where it stands, and every number is finite."""
+        low, high = self.env._healthy_z_range
+        finite = np.isfinite(sim.qpos).all(axis=1) & np.isfinite(sim.qvel).all(axis=1)
+        return finite & (low <= sim.qpos[:, 2]) & (sim.qpos[:, 2] <= high)
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where it fell."""
+        return ~self.healthy(sim) & bool(self.env._terminate_when_unhealthy)
+
+
+class Humanoid(Ant):
+    """Humanoid-v5."""
+
+    normal = False
+
+    def __init__(self, env: Any) -> None:  # noqa: ANN401
+        """Take its settings."""
+        Batched.__init__(self, env)
+
+    def before(self, sim: Sim) -> FloatArray:
+        """Where its centre of mass is, (B, 2)."""
+        return self.centre(sim)
+
+    def centre(self, sim: Sim) -> FloatArray:
+        """The mean place of its bodies by mass, (B, 2)."""
+        mass = self.model.body_mass
+        return (mass[:, None] * sim.xipos[:, :, :2]).sum(axis=1) / mass.sum()
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """Positions and velocities, the links' inertias and velocities, forces of the motors and of contacts."""
+        env, parts = self.env, [sim.qpos[:, self.left_out :], sim.qvel]
+        if env._include_cinert_in_observation is True:
+            parts.append(_flat(sim.cinert[:, 1:]))
+        if env._include_cvel_in_observation is True:
+            parts.append(_flat(sim.cvel[:, 1:]))
+        if env._include_qfrc_actuator_in_observation is True:
+            parts.append(sim.qfrc_actuator[:, 6:])
+        if env._include_cfrc_ext_in_observation is True:
+            parts.append(_flat(_contact_forces(sim)[:, 1:]))
+        return np.concatenate(parts, axis=1)
+
+    def effort(self, sim: Sim) -> FloatArray:
+        """Squared length of the controls, (B,)."""
+        return _squared(sim.ctrl)
+
+    def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
+        """Speed, and a bonus for standing, less the effort and the contacts."""
+        env = self.env
+        speed = (self.centre(sim)[:, 0] - before[:, 0]) / env.dt
+        gained = env._forward_reward_weight * speed + self.healthy(sim) * env._healthy_reward
+        touch = np.clip(env._contact_cost_weight * _squared(_flat(_contact_forces(sim))), *env._contact_cost_range)
+        return gained - (env._ctrl_cost_weight * self.effort(sim) + touch)
+
+    def healthy(self, sim: Sim) -> BoolArray:
+        """Where it stands."""
+        return _within(sim.qpos[:, 2], self.env._healthy_z_range)
 
 
 class InvertedPendulum(Batched):
@@ -201,6 +295,21 @@ def _within(values: FloatArray, limits: tuple[float, float]) -> BoolArray:
     return (low < values) & (values < high)
 
 
+def _contact_forces(sim: Sim) -> FloatArray:
+    """Forces of contacts on every body, none before the first step, (B, nbody, 6)."""
+    return np.zeros((len(sim), sim.model.nbody, 6)) if sim.t == 0 else sim.contact_forces()
+
+
+def _flat(values: FloatArray) -> FloatArray:
+    """(B, ...) -> (B, n)."""
+    return np.ascontiguousarray(values).reshape(len(values), -1)
+
+
+def _squared(values: FloatArray) -> FloatArray:
+    """(B, n) -> (B,)."""
+    return np.square(values).sum(axis=1)
+
+
 def _length(vectors: FloatArray) -> FloatArray:
     """(B, 3) -> (B,)."""
     return np.sqrt((vectors * vectors).sum(axis=1))
@@ -219,6 +328,8 @@ _CLASSES: Final[Mapping[str, type[Batched]]] = {
     "half_cheetah_v5.HalfCheetahEnv": HalfCheetah,
     "hopper_v5.HopperEnv": Hopper,
     "walker2d_v5.Walker2dEnv": Walker2d,
+    "ant_v5.AntEnv": Ant,
+    "humanoid_v5.HumanoidEnv": Humanoid,
     "inverted_pendulum_v5.InvertedPendulumEnv": InvertedPendulum,
     "inverted_double_pendulum_v5.InvertedDoublePendulumEnv": InvertedDoublePendulum,
     "reacher_v5.ReacherEnv": Reacher,

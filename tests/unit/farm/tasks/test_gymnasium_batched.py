@@ -21,6 +21,8 @@ ARGUMENTS = {
     "HalfCheetah-v5": ("exclude_current_positions_from_observation=false", "forward_reward_weight=0.5"),
     "Hopper-v5": ("terminate_when_unhealthy=false", "healthy_reward=0.7", "healthy_state_range=[-3,3]"),
     "Walker2d-v5": ("healthy_z_range=[0.9,1.4]", "healthy_angle_range=[-0.3,0.3]", "reset_noise_scale=0.05"),
+    "Ant-v5": ("contact_force_range=[-3,2]", "main_body=2", "healthy_z_range=[0.3,0.9]", "contact_cost_weight=0.01"),
+    "Humanoid-v5": ("contact_cost_weight=0.001", "include_cinert_in_observation=false", "healthy_z_range=[1.2,2]"),
     "InvertedPendulum-v5": ("reset_noise_scale=0.1",),
     "InvertedDoublePendulum-v5": ("healthy_reward=3.5", "reset_noise_scale=0.02"),
     "Reacher-v5": ("reward_dist_weight=2", "reward_control_weight=0.3"),
@@ -45,6 +47,7 @@ def test_every_step_is_the_environments(name: str, own: tuple[str, ...]) -> None
         begun = Batch(made, sim, [*STARTS, STARTS[1]])  # two begin alike
         begun.observe()
         begun.step(np.zeros((4, len(made.limits[0]))))
+        begun.observe()
         return Batch(made, sim, [*STARTS, STARTS[1]])
 
     batch = again(begin)
@@ -80,7 +83,7 @@ def test_physics_that_blows_up_is_never_good() -> None:
 
 
 def test_others_step_themselves() -> None:
-    for name, own in (("HumanoidStandup-v5", ()), ("Ant-v5", ()), ("Swimmer-v4", ())):
+    for name, own in (("HumanoidStandup-v5", ()), ("Ant-v4", ()), ("Swimmer-v4", ())):
         made = Environment(EnvironmentConfig(env_arg=own), name)
         assert (made.batched, made.substeps) == (None, 1)
         assert isinstance(made.engine(lambda model: BatchEngine(model, 1)), EnvironmentEngine)
