@@ -34,7 +34,7 @@ class Runner:
     ran: ClassVar[list[str]]
 
     def __init__(self, name: str, policy: Any, make: Callable[..., Any]) -> None:
-        self.name, self.policy = name, policy
+        self.name, self.size = name, policy.size
         self.made.append(name)
         assert callable(make)
 
