@@ -1,7 +1,7 @@
 """A process that runs one run's code which came over the network: `python -m workers.runner_process SOCKET`.
 
-It has no session and no certificate; its worker (`workers.subprocess_runner`) sends it jobs over a socket and reads what
-they gave. What such a process can reach all the same: docs/protocol.md, "Code that travels".
+It has no session and no certificate; its worker (`workers.subprocess_runner`) sends it jobs over a socket and reads
+what they gave. What such a process can reach all the same: docs/protocol.md, "Code that travels".
 """
 
 import ctypes

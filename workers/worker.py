@@ -29,8 +29,9 @@ from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
 from farm.rollouts import Runner, served
 from farm.settings import Settings, setting
 from workers import fingerprint
+from workers.runner_process import Begin
 from workers.source_cache import SourceCache
-from workers.subprocess_runner import SubprocessRunner
+from workers.subprocess_runner import RunnerProcess, SubprocessRunner
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ class WorkerConfig(Settings):
     allow_file: tuple[Path, ...] = ()
     """Serve runs whose task or policy is a class in this file, repeatable; the learner's must be the same file."""
     accept_code: bool = False
-    """Serve runs whose task or policy is a class in a file that the learner sends, in a process of its own; with --tls."""
+    """Serve runs whose task or policy is a class in a file that the learner sends; with --tls."""
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""
@@ -140,6 +141,7 @@ class Worker:
         self._runs: OrderedDict[str, _Served] = OrderedDict()
         self._runners: OrderedDict[str, Runner | SubprocessRunner | Exception] = OrderedDict()
         self._sources = SourceCache()
+        self._spare: RunnerProcess | None = None  # begun beforehand: imports take half a second
         self._backend = rollouts.backend(config.backend)
         self._canary = fingerprint.digest()
         self._credits = 2 * self._backend.capacity
@@ -151,6 +153,8 @@ class Worker:
     def join(self) -> None:
         """Subscribe, then show up: in that order, or the first jobs are lost."""
         farm = self._config.farm
+        if self._config.accept_code:
+            self._spare = RunnerProcess(self._sources.empty)
         self._session.subscribe("generation", keys.generation(farm, "*"))
         self._session.subscribe("inbox", keys.inbox(farm, self.id))
         self._session.subscribe("refused", keys.refused(farm, self.id))
@@ -179,6 +183,8 @@ class Worker:
         for runner in self._runners.values():
             if not isinstance(runner, Exception):
                 runner.close()
+        if self._spare is not None:
+            self._spare.close()
         self._sources.close()
 
     def _events(self) -> list[Event]:
@@ -391,7 +397,11 @@ class Worker:
                 self._sources.keep(name, digest, source)
             files.insert(0, path)
             log.info("run %s: %s (SHA-256 %s) came from its learner; a process of its own runs it", run, name, digest)
-        return SubprocessRunner(spec, tuple(files), self._config.backend, self._sources.empty)
+        begin = Begin(spec=spec, files=tuple(map(str, files)), backend=self._config.backend)
+        process, self._spare = self._spare, None
+        runner = SubprocessRunner(begin, self._sources.empty, process)
+        self._spare = RunnerProcess(self._sources.empty)
+        return runner
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
         lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.told(error)
