@@ -79,7 +79,6 @@ class Dispatcher:
         self._session, self._farm, self._stopped = session, farm, stopped
         scheduler = scheduler or SchedulerConfig()
         self._scheduler = Scheduler(scheduler)
-        self._audit = Audit(0.0 if admission.mixed else scheduler.audit)
         self._expelled: dict[str, str] = {}  # hosts, and why
         self._how_to_join = how_to_join
         self._trace, self._shapes = sizes
@@ -95,6 +94,7 @@ class Dispatcher:
         self._refused: dict[str, str] = {}
         self._declined: set[str] = set()
         self._census = Census()
+        self._audit = Audit(scheduler.audit, self._census.canary if admission.mixed else None)
         self._progress: GenerationStats | None = None
         self._generations, self._status, self._status_due = generations, b"", 0.0
         self._alone = time.monotonic()
