@@ -215,10 +215,16 @@ def author_frames(error: BaseException) -> list[str]:
     return traceback.format_list([each for each in traceback.extract_tb(error.__traceback__) if each.filename in files])
 
 
-def told(error: BaseException) -> tuple[str, ...]:
+def root(error: BaseException) -> BaseException:
+    """What an error came from in the first place."""
+    for _ in range(_LINES):
+        error = error.__cause__ or error
+    return error
+
+
+def author_traceback(error: BaseException) -> tuple[str, ...]:
     """The traceback of an error from the first line that is not the farm's own, as printable lines for its author."""
-    while error.__cause__ is not None:
-        error = error.__cause__
+    error = root(error)
     ours = tuple(f"{Path(__file__).parent.parent / package}/" for package in ("farm", "workers", "learner"))
     frames = list(dropwhile(lambda each: each.filename.startswith(ours), traceback.extract_tb(error.__traceback__)))
     if not frames and not isinstance(error, SyntaxError):

@@ -118,12 +118,9 @@ def serve(link: socket.socket) -> None:
 
 def _failed(error: Exception, files: tuple[str, ...]) -> Answer:
     text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
-    root: BaseException = error
-    while root.__cause__ is not None:
-        root = root.__cause__
-    if isinstance(root, FileNotFoundError):
+    if isinstance(plugins.root(error), FileNotFoundError):
         text += "; files beside a class do not travel, but texts that its files() reads do"
-    lines = plugins.told(error)
+    lines = plugins.author_traceback(error)
     for path in files:  # the author knows the file, not where it lies here
         text, lines = text.replace(path, Path(path).name), tuple(line.replace(path, Path(path).name) for line in lines)
     return Answer(error=brief(text), served=not isinstance(error, UnservedError), traceback=lines)

@@ -39,6 +39,7 @@ IDLE: Final = 1.0
 """A worker without work of a run for so long says so, and again every time [s]."""
 
 _ASK: Final = 1.0  # [s] for an answer to a query
+_FETCH: Final = 10.0  # [s] for a source, up to 1 MB
 _KEEP: Final = 32  # runs whose tasks are kept built: as many learners may share us
 _PROCESSES: Final = 8  # of code that came over the network; some 80 MB each
 _RUNS: Final = 1000  # that are served side by side
@@ -263,12 +264,12 @@ class Worker:
         self._make_room(chunk)
         run.chunks.append(chunk)
 
-    def _ask(self, run: _Served, key: str) -> bytes | None:
+    def _ask(self, run: _Served, key: str, seconds: float = _ASK) -> bytes | None:
         """An answer of a run's learner; one that does not come costs at most a tenth of our time."""
         begun = time.monotonic()
         if begun < (run.mute if run.there else self._mute):
             return None
-        payload = self._session.ask(key, _ASK)
+        payload = self._session.ask(key, seconds)
         if payload is None:
             now = time.monotonic()
             run.mute = self._mute = now + _MUTE * (now - begun)
@@ -390,7 +391,7 @@ class Worker:
         for name, digest in travels:
             path = self._sources.place(name, digest)
             if not path.is_file():
-                source = self._ask(self._served(run), keys.code(self._config.farm, run, digest))
+                source = self._ask(self._served(run), keys.code(self._config.farm, run, digest), _FETCH)
                 if source is None:
                     self._tell(logging.WARNING, f"run {run} does not send the source of {name}; its jobs wait")
                     return None
@@ -404,7 +405,7 @@ class Worker:
         return runner
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
-        lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.told(error)
+        lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)
         text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
         self._answer(chunk, Failure(index=index, error=brief(text), traceback=lines, **head))

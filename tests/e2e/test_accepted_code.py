@@ -4,11 +4,13 @@ import contextlib
 import hashlib
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from network import Network, address
 from processes import Farm
 
 from farm.commands import certificates
@@ -101,6 +103,32 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     assert len({farm.summary(f"r{i}")["mean_policy_return"] for i in range(3)}) == 3, "each is another task"
     farm.call("run", "--task", "pole.py:Pole", "--name", "here", *FEW)
     assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
+
+
+def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Path) -> None:
+    with closing(Network(3)) as network:
+        names = [word for name in ("left", "right") for word in ("--worker", name)]
+        farm.call("certificates", "new", "certs", "--learner", address(0), *names)
+        join = ("--connect", f"tls/{address(0)}:7447", "--tls")
+        farm.start("router", "--listen", join[1], "--tls", "certs/learner", host=network.hosts[0])
+        flags = ("--processes", "1", "--accept-code")
+        workers = [
+            farm.start("worker", *join, f"certs/worker-{name}", *flags, host=host)
+            for name, host in zip(("left", "right"), network.hosts[1:], strict=True)
+        ]
+        for worker in workers:
+            assert any("joined farm" in line for line in worker.stdout or ())
+        for name, text in (("first", POLE), ("second", POLE.replace("np.cos", "-np.cos"))):
+            task.write_text(text)
+            words = ("--task", "pole.py:Pole", "--name", name, "--generations", "20", "--pairs", "20", "--no-record")
+            process = farm.start("learner", *join, "certs/learner", *words, host=network.hosts[0])
+            said, _ = process.communicate(timeout=60)
+            assert process.returncode == 0, said
+        for worker in workers:
+            said = ended(worker)
+            for name in ("first", "second"):
+                assert f"run {name}: pole.py" in said
+                assert f"serving run {name}" in said
 
 
 def test_who_was_not_told_to_accept_code_says_which_flag(farm: Farm, certs: Path, router: str, task: Path) -> None:

@@ -79,10 +79,14 @@ def test_it_is_fetched_once_and_run_elsewhere(
     caplog.set_level(logging.INFO)
     monkeypatch.setenv("A_SECRET", "s")
     said = tmp_path / "said"
-    spy = f"import os, sys\nif sys.argv[0].endswith('runner_process.py'):\n    with open({str(said)!r}, 'a') as f:\n"
-    spy += (
-        "        print(os.getpid(), os.getcwd(), os.listdir(), *sorted(os.environ), sep='|', file=f)\nprint('noise')\n"
-    )
+    spy = f"""
+import os, sys
+if sys.argv[0].endswith("runner_process.py"):
+    bound, session = "NoNewPrivs:\\t1" in open("/proc/self/status").read(), "zenoh" in sys.modules
+    with open({str(said)!r}, "a") as file:
+        print(os.getpid(), os.getcwd(), os.listdir(), bound, session, *os.environ, sep="|", file=file)
+print("noise")
+"""
     file = write(tmp_path, spy)
     author, other = Author(safe, file), Author(safe, file, "again")
     worker = hire(safe, certs)
@@ -97,9 +101,10 @@ def test_it_is_fetched_once_and_run_elsewhere(
     assert kept.parents[1].stat().st_mode & 0o077 == 0
     lines = [line.split("|") for line in said.read_text().splitlines()]
     assert len(lines) == 2, "one process for each run"
-    for pid, folder, content, *names in lines:
+    for pid, folder, content, bound, session, *names in lines:
         assert int(pid) != os.getpid()
         assert (Path(folder), content) == (worker._sources.empty, "[]")
+        assert (bound, session) == ("True", "False"), "no new privileges, and no session"
         assert not {"A_SECRET", "HOME"} & set(names)
     safe.let_go()
 
