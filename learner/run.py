@@ -172,7 +172,8 @@ def open_run(
             stack.enter_context(folder.held())
         config = config if resume else fitted(config)
         problem, at = resumed(folder, config, mixed=place.mixed) if resume else start(config, folder.name)
-        _ = place.tls and problem.sources  # says in time what cannot travel
+        if place.tls:
+            _ = problem.sources  # says in time what cannot travel
         if place.workers:
             problem.runner().close()  # says in time what no worker could simulate
         link = stack.enter_context(connected(place, stopped))

@@ -63,6 +63,11 @@ class Answer:
     """False: no job of this run can be run here."""
     traceback: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Check that what goes on to the learner can be shown: the process may say anything."""
+        if len(self.traceback) > 40 or not all(len(line) <= 1000 and line.isprintable() for line in self.traceback):
+            raise ValueError("a traceback of more than 40 lines, long lines, or unprintable ones")
+
 
 def send(link: socket.socket, message: object, seconds: float | None = None) -> None:
     """Send a message, in time; a TimeoutError or another OSError where that cannot be."""

@@ -400,9 +400,10 @@ class Worker:
             log.info("run %s: %s (SHA-256 %s) came from its learner; a process of its own runs it", run, name, digest)
         begin = Begin(spec=spec, files=tuple(map(str, files)), backend=self._config.backend)
         process, self._spare = self._spare, None
-        runner = SubprocessRunner(begin, self._sources.empty, process)
-        self._spare = RunnerProcess(self._sources.empty)
-        return runner
+        try:
+            return SubprocessRunner(begin, self._sources.empty, process)
+        finally:
+            self._spare = RunnerProcess(self._sources.empty)
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
         lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)

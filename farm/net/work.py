@@ -297,7 +297,7 @@ class Failure:
     error: str
     """One line."""
     traceback: tuple[str, ...] = ()
-    """Where the error is in a class from a file: lines for its author, who has the file."""
+    """Where the error is not in the farm's own code: lines for who wrote that."""
 
     def __post_init__(self) -> None:
         """Check that it can be shown."""

@@ -202,6 +202,24 @@ def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monk
     assert (said.index, said.error) == (None, "its code did not answer within 0.2 s and was ended")
 
 
+def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: Path) -> None:
+    """The code may write to the worker itself."""
+    forged = """
+import socket, sys
+if sys.argv[0].endswith("runner_process.py"):
+    from workers.runner_process import Answer, send
+    Answer.__post_init__ = lambda _: None
+    send(socket.socket(fileno=int(sys.argv[1])), Answer(error="e", traceback=("\\x1b[2J",)))
+"""
+    author, other = Author(safe, write(tmp_path, forged, "forged.py")), Author(safe, write(tmp_path), "other")
+    worker = hire(safe, certs)
+    author.send(worker.id, 0)
+    said = safe.failure()
+    assert said.error.startswith("the process that runs its code ended")
+    other.send(worker.id, 0)
+    assert indices(safe.results("other")) == [0]
+
+
 def test_without_certificates_it_is_refused() -> None:
     with pytest.raises(ConfigError, match="--accept-code needs --tls: without certificates anybody could send code"):
         WorkerConfig(accept_code=True)
