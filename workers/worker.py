@@ -124,6 +124,8 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
         try:
             worker.join()
             log.info("joined farm %s as %s", config.farm, worker.id)
+            if config.accept_code:
+                log.warning("--accept-code: learners of farm %s run their code here, as this user", config.farm)
             while not stopped():
                 worker.turn()
             worker.leave()
