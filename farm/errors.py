@@ -37,6 +37,9 @@ def printable(text: str, kept: str = "") -> str:
 class FarmError(Exception):
     """One clear line: what was wrong, what was expected, what to do."""
 
+    traceback: tuple[str, ...] = ()
+    """Of an error in code that ran in another process: what its author wants to see, in printable lines."""
+
 
 class ConfigError(FarmError):
     """A setting that makes no sense."""

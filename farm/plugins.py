@@ -12,9 +12,10 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any, Final
 
@@ -75,6 +76,12 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
 }
 """Kinds of plug-ins, and the built-in ones by name. Strings, because nothing in farm/ imports a learner or worker."""
 
+SOURCE_LIMIT: Final = 1_000_000
+"""Bytes that a file may have which travels to workers."""
+
+_LINES: Final = 40  # of a traceback that others are told
+_WIDTH: Final = 250  # characters of each
+
 _MODULES: Final = "rolloutfarm_file_"  # prefix of the modules that files become
 
 
@@ -94,8 +101,8 @@ class Plugin:
     """Package and version that it comes from; empty for the farm's own and for files."""
     file: Path | None = None
     """The file that it comes from, if it is from a file."""
-    imported: str = ""
-    """SHA-256 of that file as it was when it was imported."""
+    source: bytes = field(default=b"", repr=False)
+    """That file's bytes as they were when it was imported."""
 
     @property
     def wire(self) -> str:
@@ -109,7 +116,7 @@ class Plugin:
 
     def digest(self) -> str:
         """SHA-256 of its code: its file, or its module and all that this imports from the same package."""
-        return self.imported or code_digest(self.target.__module__)
+        return hashlib.sha256(self.source).hexdigest() if self.file else code_digest(self.target.__module__)
 
 
 def names(kind: str) -> dict[str, str]:
@@ -180,7 +187,7 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
         classes = [(name, value) for name, value in vars(module).items() if isinstance(value, type)]
         known = [name for name, value in classes if value.__module__ == module.__name__]
         raise ConfigError(f"{path} has no class {inside!r}; it has {', '.join(known) or 'none'}")
-    return Plugin(kind, f"{path}:{inside}", target, file=path, imported=hashlib.sha256(source).hexdigest())
+    return Plugin(kind, f"{path}:{inside}", target, file=path, source=source)
 
 
 @cache
@@ -214,6 +221,31 @@ def author_frames(error: BaseException) -> list[str]:
     return traceback.format_list([each for each in traceback.extract_tb(error.__traceback__) if each.filename in files])
 
 
+def root(error: BaseException) -> BaseException:
+    """What an error came from in the first place."""
+    for _ in range(_LINES):
+        error = error.__cause__ or error
+    return error
+
+
+def author_traceback(error: BaseException) -> tuple[str, ...]:
+    """The traceback of an error from the first line that is not the farm's own, as printable lines for its author."""
+    error = root(error)
+    ours = tuple(f"{Path(__file__).parent.parent / package}/" for package in ("farm", "workers", "learner"))
+    frames = list(dropwhile(lambda each: each.filename.startswith(ours), traceback.extract_tb(error.__traceback__)))
+    if not frames and not isinstance(error, SyntaxError):
+        return ()
+    text = "".join([*traceback.format_list(frames), *traceback.format_exception_only(error)])
+    shown = ("".join(letter if letter.isprintable() else "?" for letter in line) for line in text.splitlines())
+    return tuple(line[:_WIDTH] for line in shown)[-_LINES:]
+
+
+def named_file(wire: str) -> str:
+    """The file that a class NAME.py:CLASS lies in; empty for names of other kinds."""
+    name = wire.rpartition(":")[0]
+    return name if name.endswith(".py") else ""
+
+
 def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:
     """A class NAME.py:CLASS that somebody else named, from the one of these files of that name and digest.
 
@@ -230,7 +262,10 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
             if hashlib.sha256(source).hexdigest() != digest:
                 raise UnservedError(f"{path} differs from the learner's {name}: copy the learner's file there")
             return _of_source(kind, path.resolve(), source, inside)
-    raise UnservedError(f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file {name}")
+    raise UnservedError(
+        f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file {name}, "
+        "or start this worker with --accept-code and --tls"
+    )
 
 
 @cache

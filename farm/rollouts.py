@@ -35,6 +35,11 @@ class Runner:
         self.sim = Sim(task.engine(make))
         loop.again(lambda: task.setup(self.sim))
 
+    @property
+    def size(self) -> int:
+        """Parameters of the policy, P."""
+        return self.policy.size
+
     def run(
         self, mu: FloatArray, jobs: Jobs, traces: str = "none", normaliser: FloatArray = NOT_NORMALISED
     ) -> Simulated:
@@ -120,7 +125,7 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
     except UnservedError:
         raise
     except ConfigError as error:
-        raise UnservedError(str(error)) from None
+        raise UnservedError(str(error)) from error
 
 
 def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping[str, str] | None) -> Task:
@@ -140,7 +145,7 @@ _SAME = "install the learner's release on both sides"
 def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]) -> plugins.Plugin:
     """The class that a specification names, if its code is the learner's."""
     base = {"tasks": Task, "policies": Policy}[kind]
-    from_file = name.rpartition(":")[0].endswith(".py")
+    from_file = plugins.named_file(name) != ""
     found = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
     if not (isinstance(found.target, type) and issubclass(found.target, base)):
         raise UnservedError(f"{name} is no {base.__name__}")

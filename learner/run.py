@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -180,6 +181,8 @@ def open_run(
             stack.enter_context(folder.held())
         config = config if resume else fitted(config)
         problem, at = resumed(folder, config, mixed=place.mixed) if resume else start(config, folder.name)
+        if place.tls:
+            _ = problem.sources  # says in time what cannot travel
         if place.workers:
             problem.runner().close()  # says in time what no worker could simulate
         link = stack.enter_context(connected(place, stopped))
@@ -220,6 +223,8 @@ def dispatch(
 ) -> tuple[Dispatcher, Pool | None]:
     """Show a problem on the network under a name, and start its local workers; all ends with the stack."""
     tend = _Tending(stopped)
+    for digest, source in problem.sources.items() if place.tls else ():
+        link.answer(keys.code(place.farm, name, digest), partial(_same, source))
     farm = Dispatcher(
         link,
         place.farm,
@@ -236,6 +241,10 @@ def dispatch(
         flags += ["--log-level", "WARNING"]  # what they do, the learner says
         tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
     return farm, tend.pool
+
+
+def _same(source: bytes) -> bytes:
+    return source
 
 
 class _Tending:

@@ -64,12 +64,28 @@ class Problem:
         return tuple(dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None))
 
     @cached_property
+    def sources(self) -> dict[str, bytes]:
+        """Those files as they were imported, by SHA-256, for workers that accept code.
+
+        Raises:
+          ConfigError: one is too large to travel.
+        """
+        files = [each for each in self._plugins.values() if each.file is not None]
+        for each in files:
+            if len(each.source) > plugins.SOURCE_LIMIT:
+                raise ConfigError(
+                    f"{each.file} has {len(each.source)} bytes; with --tls a class's file travels to workers and has "
+                    f"at most {plugins.SOURCE_LIMIT}: put data into a package"
+                )
+        return {each.digest(): each.source for each in files}
+
+    @cached_property
     def code(self) -> dict[str, str]:
         """Digests of the code that decides its numbers."""
         parts = {name: plugin.digest() for name, plugin in self._plugins.items()}
         return parts | {"simulation": plugins.code_digest(rollouts.SIMULATION)}
 
-    @property
+    @cached_property
     def _plugins(self) -> dict[str, plugins.Plugin]:
         return {"task": plugins.find("tasks", self.config.task), "policy": plugins.find("policies", self.config.policy)}
 

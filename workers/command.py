@@ -48,6 +48,8 @@ def _flags(command: WorkerCommand) -> list[str]:
     if config.tls is not None:
         flags += ["--tls", str(config.tls)]
     flags += [word for path in config.allow_file for word in ("--allow-file", str(path.resolve()))]
+    if config.accept_code:
+        flags.append("--accept-code")
     if config.timeout is not None:
         flags += ["--timeout", str(config.timeout)]
     return [*flags, "--log-level", command.log_level.upper()]

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from farm import __version__, rollouts
+from farm import __version__, plugins, rollouts
 from farm.errors import ConfigError, FarmError, MessageError, UnservedError, brief
 from farm.net import codec, keys
 from farm.net.events import Event
@@ -29,6 +29,9 @@ from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
 from farm.rollouts import Runner, served
 from farm.settings import Settings, setting
 from workers import fingerprint
+from workers.runner_process import Begin
+from workers.source_cache import SourceCache
+from workers.subprocess_runner import RunnerProcess, SubprocessRunner
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +39,9 @@ IDLE: Final = 1.0
 """A worker without work of a run for so long says so, and again every time [s]."""
 
 _ASK: Final = 1.0  # [s] for an answer to a query
+_FETCH: Final = 10.0  # [s] for a source, up to 1 MB
 _KEEP: Final = 32  # runs whose tasks are kept built: as many learners may share us
+_PROCESSES: Final = 8  # of code that came over the network; some 80 MB each
 _RUNS: Final = 1000  # that are served side by side
 _HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below
 _CREDITS: Final = 4  # times as many jobs of one run are held as were asked for: jobs are sent again, and cross others
@@ -63,6 +68,8 @@ class WorkerConfig(Settings):
     """What simulates: a name, or FILE.py:CLASS."""
     allow_file: tuple[Path, ...] = ()
     """Serve runs whose task or policy is a class in this file, repeatable; the learner's must be the same file."""
+    accept_code: bool = False
+    """Serve runs whose task or policy is a class in a file that the learner sends; with --tls."""
 
     def __post_init__(self) -> None:
         """Check every value, and put in the host's name."""
@@ -80,6 +87,8 @@ class WorkerConfig(Settings):
         keys.checked("farm", self.farm)
         keys.checked("worker", self.name)
         rollouts.backend(self.backend)
+        if self.accept_code and self.tls is None:
+            raise ConfigError("--accept-code needs --tls: without certificates anybody could send code")
         for path in self.allow_file:
             if not path.is_file():
                 raise ConfigError(f"--allow-file {path}: there is no such file")
@@ -112,11 +121,16 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
     """
     with connect(config.connect, config.timeout, stopped, config.bundle) as session:
         worker = Worker(config, session)
-        worker.join()
-        log.info("joined farm %s as %s", config.farm, worker.id)
-        while not stopped():
-            worker.turn()
-        worker.leave()
+        try:
+            worker.join()
+            log.info("joined farm %s as %s", config.farm, worker.id)
+            if config.accept_code:
+                log.warning("--accept-code: learners of farm %s run their code here, as this user", config.farm)
+            while not stopped():
+                worker.turn()
+            worker.leave()
+        finally:
+            worker.close()
 
 
 class Worker:
@@ -128,7 +142,9 @@ class Worker:
         self._config = config
         self._session = session
         self._runs: OrderedDict[str, _Served] = OrderedDict()
-        self._runners: OrderedDict[str, Runner | Exception] = OrderedDict()
+        self._runners: OrderedDict[str, Runner | SubprocessRunner | Exception] = OrderedDict()
+        self._sources = SourceCache()
+        self._spare: RunnerProcess | None = None  # begun beforehand: imports take half a second
         self._backend = rollouts.backend(config.backend)
         self._canary = fingerprint.digest()
         self._credits = 2 * self._backend.capacity
@@ -140,6 +156,8 @@ class Worker:
     def join(self) -> None:
         """Subscribe, then show up: in that order, or the first jobs are lost."""
         farm = self._config.farm
+        if self._config.accept_code:
+            self._spare = RunnerProcess(self._sources.empty)
         self._session.subscribe("generation", keys.generation(farm, "*"))
         self._session.subscribe("inbox", keys.inbox(farm, self.id))
         self._session.subscribe("refused", keys.refused(farm, self.id))
@@ -163,6 +181,15 @@ class Worker:
         """Hand back everything that is not done; what is done arrives before."""
         self._want(idle=tuple(self._runs), credits=0)
 
+    def close(self) -> None:
+        """End the processes that run others' code, and delete that."""
+        for runner in self._runners.values():
+            if not isinstance(runner, Exception):
+                runner.close()
+        if self._spare is not None:
+            self._spare.close()
+        self._sources.close()
+
     def _events(self) -> list[Event]:
         """What is waiting, headers first; waits a little when there is nothing to do."""
         working = any(run.chunks for run in self._runs.values())
@@ -183,7 +210,11 @@ class Worker:
     def _learner(self, run: str, *, there: bool) -> None:
         """A run's learner came or went."""
         if not there:
-            self._runs.pop(run, None)
+            gone = self._runs.pop(run, None)
+            made = self._runners.get(gone.header.spec) if gone and gone.header else None
+            if gone and gone.header and isinstance(made, SubprocessRunner):
+                made.close()  # it begins again should the learner come back
+                del self._runners[gone.header.spec]
             return
         self._served(run).there = True
         self._want(idle=())
@@ -235,12 +266,12 @@ class Worker:
         self._make_room(chunk)
         run.chunks.append(chunk)
 
-    def _ask(self, run: _Served, key: str) -> bytes | None:
+    def _ask(self, run: _Served, key: str, seconds: float = _ASK) -> bytes | None:
         """An answer of a run's learner; one that does not come costs at most a tenth of our time."""
         begun = time.monotonic()
         if begun < (run.mute if run.there else self._mute):
             return None
-        payload = self._session.ask(key, _ASK)
+        payload = self._session.ask(key, seconds)
         if payload is None:
             now = time.monotonic()
             run.mute = self._mute = now + _MUTE * (now - begun)
@@ -298,13 +329,17 @@ class Worker:
             for index in [None] if isinstance(runner, UnservedError) else chunk.indices.tolist():
                 self._fail(chunk, index, runner)
             return
-        size = runner.policy.size
+        size = runner.size
         if len(header.mu) != size or (len(chunk.eps) and chunk.eps.shape[1] != size):
             log.warning("ignored jobs of run %s: not %d parameters", chunk.run, size)
             return
         jobs = chunk.take(np.argsort(chunk.indices).tolist())
         try:
             self._do(chunk, runner, header, jobs)
+        except UnservedError as error:  # nor any other job
+            runner.close()
+            self._runners[header.spec] = error
+            self._fail(chunk, None, error)
         except Exception:  # whatever it was, others may be able to, and the learner decides
             log.exception("a chunk of run %s failed; trying its jobs one by one", chunk.run)
             for at, index in enumerate(jobs.indices.tolist()):
@@ -314,13 +349,13 @@ class Worker:
                     self._fail(chunk, index, error)
         self._runs[chunk.run].busy = time.monotonic()
 
-    def _do(self, chunk: Chunk, runner: Runner, header: RoundHeader, jobs: Jobs) -> None:
+    def _do(self, chunk: Chunk, runner: Runner | SubprocessRunner, header: RoundHeader, jobs: Jobs) -> None:
         """Run some of a chunk's jobs and say what they gave."""
         given = runner.run(header.mu, jobs, header.traces, header.normaliser)
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
         self._answer(chunk, Results.carrying(given, jobs, **head))
 
-    def _runner(self, header: RoundHeader) -> Runner | Exception | None:
+    def _runner(self, header: RoundHeader) -> Runner | SubprocessRunner | Exception | None:
         """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
         if header.spec not in self._runners:
             payload = self._ask(self._runs[header.run], keys.spec(self._config.farm, header.run))
@@ -328,8 +363,10 @@ class Worker:
                 self._tell(logging.WARNING, f"run {header.run} does not tell what it simulates; its jobs wait")
                 return None
             try:
-                spec = codec.decode(payload, Spec)
-                self._runners[header.spec] = Runner(*served(spec, self._config.allow_file), self._backend.engine)
+                made = self._made(header.run, codec.decode(payload, Spec))
+                if made is None:
+                    return None
+                self._runners[header.spec] = made
                 log.info("serving run %s", header.run)
             except Exception as error:  # the learner is told, and decides
                 log.error("cannot serve run %s: %s", header.run, error, exc_info=not isinstance(error, FarmError))
@@ -337,16 +374,44 @@ class Worker:
                     return error  # short of memory, say: another time it may go
                 self._runners[header.spec] = error
         self._runners.move_to_end(header.spec)
-        while len(self._runners) > _KEEP:
-            _, oldest = self._runners.popitem(last=False)
+        processes = [digest for digest, each in self._runners.items() if isinstance(each, SubprocessRunner)]
+        for digest in {*processes[:-_PROCESSES], *list(self._runners)[:-_KEEP]}:
+            oldest = self._runners.pop(digest)
             if not isinstance(oldest, Exception):
                 oldest.close()
         return self._runners[header.spec]
 
+    def _made(self, run: str, spec: Spec) -> Runner | SubprocessRunner | None:
+        """What runs a run's jobs; None if a source of it is not to be had."""
+        files = list(self._config.allow_file)
+        here = {(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file()}
+        named = {(plugins.named_file(spec.task), spec.code.get("task", "")),
+                 (plugins.named_file(spec.policy), spec.code.get("policy", ""))}  # fmt: skip
+        travels = sorted((name, digest) for name, digest in named - here if name)
+        if not (travels and self._config.accept_code):
+            return Runner(*served(spec, self._config.allow_file), self._backend.engine)
+        for name, digest in travels:
+            path = self._sources.place(name, digest)
+            if not path.is_file():
+                source = self._ask(self._served(run), keys.code(self._config.farm, run, digest), _FETCH)
+                if source is None:
+                    self._tell(logging.WARNING, f"run {run} does not send the source of {name}; its jobs wait")
+                    return None
+                self._sources.keep(name, digest, source)
+            files.insert(0, path)
+            log.info("run %s: %s (SHA-256 %s) came from its learner; a process of its own runs it", run, name, digest)
+        begin = Begin(spec=spec, files=tuple(map(str, files)), backend=self._config.backend)
+        process, self._spare = self._spare, None
+        try:
+            return SubprocessRunner(begin, self._sources.empty, process)
+        finally:
+            self._spare = RunnerProcess(self._sources.empty)
+
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
+        lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)
         text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
-        self._answer(chunk, Failure(index=index, error=brief(text), **head))
+        self._answer(chunk, Failure(index=index, error=brief(text), traceback=lines, **head))
 
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
         self._session.publish(keys.result(self._config.farm, chunk.run, self.id), codec.encode(message))

@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 4
+SCHEMA: Final = 5
 """Version of everything on the wire; stands in every message."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024

@@ -6,6 +6,7 @@
 <farm>/pairs/<worker>              a worker's inbox: chunks of jobs
 <farm>/run/<run>/claim             queryable: when the run's learner began
 <farm>/run/<run>/spec              queryable: what is simulated
+<farm>/run/<run>/code/<digest>     queryable: the source of a class that lies in a file; by TLS only
 <farm>/run/<run>/generation        published and queryable: the round that is on
 <farm>/run/<run>/result/<worker>   results
 <farm>/run/<run>/status            queryable: how it is doing
@@ -61,6 +62,11 @@ def claim(farm: str, run: str) -> str:
 def spec(farm: str, run: str) -> str:
     """Where a run's specification is answered."""
     return f"{farm}/run/{run}/spec"
+
+
+def code(farm: str, run: str, digest: str) -> str:
+    """Where a run's learner answers the source with this SHA-256; run and digest `*` for all."""
+    return f"{farm}/run/{run}/code/{digest}"
 
 
 def generation(farm: str, run: str) -> str:

@@ -34,7 +34,7 @@ class WorkRequest:
     version: str
     """Release of the worker's software."""
     canary: str
-    """Digest of the numbers its machine gives."""
+    """Digest of the numbers its machine gives; empty for a device, whose numbers are not to be had again."""
     host: str
     cores: int
     """That its machine has."""

@@ -157,7 +157,8 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
     """What a worker may send, and what it may be sent."""
-    own, told, asked = f"{name}/**", keys.generation(farm, "*"), [keys.spec(farm, "*"), keys.generation(farm, "*")]
+    own, told = f"{name}/**", keys.generation(farm, "*")
+    asked = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), told]
     sent = [keys.inbox(farm, own), keys.refused(farm, own), told]
     return [
         ("ingress", ["put"], [keys.want(farm, own), keys.result(farm, "*", own)]),

@@ -25,6 +25,7 @@ NOT_NORMALISED: Final = np.empty((2, 2, 0))
 """What a RoundHeader has where observations are taken as they are."""
 
 _LINE: Final = 1000  # characters
+_LINES: Final = 40  # of a traceback
 _CHANNELS: Final = 100  # of a trajectory
 
 
@@ -295,11 +296,16 @@ class Failure:
     """None where it is not the job: no job of this run can be run there."""
     error: str
     """One line."""
+    traceback: tuple[str, ...] = ()
+    """Where the error is not in the farm's own code: lines for who wrote that."""
 
     def __post_init__(self) -> None:
         """Check that it can be shown."""
-        if len(self.error) > _LINE or not self.error.isprintable():
-            raise ValueError(f"an error of more than {_LINE} characters, or unprintable ones")
+        if len(self.traceback) > _LINES:
+            raise ValueError(f"a traceback of {len(self.traceback)} lines")
+        for line in (self.error, *self.traceback):
+            if len(line) > _LINE or not line.isprintable():
+                raise ValueError(f"an error of more than {_LINE} characters a line, or unprintable ones")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,8 +42,8 @@ def learn(
     logs.set_up("WARNING" if chosen.quiet and chosen.log_level == "INFO" else chosen.log_level)
     place = replace(
         place, connect=chosen.connect, farm=chosen.farm, record=chosen.record, log=chosen.log,
-        listen=chosen.listen or place.listen,
-        trusted=chosen.trust_network, mixed=chosen.mixed, scheduler=SchedulerConfig(audit=chosen.audit),
+        listen=chosen.listen or place.listen, trusted=chosen.trust_network, mixed=chosen.mixed,
+        scheduler=SchedulerConfig(audit=chosen.audit, straggler_seconds=chosen.patience),
         tls=None if chosen.tls is None else find(chosen.tls, "learner"),
         serve=None if chosen.serve is None else options.address(chosen.serve),
     )  # fmt: skip

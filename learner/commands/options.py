@@ -50,6 +50,8 @@ class LearnerOptions:
     """Admit workers whose machines round differently, and resume although code has changed: not repeatable."""
     audit: float = setting(0.02, least=0.0, most=1.0)
     """Part of the jobs that a second host does as well, where there is one: hosts that lie are expelled; 0: none."""
+    patience: float = setting(1.0, above=0.0)
+    """A job goes to a second worker no sooner than this [s]: more where slow devices take part."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     quiet: bool = False

@@ -1,23 +1,31 @@
 """Spot checks: some jobs of a round are done by a second host as well. Pure: time is an argument [s].
 
-Honest hosts of one run give the same bits. Two answers to a job that differ mean that one of the hosts is broken or
-lies, and a third host's answer says which. Which jobs are checked depends on the round, the indices and the returns,
+Honest hosts of one run give the same bits; where machines of different numbers are mixed, those of one kind do, and
+devices are not checked. Two answers to a job that differ mean that one of the hosts is broken or lies, and a third
+host's answer says which. Which jobs are checked depends on the round, the indices and the returns,
 never on the clock; that they are checked changes no number.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from learner.scheduler.round import RoundResults
 
 
+class _Party(NamedTuple):
+    """A host's workers whose numbers are of one kind."""
+
+    host: str
+    canary: str
+
+
 @dataclass
 class _Check:
-    answers: dict[str, bytes]
-    """By host."""
+    answers: dict[_Party, bytes]
     passed: set[str] = field(default_factory=set)
     """Workers that were asked and did not answer in time."""
     asked: str = ""
@@ -33,16 +41,22 @@ def host(worker: str) -> str:
 class Audit:
     """The spot checks of one round after another."""
 
-    def __init__(self, part: float) -> None:
-        """Check this part of the jobs, 0 to 1; 0: none at all."""
+    def __init__(self, part: float, canary: Callable[[str], str] | None = None) -> None:
+        """Check this part of the jobs, 0 to 1; 0: none at all.
+
+        Args:
+          part: of the jobs.
+          canary: of a worker's numbers, empty for a device; None: all workers' numbers are the same.
+        """
         self._part, self._round, self._best = part, -1, -np.inf
-        self._hosts: list[str] = []
+        self._canary = canary or (lambda _: "one")
+        self._parties: list[_Party] = []
         self.begin(0)
 
     def begin(self, jobs: int) -> None:
         """A round of so many jobs."""
         self._round += 1
-        self._by = np.full(jobs, -1)  # whose answer counts, as a place in self._hosts
+        self._by = np.full(jobs, -1)  # whose answer counts, as a place in self._parties; -1: nobody who is checked
         self._checks: dict[int, _Check] = {}
         self._agreed: set[int] = set()
         self._chosen = False
@@ -53,11 +67,13 @@ class Audit:
         return self._part > 0
 
     def counted(self, worker: str, indices: np.ndarray) -> None:
-        """These answers of a worker are the ones that count."""
-        name = host(worker)
-        if name not in self._hosts:
-            self._hosts.append(name)
-        self._by[indices] = self._hosts.index(name)
+        """These answers of a worker are the ones that count; a device's are not checked."""
+        party = self._party(worker)
+        if not party.canary:
+            return
+        if party not in self._parties:
+            self._parties.append(party)
+        self._by[indices] = self._parties.index(party)
 
     def passed(self, results: RoundResults, workers: Sequence[str]) -> bool:
         """Whether the round, all of whose jobs are done, needs no further answer; chooses what to check at first."""
@@ -65,7 +81,7 @@ class Audit:
             self._chosen = True
             for index in self._choose(results):
                 if index not in self._agreed:
-                    self._checks.setdefault(index, _Check({self._name(index): results.answer(index)}))
+                    self._checks.setdefault(index, _Check({self._whose(index): results.answer(index)}))
         if self._checks:
             return False
         self._best = max(self._best, results.best()[1])
@@ -73,12 +89,15 @@ class Audit:
 
     def answered(self, worker: str, index: int, first: bytes, second: bytes) -> bool:
         """Another answer to a job that is done; return whether it was asked for, not given to two workers anyway."""
-        name, known = host(worker), self._checks.get(index)
+        party, known = self._party(worker), self._checks.get(index)
         asked = known is not None and known.asked == worker
-        if not self.on or name == self._name(index) or (known is None and first == second):
+        if not self.on or self._by[index] < 0 or (known is None and first == second):
             return asked
-        check = self._checks.setdefault(index, _Check({self._name(index): first}))
-        check.answers.setdefault(name, second)
+        whose = self._whose(index)
+        if party == whose or party.canary != whose.canary:
+            return asked
+        check = self._checks.setdefault(index, _Check({whose: first}))
+        check.answers.setdefault(party, second)
         check.asked = ""
         return asked
 
@@ -88,20 +107,21 @@ class Audit:
         for index, check in list(self._checks.items()):
             answer, agree = Counter(check.answers.values()).most_common(1)[0]
             if agree > 1:
-                liars |= {name: index for name, other in check.answers.items() if other != answer}
+                liars |= {party.host: index for party, other in check.answers.items() if other != answer}
                 self._agreed.add(index)
                 del self._checks[index]
         return liars
 
     def expel(self, name: str) -> list[int]:
         """A host's answers count no longer; its jobs of this round, to be done again."""
-        jobs = np.flatnonzero(self._by == self._hosts.index(name)).tolist() if name in self._hosts else []
+        theirs = [at for at, party in enumerate(self._parties) if party.host == name]
+        jobs = np.flatnonzero(np.isin(self._by, theirs)).tolist()
         self._by[jobs] = -1
         self._agreed.difference_update(jobs)
         for index in jobs:
             self._checks.pop(index, None)
         for check in self._checks.values():
-            check.answers.pop(name, None)
+            check.answers = {party: answer for party, answer in check.answers.items() if party.host != name}
         self._chosen = False
         return jobs
 
@@ -120,7 +140,9 @@ class Audit:
                 check.asked = ""
             if check.asked:
                 continue
-            free = [name for name in workers if host(name) not in check.answers and name not in check.passed]
+            hosts, canary = {party.host for party in check.answers}, self._whose(index).canary
+            alike = [name for name in workers if self._party(name).canary == canary and name not in check.passed]
+            free = [name for name in alike if host(name) not in hosts]
             if free:
                 check.asked, check.since = min(free, key=lambda name: len(asked.get(name, ()))), now
                 asked.setdefault(check.asked, []).append(index)
@@ -133,20 +155,25 @@ class Audit:
     @property
     def disputed(self) -> str:
         """Hosts whose answers differ, as long as no third host can settle it; empty where none do."""
-        return next((" and ".join(c.answers) for c in self._checks.values() if len(c.answers) > 1 and not c.asked), "")
+        unasked = (check for check in self._checks.values() if len(check.answers) > 1 and not check.asked)
+        return next((" and ".join(party.host for party in check.answers) for check in unasked), "")
 
-    def _name(self, index: int) -> str:
-        return self._hosts[self._by[index]]
+    def _party(self, worker: str) -> _Party:
+        return _Party(host(worker), self._canary(worker))
+
+    def _whose(self, index: int) -> _Party:
+        return self._parties[self._by[index]]
 
     def _choose(self, results: RoundResults) -> list[int]:
         """The best of the run so far, always; then each host's best, in turn, and some of the rest."""
         jobs = len(self._by)
         count = int((self._round + 1) * self._part * jobs) - int(self._round * self._part * jobs)
         returns = results.job_returns()
-        order = [int(np.where(self._by == by, returns, -np.inf).argmax()) for by in np.unique(self._by)]
-        turn = self._round % len(order)
+        checked = self._by >= 0
+        order = [int(np.where(self._by == by, returns, -np.inf).argmax()) for by in np.unique(self._by[checked])]
+        turn = self._round % max(1, len(order))
         order = order[turn:] + order[:turn]
         mixed = (np.arange(jobs, dtype=np.uint64) + 1 + self._round * jobs) * np.uint64(0x9E3779B97F4A7C15)
         chosen = list(dict.fromkeys([*order, *np.argsort(mixed, kind="stable").tolist()]))[:count]
         best, value = results.best()
-        return [best, *chosen] if value > self._best else chosen
+        return [job for job in ([best, *chosen] if value > self._best else chosen) if checked[job]]

@@ -79,7 +79,6 @@ class Dispatcher:
         self._session, self._farm, self._stopped = session, farm, stopped
         scheduler = scheduler or SchedulerConfig()
         self._scheduler = Scheduler(scheduler)
-        self._audit = Audit(0.0 if admission.mixed else scheduler.audit)
         self._expelled: dict[str, str] = {}  # hosts, and why
         self._how_to_join = how_to_join
         self._trace, self._shapes = sizes
@@ -95,6 +94,7 @@ class Dispatcher:
         self._refused: dict[str, str] = {}
         self._declined: set[str] = set()
         self._census = Census()
+        self._audit = Audit(scheduler.audit, self._census.canary if admission.mixed else None)
         self._progress: GenerationStats | None = None
         self._generations, self._status, self._status_due = generations, b"", 0.0
         self._alone = time.monotonic()
@@ -364,12 +364,12 @@ class Dispatcher:
 
     def _failed(self, failure: Failure) -> None:
         if failure.index is None:
-            self._does_not_serve(failure.worker, failure.error)
+            self._does_not_serve(failure)
             return
         if self._round is None or not 0 <= failure.index < len(self._round):
             self.ignored["bad"] += 1
             return
-        self._warn(f"worker {failure.worker} failed at a job: {failure.error}")
+        self._warn(f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback)
         if self._scheduler.error(failure.worker, failure.index, time.monotonic()):
             seed = self._round.jobs.take([failure.index]).seeds()[0]
             raise RunError(
@@ -377,12 +377,12 @@ class Dispatcher:
                 f"tried, last with {failure.error}"
             )
 
-    def _does_not_serve(self, worker: str, reason: str) -> None:
+    def _does_not_serve(self, failure: Failure) -> None:
         """A worker that is here but does not serve this run: others may."""
-        if worker in self._scheduler.workers:
-            self._warn(f"worker {worker} does not serve this run: {reason}")
-            self._declined.add(worker)
-            self._forget(worker)
+        if failure.worker in self._scheduler.workers:
+            self._warn(f"worker {failure.worker} does not serve this run: {failure.error}", failure.traceback)
+            self._declined.add(failure.worker)
+            self._forget(failure.worker)
 
     def _forget(self, worker: str) -> int:
         """It takes part no longer; how many of its jobs go to others."""
@@ -450,12 +450,16 @@ class Dispatcher:
         self.ignored[kind] += 1
         self._warn(f"ignored a message {text}")
 
-    def _warn(self, text: str) -> None:
-        """Say something once."""
+    def _warn(self, text: str, traceback: tuple[str, ...] = ()) -> None:
+        """Say something once; a traceback, which many workers may send, below the first that brings it."""
         text = brief(text)
         if text not in self._told and len(self._told) < 1000:
             self._told.add(text)
             log.warning("%s", text)
+            whole = "\n".join(traceback)
+            for line in traceback if whole not in self._told else ():
+                log.warning("  %s", line)
+            self._told.add(whole)
 
 
 _NOTHING: Final = np.empty(0)

@@ -30,6 +30,11 @@ class Admission:
 
     def refusal(self, want: WorkRequest) -> str | None:
         """Why this worker may not take part, None if it may."""
+        if not want.canary and not self.mixed:
+            return (
+                "it is a device, whose numbers are not to be had again: start the learner with --mixed and do without "
+                "repeatable numbers"
+            )
         if self.canary in (None, want.canary) or self.mixed:
             return None
         return (
@@ -39,7 +44,7 @@ class Admission:
 
     def counted(self, canary: str) -> bool:
         """A result of such a machine counted; say whether it was the first, which decides whose numbers the run has."""
-        if self.canary is not None:
+        if self.canary is not None or not canary:
             return False
         self.canary = canary
         return True
@@ -134,6 +139,11 @@ class Census:
     def canaries(self) -> dict[str, str]:
         """The digests of the workers' numbers."""
         return {name: known.want.canary for name, known in self._known.items()}
+
+    def canary(self, worker: str) -> str:
+        """The digest of a worker's numbers; empty where it is a device, or gone."""
+        known = self._known.get(worker)
+        return "" if known is None else known.want.canary
 
     def requests(self) -> list[WorkRequest]:
         """What each worker asked for last."""

@@ -11,7 +11,7 @@ import pytest
 import farm
 from farm import plugins
 from farm.errors import ConfigError, UnservedError
-from farm.plugins import allowed, code_digest, find, names
+from farm.plugins import allowed, author_traceback, code_digest, find, names
 from farm.tasks.finger_gait.task import FingerGait
 
 # ---------------------------------------------------------------- built in
@@ -140,6 +140,32 @@ def test_a_file_of_somebody_elses(write: Write, tmp_path: Path) -> None:
     ):
         with pytest.raises(UnservedError, match=words):
             allowed("tasks", wire, told, files)
+
+
+def test_the_author_is_told_where_it_happened(write: Write) -> None:
+    path = write("def f():\n    raise OSError('no\\x1b[2J')\n\nf()\n")
+    with pytest.raises(ConfigError) as caught:
+        find("tasks", f"{path}:Mine")
+    assert author_traceback(caught.value) == (
+        f'  File "{path}", line 4, in <module>', "    f()",
+        f'  File "{path}", line 2, in f', "    raise OSError('no\\x1b[2J')", "OSError: no?[2J",
+    )  # fmt: skip
+    path.write_text("x = 1\nclass Mine\n")
+    with pytest.raises(ConfigError) as caught:
+        find("tasks", f"{path}:Mine")
+    assert author_traceback(caught.value)[-1] == "SyntaxError: expected ':'"
+    assert author_traceback(ConfigError("nothing of the author's")) == ()
+
+
+def test_a_long_traceback_is_cut(write: Write) -> None:
+    path = write("def f(n):\n    return f(n - 1) if n else 1 / 0 + " + "1 + " * 100 + "1\ndef g(n):\n    f(n)\n" +
+                 "".join(f"def h{n}(): h{n - 1}()\n" for n in range(1, 60)) + "def h0(): g(1)\nh59()\n")  # fmt: skip
+    with pytest.raises(ConfigError) as caught:
+        find("tasks", f"{path}:Mine")
+    lines = author_traceback(caught.value)
+    assert len(lines) == 40
+    assert max(map(len, lines)) == 250
+    assert lines[-1] == "ZeroDivisionError: division by zero"
 
 
 # ---------------------------------------------------------------- installed packages

@@ -34,7 +34,7 @@ class Runner:
     ran: ClassVar[list[str]]
 
     def __init__(self, name: str, policy: Any, make: Callable[..., Any]) -> None:
-        self.name, self.policy = name, policy
+        self.name, self.size = name, policy.size
         self.made.append(name)
         assert callable(make)
 
@@ -104,8 +104,9 @@ class Stage:
 
     def hire(self, **changed: Any) -> Worker:
         config = WorkerConfig(connect=(self.endpoint,), farm=FARM, name="w", **changed)
-        session = self._open.enter_context(connect((self.endpoint,), WAIT, lambda: False))
+        session = self._open.enter_context(connect((self.endpoint,), WAIT, lambda: False, config.bundle))
         worker = Worker(config, session)
+        self._open.callback(worker.close)
         self._hired.append(worker)
         worker.join()
         thread = threading.Thread(target=self._work, args=(worker,))

@@ -106,6 +106,9 @@ MESSAGES = {
         steps=np.ones(2, "<i8"), traces=np.empty((0, 15, 0), "<f4"), trajectories=(), moments=RNG.uniform(size=(2, 7)),
     ),
     "failure": Failure(**HEAD, worker="host/a1", index=3, error="ValueError: so it went"),
+    "failure of a class from a file": Failure(
+        **HEAD, worker="host/a1", index=3, error="ValueError: so", traceback=('  File "a.py", line 3', "ValueError: so")
+    ),
     "failure of all": Failure(**HEAD, worker="host/a1", index=None, error="not served"),
     "report": report(),
     "report of statistics": report(traces=(), sample=None, lines=()),
@@ -392,3 +395,11 @@ def test_a_trajectory_fits_its_runs_task_or_not(name, width):
     other = codec.decode(codec.encode(dataclasses.replace(WIRE, **change)), WireTrajectory)
     assert other.fits(SHAPES | {name: width})
     assert not other.fits(SHAPES)
+
+
+@pytest.mark.parametrize("lines", [["x"] * 41, ["x" * 1001], ["\x1b[2J"], ["two\nlines"]], ids=range(4))
+def test_a_traceback_that_cannot_be_shown_is_refused(lines: list[str]) -> None:
+    body = {"schema": codec.SCHEMA, "type": "Failure", **HEAD, "worker": "w/1", "index": 0, "error": "e"}
+    assert codec.decode(msgpack.packb(body | {"traceback": ["  x"]}), Failure).traceback == ("  x",)
+    with pytest.raises(MessageError):
+        codec.decode(msgpack.packb(body | {"traceback": lines}), Failure)

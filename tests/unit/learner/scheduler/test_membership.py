@@ -15,6 +15,15 @@ def want(worker: str = "a/1", credits: int = 4, canary: str = "bits") -> WorkReq
 # ---------------------------------------------------------------- admission
 
 
+def test_a_device_is_admitted_among_mixed_machines_and_decides_nothing() -> None:
+    assert "it is a device" in str(Admission(None).refusal(want(canary="")))
+    admission = Admission(None, mixed=True)
+    assert admission.refusal(want(canary="")) is None
+    assert not admission.counted("")
+    assert admission.counted("bits")
+    assert admission.refusal(want(canary="")) is None
+
+
 def test_the_first_result_decides_whose_numbers_count() -> None:
     admission = Admission(None)
     assert admission.refusal(want(canary="odd")) is None

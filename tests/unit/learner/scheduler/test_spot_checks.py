@@ -150,3 +150,35 @@ def test_a_new_best_is_always_checked_before_it_counts() -> None:
 
 def test_none_are_checked_on_request() -> None:
     assert checked(Audit(0.0), np.arange(20.0)) == set()
+
+
+KINDS = {"a/1": "x", "b/1": "x", "c/1": "y", "rig/1": ""}
+
+
+def test_only_machines_whose_numbers_are_of_one_kind_are_compared() -> None:
+    audit, results = Audit(1.0, KINDS.__getitem__), filled(np.arange(8.0))
+    audit.begin(8)
+    for index in range(8):
+        audit.counted(list(KINDS)[index % 4], np.array([index]))
+    assert not audit.passed(results, list(KINDS))
+    asked = audit.assign(list(KINDS), 0.0, 1.0)
+    assert {worker: sorted(indices) for worker, indices in asked.items()} == {"b/1": [0, 4], "a/1": [1, 5]}
+    for worker, indices in asked.items():
+        for index in indices:
+            assert audit.answered(worker, index, results.answer(index), results.answer(index))
+    assert audit.settle() == {}
+    assert audit.passed(results, list(KINDS)), "nobody is like c, and a device is like nobody"
+
+
+def test_numbers_of_another_kind_expel_nobody() -> None:
+    audit, results = Audit(1.0, KINDS.__getitem__), filled(np.arange(2.0))
+    audit.begin(2)
+    audit.counted("a/1", np.array([0]))
+    audit.counted("rig/1", np.array([1]))
+    for worker in ("c/1", "rig/1"):
+        assert not audit.answered(worker, 0, results.answer(0), b"others")
+    for worker in ("a/1", "rig/1"):
+        assert not audit.answered(worker, 1, results.answer(1), b"others")
+    assert audit.settle() == {}
+    assert not audit.disputed
+    assert audit.expel("rig") == []

@@ -1,0 +1,150 @@
+"""A robot as a worker, in plain Python with zenoh and msgpack: docs/protocol.md, "The worker's side, exactly".
+
+    farm learner --task rig.py:Rig --mixed --patience 10
+    python robot_worker.py --connect tcp/127.0.0.1:7447
+
+The robot here is a pendulum, integrated against a clock of its own; put yours into `rollout`.
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import os
+import queue
+import random
+import signal
+import struct
+import time
+from pathlib import Path
+
+import msgpack
+import zenoh
+
+SCHEMA = 5
+LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}  # struct's, of an array's numbers
+
+
+def rollout(theta: list[float], clock: float) -> float:
+    """The return of 50 control steps of 50 ms by the rig's clock; a RuntimeError where the rig could not do them."""
+    angle, speed, value, begun = 0.3 + random.uniform(-0.1, 0.1), 0.0, 0.0, time.monotonic()
+    for step in range(1, 51):
+        action = theta[0] * math.sin(angle) + theta[1] * math.cos(angle) + theta[2] * 0.1 * speed + theta[3]
+        for _ in range(10):
+            speed += 0.005 * (2.4525 * math.sin(angle) + 1.5 * max(-1.0, min(1.0, action)) - 0.06 * speed) / 0.126
+            angle += 0.005 * speed
+        if abs(speed) > 7.0:
+            raise RuntimeError(f"the rig's guard stopped it in step {step}: faster than 7 rad/s")
+        value += math.cos(angle)
+        time.sleep(max(0.0, begun + 0.05 * step / clock - time.monotonic()))
+    return value
+
+
+def array(dtype: str, shape: list[int], values: list[float]) -> msgpack.ExtType:
+    """Numbers as an array: the length of its head in a byte, the head (dtype and shape), their bytes."""
+    head = msgpack.packb([dtype, shape])
+    return msgpack.ExtType(1, bytes([len(head)]) + head + struct.pack(f"<{len(values)}{LETTERS[dtype]}", *values))
+
+
+def numbers(_: int, data: bytes) -> list[float]:
+    """The numbers of an array, one behind the other."""
+    (dtype, _), raw = msgpack.unpackb(data[1 : 1 + data[0]]), data[1 + data[0] :]
+    return struct.unpack(f"<{len(raw) // struct.calcsize(LETTERS[dtype])}{LETTERS[dtype]}", raw)
+
+
+class Worker:
+    """Joins a farm, does a job at a time, and says what it cannot do."""
+
+    def __init__(self, session: zenoh.Session, name: str, clock: float) -> None:
+        self.session, self.clock, self.id = session, clock, f"{name}/{os.getpid()}-{os.urandom(3).hex()}"
+        self.runs, self.rounds, self.events = set(), {}, queue.Queue()
+        self.inbox = session.declare_subscriber(f"farm/pairs/{self.id}", self.events.put)
+        self.learners = session.liveliness().declare_subscriber("farm/live/learner/*", self.events.put, history=True)
+        self.token = session.liveliness().declare_token(f"farm/live/worker/{self.id}")  # last, or jobs are lost
+
+    def serve(self) -> None:
+        """Take in what comes; where nothing does for a second, say that there is nothing."""
+        while True:
+            try:
+                sample = self.events.get(timeout=1.0)
+                if "/live/" in (key := str(sample.key_expr)):
+                    (self.runs.add if sample.kind == zenoh.SampleKind.PUT else self.runs.discard)(key.split("/")[-1])
+                    self.want()
+                else:
+                    self.chunk(msgpack.unpackb(sample.payload.to_bytes(), ext_hook=numbers))
+            except queue.Empty:
+                self.want(idle=tuple(self.runs))
+            except (ValueError, KeyError, TypeError, StopIteration, struct.error, msgpack.UnpackException) as error:
+                print("ignored a message:", ascii(error))
+
+    def want(self, idle: tuple[str, ...] = ()) -> None:
+        """Ask for a job at a time. The canary is empty: nobody gets these numbers a second time."""
+        own = {"version": "robot_worker", "canary": "", "host": os.uname().nodename, "cores": 1, "ignored": {}}
+        self.say(f"want/{self.id}", "WorkRequest", worker=self.id, credits=1, idle=list(idle), **own)
+
+    def say(self, key: str, kind: str, **fields: object) -> None:
+        """Publish a message, and wait until it is on its way."""
+        payload = msgpack.packb({"schema": SCHEMA, "type": kind, **fields})
+        self.session.put(f"farm/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def ask(self, run: str, what: str) -> bytes:
+        """What the run's learner answers, empty where it does not."""
+        replies = self.session.get(f"farm/run/{run}/{what}", timeout=1.0)
+        return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok), b"")
+
+    def round(self, run: str) -> dict:
+        """The round that is on, and whether it is of a run that the rig knows."""
+        header, said = msgpack.unpackb(self.ask(run, "generation"), ext_hook=numbers), self.ask(run, "spec")
+        if hashlib.sha256(said).hexdigest() != header["spec"]:
+            raise ValueError("a specification that is not the round's")
+        spec = msgpack.unpackb(said, ext_hook=numbers)
+        own = spec["task"], spec["policy"], spec["task_config"]["steps"] or 50, spec["task_config"]["gamma"]
+        return header | {"fits": own == ("rig.py:Rig", "linear", 50, 1.0) and not header["normaliser"]}
+
+    def chunk(self, chunk: dict) -> None:
+        """Do the jobs of a message, if they belong to the round that is on."""
+        run, head = chunk["run"], {"worker": self.id} | {name: chunk[name] for name in ("run", "incarnation", "round")}
+        if any(self.rounds.get(run, {}).get(name) != head[name] for name in ("incarnation", "round")):
+            self.rounds[run] = self.round(run)
+        header, key = self.rounds[run], f"run/{run}/result/{self.id}"
+        if chunk["schema"] != SCHEMA or any(header[name] != head[name] for name in ("incarnation", "round")):
+            return  # the round is over
+        if not header["fits"]:
+            self.say(key, "Failure", **head, index=None, error="this rig does rig.py:Rig with --policy linear alone")
+            return
+        eps = iter(chunk["eps"])
+        for at in range(0, len(chunk["table"]), 10):
+            index, around, explores, rate, *signs = chunk["table"][at : at + 6]
+            job = [(mu * around, next(eps) if explores else 0.0) for mu in header["mu"]]
+            try:
+                if rate:
+                    raise RuntimeError("the rig records no trajectory")
+                values = [rollout([o + sign * e for o, e in job], self.clock) for sign in signs if sign]
+            except RuntimeError as error:
+                self.say(key, "Failure", **head, index=index, error=str(error))
+                self.want()  # who failed gets nothing until it asks again
+                continue
+            n, own = len(values), {"trajectories": [], "traces": array("<f4", [0, 0, 0], [])}
+            own |= {"returns": array("<f8", [n], values), "flags": array("|b1", [n, 4], [False] * 4 * n)}
+            own |= {"jobs": array("<i8", [1], [index]), "steps": array("<i8", [n], [50] * n)}
+            self.say(key, "Results", **head, **own)
+            print(f"job {index} of round {head['round']}:", *(f"{value:.2f}" for value in values), flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="A simulated rig as a worker.")
+    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="where a learner or a router listens")
+    parser.add_argument("--tls", type=Path, help="a folder worker-NAME of farm certificates")
+    parser.add_argument("--clock", type=float, default=10.0, help="the rig's, times real time")
+    given, config, name = parser.parse_args(), zenoh.Config(), "rig"
+    settings = {"mode": "client", "connect/endpoints": [given.connect], "connect/timeout_ms": -1}
+    settings |= {"connect/retry": {"period_max_ms": 1000}, "transport/link/tls/enable_mtls": bool(given.tls)}
+    if given.tls:
+        name = json.loads((given.tls / "identity.json").read_text())["name"]
+        for key in ("root_ca_certificate ca", "connect_certificate cert", "connect_private_key key"):
+            settings[f"transport/link/tls/{key.split()[0]}"] = str(given.tls / f"{key.split()[1]}.pem")
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, also while nobody answers
+    with zenoh.open(config) as session:
+        Worker(session, name, given.clock).serve()

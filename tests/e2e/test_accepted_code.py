@@ -1,0 +1,259 @@
+"""A task that travels: edited here, learnt by workers that stay; and nobody else can send one."""
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from network import Network, address
+from processes import Farm
+
+from farm.commands import certificates
+from farm.errors import FarmError
+from farm.net import codec, keys, session
+from farm.net.messages import Spec
+from farm.net.session import Session, free_endpoint
+from farm.net.tls import Bundle, Roster, find
+from farm.net.work import RoundHeader
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
+
+POLE = """
+import numpy as np
+import farm
+
+class Pole(farm.Task):
+    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
+    steps = 4
+
+    def reward(self, sim, action):
+        return np.cos(sim.qpos[:, 0])
+"""
+FEW = ("--generations", "2", "--pairs", "4", "--no-record")
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certificates")
+    workers = ("--worker", "w1", "--worker", "w2", "--viewer", "eva")
+    certificates.main(["new", str(folder / "own"), "--learner", "127.0.0.1", *workers])
+    certificates.main(["new", str(folder / "foreign"), "--learner", "127.0.0.1", "--worker", "w1"])
+    return folder
+
+
+@pytest.fixture
+def task(farm: Farm) -> Path:
+    path = farm.folder / "pole.py"
+    path.write_text(POLE)
+    return path
+
+
+@pytest.fixture
+def router(farm: Farm, certs: Path) -> str:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    farm.start_router(endpoint, "--tls", str(certs / "own"))
+    return endpoint
+
+
+def hire(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> Any:
+    """A worker that has joined."""
+    words = ("worker", "--connect", endpoint, "--tls", str(certs / "own"), "--name", name, "--processes", "1", *flags)
+    worker = farm.start(*words)
+    warned = "--accept-code: learners of farm farm run their code here, as this user"
+    assert any((warned if "--accept-code" in flags else "joined farm") in line for line in worker.stdout)
+    return worker
+
+
+def learner(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> Any:
+    words = ("--connect", endpoint, "--tls", str(certs / "own"), "--task", "pole.py:Pole", "--name", name)
+    return farm.start("learner", *words, *FEW, *flags)
+
+
+def ended(process: Any) -> str:
+    process.terminate()
+    return process.communicate(timeout=20)[0]
+
+
+def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
+    farm: Farm, certs: Path, router: str, task: Path
+) -> None:
+    workers = [hire(farm, router, certs, name, "--accept-code") for name in ("w1", "w2")]
+    texts = [POLE.replace("np.cos", f"{factor} * np.cos") for factor in (1, 2, 3)]
+    took = []
+    for i, text in enumerate(texts):
+        task.write_text(text)
+        process = learner(farm, router, certs, f"r{i}", "--json")
+        for line in process.stdout:
+            if '"event": "run"' in line:
+                begun = time.monotonic()
+            if '"event": "generation"' in line:
+                took.append(time.monotonic() - begun)
+                break
+        process.communicate(timeout=60)
+        assert process.returncode == 0
+    assert max(took) < 2.0, "from the run's announcement to a whole generation [s]"
+    said = "".join(map(ended, workers))
+    for i, text in enumerate(texts):
+        assert f"run r{i}: pole.py (SHA-256 {hashlib.sha256(text.encode()).hexdigest()}) came from its learner" in said
+    assert len({farm.summary(f"r{i}")["mean_policy_return"] for i in range(3)}) == 3, "each is another task"
+    farm.call("run", "--task", "pole.py:Pole", "--name", "here", *FEW)
+    assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
+
+
+def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Path) -> None:
+    with closing(Network(3)) as network:
+        names = [word for name in ("left", "right") for word in ("--worker", name)]
+        farm.call("certificates", "new", "certs", "--learner", address(0), *names)
+        join = ("--connect", f"tls/{address(0)}:7447", "--tls")
+        farm.start("router", "--listen", join[1], "--tls", "certs/learner", host=network.hosts[0])
+        flags = ("--processes", "1", "--accept-code")
+        workers = [
+            farm.start("worker", *join, f"certs/worker-{name}", *flags, host=host)
+            for name, host in zip(("left", "right"), network.hosts[1:], strict=True)
+        ]
+        for worker in workers:
+            assert any("joined farm" in line for line in worker.stdout or ())
+        for name, text in (("first", POLE), ("second", POLE.replace("np.cos", "-np.cos"))):
+            task.write_text(text)
+            words = ("--task", "pole.py:Pole", "--name", name, "--generations", "20", "--pairs", "20", "--no-record")
+            process = farm.start("learner", *join, "certs/learner", *words, host=network.hosts[0])
+            said, _ = process.communicate(timeout=60)
+            assert process.returncode == 0, said
+        for worker in workers:
+            said = ended(worker)
+            for name in ("first", "second"):
+                assert f"run {name}: pole.py" in said
+                assert f"serving run {name}" in said
+
+
+def test_who_was_not_told_to_accept_code_says_which_flag(farm: Farm, certs: Path, router: str, task: Path) -> None:
+    plain = hire(farm, router, certs, "w1")
+    process = learner(farm, router, certs, "r")
+    words = "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls"
+    assert any("does not serve this run" in line and words in line for line in process.stdout)
+    hire(farm, router, certs, "w2", "--accept-code")
+    process.communicate(timeout=60)
+    assert process.returncode == 0, "others serve it"
+    assert words in ended(plain)
+
+
+def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
+    farm: Farm, certs: Path, router: str, task: Path
+) -> None:
+    worker = hire(farm, router, certs, "w1", "--accept-code")
+    task.write_text("import os\ndef look():\n    os.environ['PYTEST_CURRENT_TEST']\nlook()\n" + POLE)
+    process = learner(farm, router, certs, "broken")
+    said = []
+    for line in process.stdout:
+        said.append(line.rstrip())
+        if "KeyError" in line and "cannot be imported" not in line:
+            break
+    [first] = [i for i, line in enumerate(said) if "does not serve this run" in line]
+    assert "pole.py cannot be imported: line 3: KeyError: 'PYTEST_CURRENT_TEST'" in said[first]
+    assert '  File "pole.py", line 4, in <module>' in said[first + 1]
+    assert '  File "pole.py", line 3, in look' in "\n".join(said[first:])
+    ended(process)
+    task.write_text(POLE)
+    mended = learner(farm, router, certs, "mended")
+    mended.communicate(timeout=60)
+    assert mended.returncode == 0
+    assert worker.poll() is None
+
+
+def test_what_is_refused_at_the_start(farm: Farm, certs: Path, task: Path) -> None:
+    said = farm.call("worker", "--accept-code", "--processes", "1", status=2)
+    assert said == "farm: --accept-code needs --tls: without certificates anybody could send code\n"
+    task.write_text(POLE + "#" * 1_000_000)
+    tls = ("--listen", free_endpoint().replace("tcp/", "tls/"), "--tls", str(certs / "own"))
+    said = farm.call("learner", "--task", "pole.py:Pole", "--name", "large", *FEW, *tls, status=2)
+    assert "a class's file travels to workers and has at most 1000000" in said
+    assert len(said.splitlines()) == 1
+    assert not (farm.folder / "runs").exists()
+
+
+EVIL = b"raise SystemExit('evil')"
+
+
+def pose(opened: Session, worker: str, run: str) -> None:
+    """Do all that a learner of a task that travels does."""
+    digest = hashlib.sha256(EVIL).hexdigest()
+    spec = codec.encode(
+        Spec(run=run, task="evil.py:Evil", task_config={}, policy="linear", policy_config={}, code={"task": digest})
+    )
+    header = RoundHeader(
+        run=run, incarnation="i", round=1, generation=0, spec=hashlib.sha256(spec).hexdigest(), traces="none",
+        mu=np.zeros(2),
+    )  # fmt: skip
+    for key, said in (
+        (keys.spec("farm", run), spec), (keys.generation("farm", run), codec.encode(header)),
+        (keys.code("farm", run, digest), EVIL), ("farm/**", EVIL),
+    ):  # fmt: skip
+        opened.answer(key, lambda said=said: said)
+    opened.token(keys.learner_token("farm", run))
+    opened.publish(keys.generation("farm", run), codec.encode(header))
+    opened.publish(keys.inbox("farm", worker), b"")
+
+
+@contextlib.contextmanager
+def holding(endpoint: str, bundle: Bundle) -> Iterator[Session]:
+    with session.connect((endpoint,), 5, lambda: False, bundle) as opened:
+        yield opened
+
+
+def test_a_workers_or_a_viewers_certificate_sends_no_code(farm: Farm, certs: Path, router: str, task: Path) -> None:
+    own = certs / "own"
+    evil, honest = hashlib.sha256(EVIL).hexdigest(), hashlib.sha256(task.read_bytes()).hexdigest()
+    with (
+        holding(router, find(own, "worker", "w2")) as w2,
+        holding(router, find(own, "viewer", "eva")) as eva,
+        holding(router, find(own, "viewer", "eva")) as looking,
+        holding(router, find(own, "learner")) as witness,
+    ):
+        for liar, run in ((w2, "fake"), (eva, "false")):
+            pose(liar, "w1/1", run)
+            pose(liar, "w1/1", "r")
+        process = learner(farm, router, certs, "r")
+        farm.wait_for(lambda: witness.ask(keys.code("farm", "r", honest), 0.5) == task.read_bytes())
+        assert looking.ask(keys.code("farm", "r", honest), 0.5) is None, "a viewer reads no source"
+        worker = hire(farm, router, certs, "w1", "--accept-code")
+        process.communicate(timeout=60)
+        for run in ("fake", "false", "r"):  # the liars had the time of a whole run
+            assert not witness.present(keys.learner_token("farm", run), 0.5)
+            assert witness.ask(keys.code("farm", run, evil), 0.5) is None
+    assert process.returncode == 0
+    said = ended(worker)
+    assert "pole.py" in said
+    assert not {"evil", "fake", "false"} & set(said.replace(":", " ").split())
+
+
+class Posing(Bundle):
+    """A worker's bundle with which somebody listens as if it were a learner's."""
+
+    def roster(self) -> Roster:
+        return Roster(("w2",), ("w1",), ())
+
+
+@pytest.mark.parametrize("who", ["foreign", "worker"])
+def test_who_listens_without_a_learners_certificate_of_this_authority_sends_no_code(certs: Path, who: str) -> None:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    folder = certs / "own" / "worker-w2"
+    bundle = find(certs / "foreign", "learner") if who == "foreign" else Posing(folder, "learner", "w2")
+    with session.listen(endpoint, "farm", bundle) as liar:
+        pose(liar, "w1/1", "fake")
+        with pytest.raises(FarmError, match="nobody answers"), holding(endpoint, find(certs / "own", "worker", "w1")):
+            pass
+
+
+def test_a_foreign_learner_does_not_reach_the_router(farm: Farm, certs: Path, router: str, task: Path) -> None:
+    worker = hire(farm, router, certs, "w1", "--accept-code")
+    words = ("--connect", router, "--tls", str(certs / "foreign"), "--task", "pole.py:Pole", "--name", "foreign", *FEW)
+    foreign = farm.start("learner", *words)
+    assert any("may refuse our certificate" in line for line in foreign.stdout)
+    ended(foreign)
+    assert "foreign" not in ended(worker)

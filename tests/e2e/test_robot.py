@@ -1,0 +1,79 @@
+"""A slow device that speaks the protocol in plain Python, beside workers that simulate."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from processes import Farm
+
+from farm.commands import certificates
+from farm.net import keys
+from farm.net.session import connect, free_endpoint
+from farm.net.tls import find
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(60)]
+
+
+def wait_for(process: "subprocess.Popen[str]", words: str) -> str:
+    """What it says until it says that."""
+    said = ""
+    for line in process.stdout or ():
+        said += line
+        if words in line:
+            return said
+    raise AssertionError(said)
+
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+DEVICES = ("--mixed", "--patience", "20", "--audit", "0.5")
+RUN = ("--task", "rig.py:Rig", "--generations", "12", "--no-record")
+
+
+def test_the_example_is_short_and_needs_nothing_of_ours() -> None:
+    text = (EXAMPLES / "robot_worker.py").read_text()
+    assert len(text.splitlines()) <= 150
+    imports = {line.split()[1].partition(".")[0] for line in text.splitlines() if line.startswith(("import", "from"))}
+    assert imports & {"numpy", "mujoco", "farm", "learner", "workers"} == set()
+
+
+def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> None:
+    shutil.copy(EXAMPLES / "rig.py", farm.folder)
+    certificates.main(["new", str(farm.folder / "certs"), "--learner", "127.0.0.1", "--worker", "rig", "--worker", "w"])
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    farm.start_router(endpoint, "--tls", "certs/learner")
+    join = ("--connect", endpoint, "--tls")
+    robot = farm.start_python(str(EXAMPLES / "robot_worker.py"), *join, "certs/worker-rig", "--clock", "20")
+    farm.start("worker", *join, "certs/worker-w", "--processes", "2", "--allow-file", "rig.py")
+    with connect((endpoint,), 20, lambda: False, find(farm.folder / "certs", "learner")) as looking:
+        farm.wait_for(lambda: len(looking.tokens(keys.worker_token("farm", "**"), 1.0)) == 3)
+    said = farm.call("learner", *RUN, *join, "certs/learner", "--name", "r", *DEVICES, timeout=50)
+    lines = farm.progress("r")
+    assert [line["rollouts"] for line in lines] == [20 * (i + 1) for i in range(12)], "each pair counts once"
+    assert lines[0]["mean_policy_return"] < 0, "50 is upright throughout"
+    assert lines[-1]["mean_policy_return"] > 40
+    assert "failed at a job: the rig" in said, "what it cannot do"
+    assert lines[-1]["reissued"] > 0, "goes to others"
+    assert "is expelled" not in said
+    robot.terminate()
+    did, _ = robot.communicate(timeout=20)
+    assert did.count("job ") > 3, did
+    assert "ignored" not in did
+    farm.call("run", *RUN, "--name", "simulated")
+    hashes = {farm.summary(name)["parameters_sha256"] for name in ("r", "simulated")}
+    assert len(hashes) == 2, "what the device measured was learnt from"
+
+
+def test_without_mixed_a_device_is_refused(farm: Farm) -> None:
+    shutil.copy(EXAMPLES / "rig.py", farm.folder)
+    endpoint = free_endpoint()
+    learner = farm.start("learner", *RUN, "--listen", endpoint, "--name", "r")
+    farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
+    wait_for(learner, "it is a device, whose numbers are not to be had again: start the learner with --mixed")
+
+
+def test_a_device_refuses_what_it_does_not_know(farm: Farm) -> None:
+    endpoint = free_endpoint()
+    learner = farm.start("learner", "--listen", endpoint, "--name", "r", "--mixed", "--no-record")
+    farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
+    wait_for(learner, "does not serve this run: this rig does rig.py:Rig with --policy linear alone")

@@ -1,0 +1,225 @@
+"""Code that a learner sends: when it is fetched, what is refused, and what the process that runs it is left with."""
+
+import hashlib
+import logging
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stage import FARM, Learner, Runner, Stage, indices, until
+from test_worker import POLE, pole
+
+from farm.commands import certificates
+from farm.errors import ConfigError
+from farm.net import keys
+from farm.net.session import free_endpoint, listen
+from farm.net.tls import find
+from workers import subprocess_runner
+from workers.worker import Worker, WorkerConfig
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certificates") / "own"
+    certificates.main(["new", str(folder), "--learner", "127.0.0.1", "--worker", "w"])
+    return folder
+
+
+@pytest.fixture
+def safe(certs: Path) -> Iterator[Stage]:
+    """A stage with certificates, whose workers simulate."""
+    Runner.go = threading.Event()
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with listen(endpoint, FARM, find(certs, "learner")) as session:
+        opened = Stage(session, endpoint)
+        yield opened
+        opened.close()
+
+
+class Author(Learner):
+    """A learner of a run whose task is a class in a file, which it sends to who asks."""
+
+    def __init__(self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None) -> None:
+        self.source = file.read_bytes()
+        spec = pole(file) if sends is None else replace(pole(file), code=pole(file).code | {"task": digest(file)})
+        key = keys.code(FARM, run, digest(file))
+        stage.session.answer(key, lambda: self._say("code", self.source if sends is None else sends))
+        super().__init__(stage.session, run, spec)
+        self.header = replace(self.header, mu=np.ones(2), traces="none")
+
+
+def digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def write(folder: Path, text: str = "", name: str = "pole.py") -> Path:
+    """The pole's file with something before it."""
+    path = folder / name
+    path.write_text(text + POLE)
+    return path
+
+
+def hire(stage: Stage, certs: Path) -> Worker:
+    return stage.hire(tls=certs, accept_code=True)
+
+
+def process(worker: Worker) -> subprocess_runner.SubprocessRunner:
+    [found] = [each for each in worker._runners.values() if isinstance(each, subprocess_runner.SubprocessRunner)]
+    return found
+
+
+def test_it_is_fetched_once_and_run_elsewhere(
+    safe: Stage, certs: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setenv("A_SECRET", "s")
+    said = tmp_path / "said"
+    spy = f"""
+import os, sys
+if sys.argv[0].endswith("runner_process.py"):
+    bound, session = "NoNewPrivs:\\t1" in open("/proc/self/status").read(), "zenoh" in sys.modules
+    with open({str(said)!r}, "a") as file:
+        print(os.getpid(), os.getcwd(), os.listdir(), bound, session, *os.environ, sep="|", file=file)
+print("noise")
+"""
+    file = write(tmp_path, spy)
+    author, other = Author(safe, file), Author(safe, file, "again")
+    worker = hire(safe, certs)
+    for learner in (author, author, other):
+        learner.send(worker.id, 0, 1)
+        returns = safe.results(learner.run).returns
+        assert (returns > 3.9).all(), "four steps of at most 1"
+    assert author.asked["code"] + other.asked["code"] == 1, "a source is fetched once, for all runs"
+    assert f"pole.py (SHA-256 {digest(file)}) came from its learner" in caplog.text
+    kept = worker._sources.place("pole.py", digest(file))
+    assert kept.read_bytes() == file.read_bytes()
+    assert kept.parents[1].stat().st_mode & 0o077 == 0
+    lines = [line.split("|") for line in said.read_text().splitlines()]
+    assert len(lines) == 2, "one process for each run"
+    for pid, folder, content, bound, session, *names in lines:
+        assert int(pid) != os.getpid()
+        assert (Path(folder), content) == (worker._sources.empty, "[]")
+        assert (bound, session) == ("True", "False"), "no new privileges, and no session"
+        assert not {"A_SECRET", "HOME"} & set(names)
+    safe.let_go()
+
+
+def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, certs: Path, tmp_path: Path) -> None:
+    author, worker = Author(safe, write(tmp_path)), hire(safe, certs)
+    author.send(worker.id, 0)
+    safe.results()
+    first = process(worker).pid
+    os.kill(first, signal.SIGKILL)
+    author.send(worker.id, 1)
+    assert indices(safe.results()) == [1], "its job is tried once more"
+    pid = process(worker).pid
+    assert pid != first
+    safe.session._tokens.pop().undeclare()
+    until(lambda: not Path(f"/proc/{pid}").exists() and not worker._runners)
+
+
+@pytest.mark.parametrize(
+    ("sends", "words"),
+    [
+        (b"x = 1\n", "the source of pole.py that came does not fit its digest"),
+        (b"#" * 1_000_001, "the source of pole.py that came has more than 1000000 bytes"),
+    ],
+    ids=["digest", "size"],
+)
+def test_what_does_not_fit_is_not_run(safe: Stage, certs: Path, tmp_path: Path, sends: bytes, words: str) -> None:
+    author, worker = Author(safe, write(tmp_path), sends=sends), hire(safe, certs)
+    author.send(worker.id, 0)
+    said = safe.failure()
+    assert (said.index, said.error) == (None, words)
+    assert not list(worker._sources._folder.glob("*/*"))
+
+
+def test_who_was_not_told_to_accept_code_fetches_none(safe: Stage, certs: Path, tmp_path: Path) -> None:
+    author, worker = Author(safe, write(tmp_path)), safe.hire(tls=certs)
+    author.send(worker.id, 0)
+    said = safe.failure()
+    assert said.index is None
+    assert "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls" in said.error
+    assert not author.asked["code"]
+
+
+@pytest.mark.parametrize("name", ["a/pole.py", "..py", "\0.py", "po\nle.py"])
+def test_a_name_that_leads_elsewhere(safe: Stage, certs: Path, tmp_path: Path, name: str) -> None:
+    learner = Learner(safe.session, "r", replace(pole(write(tmp_path)), task=f"{name}:Pole"))
+    worker = hire(safe, certs)
+    learner.send(worker.id, 0)
+    assert "is no name of a file that travels" in safe.failure().error
+
+
+def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
+    safe: Stage, certs: Path, tmp_path: Path
+) -> None:
+    guard = "import sys\nhere = sys.argv[0].endswith('runner_process.py')\n"
+    broken = write(tmp_path, guard + "def load():\n    import nowhere_to_be_found\nif here: load()\n", "broken.py")
+    author, other, worker = Author(safe, broken), Author(safe, write(tmp_path), "other"), hire(safe, certs)
+    author.send(worker.id, 0, 1)
+    said = safe.failure()
+    assert said.index is None
+    assert said.error == (
+        "broken.py cannot be imported: line 4: ModuleNotFoundError: No module named 'nowhere_to_be_found'"
+    )
+    assert said.traceback == (
+        '  File "broken.py", line 5, in <module>', "    if here: load()", "             ^^^^^^",
+        '  File "broken.py", line 4, in load', "    import nowhere_to_be_found",
+        "ModuleNotFoundError: No module named 'nowhere_to_be_found'",
+    )  # fmt: skip
+    other.send(worker.id, 0)
+    assert indices(safe.results("other")) == [0]
+
+
+def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Path, tmp_path: Path) -> None:
+    raises = tmp_path / "raises.py"
+    raises.write_text(POLE.replace("return np", "1 / 0\n        return np"))
+    guard = "import sys\nif sys.argv[0].endswith('runner_process.py'): open('pole.xml')\n"
+    author, other = Author(safe, raises), Author(safe, write(tmp_path, guard), "other")
+    worker = hire(safe, certs)
+    author.send(worker.id, 3)
+    said = safe.failure()
+    assert (said.index, said.error) == (3, "ZeroDivisionError: division by zero")
+    assert said.traceback[0].startswith('  File "raises.py", line 11, in reward')
+    other.send(worker.id, 0)
+    _, said = safe.next("result of other", kind=type(said))
+    assert said.error.endswith("files beside a class do not travel, but texts that its files() reads do")  # type: ignore[attr-defined]
+
+
+def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess_runner, "_JOBS", 0.2)
+    hangs = tmp_path / "hangs.py"
+    hangs.write_text(POLE.replace("return np", "while sim.t > 1: pass\n        return np"))
+    author, worker = Author(safe, hangs), hire(safe, certs)
+    author.send(worker.id, 0)
+    said = safe.failure()
+    assert (said.index, said.error) == (None, "its code did not answer within 0.2 s and was ended")
+
+
+def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: Path) -> None:
+    """The code may write to the worker itself."""
+    forged = """
+import socket, sys
+if sys.argv[0].endswith("runner_process.py"):
+    from workers.runner_process import Answer, send
+    Answer.__post_init__ = lambda _: None
+    send(socket.socket(fileno=int(sys.argv[1])), Answer(error="e", traceback=("\\x1b[2J",)))
+"""
+    author, other = Author(safe, write(tmp_path, forged, "forged.py")), Author(safe, write(tmp_path), "other")
+    worker = hire(safe, certs)
+    author.send(worker.id, 0)
+    said = safe.failure()
+    assert said.error.startswith("the process that runs its code ended")
+    other.send(worker.id, 0)
+    assert indices(safe.results("other")) == [0]
+
+
+def test_without_certificates_it_is_refused() -> None:
+    with pytest.raises(ConfigError, match="--accept-code needs --tls: without certificates anybody could send code"):
+        WorkerConfig(accept_code=True)

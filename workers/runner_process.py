@@ -1,0 +1,149 @@
+"""A process that runs one run's code which came over the network: `python -m workers.runner_process SOCKET`.
+
+It has no session and no certificate; its worker (`workers.subprocess_runner`) sends it jobs over a socket and reads
+what they gave. What such a process can reach all the same: docs/protocol.md, "Code that travels".
+"""
+
+import ctypes
+import resource
+import signal
+import socket
+import struct
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from farm import plugins, rollouts
+from farm.arrays import FloatArray
+from farm.errors import FarmError, MessageError, UnservedError, brief
+from farm.net import codec
+from farm.net.codec import M, array
+from farm.net.messages import Spec
+from farm.net.work import Jobs, Results
+from farm.rollouts import Runner, served
+
+_MOST: Final = 4 * codec.MAX_BYTES  # of a mean, a chunk, a normaliser and what stands around them
+_LENGTH: Final = struct.Struct("<Q")
+_PARENT_DIED: Final = 1  # prctl's PR_SET_PDEATHSIG (linux/prctl.h)
+_NO_NEW_PRIVILEGES: Final = 38  # and its PR_SET_NO_NEW_PRIVS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Begin:
+    """What the process is for; its first message."""
+
+    spec: Spec
+    files: tuple[str, ...]
+    """Paths of the files whose classes it may serve."""
+    backend: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """Jobs, as `Runner.run` takes them."""
+
+    jobs: Jobs
+    traces: str
+    mu: FloatArray = array("<f8", 1)
+    normaliser: FloatArray = array("<f8", 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What became of the last message."""
+
+    size: int = 0
+    """Parameters of the policy; after Begin."""
+    results: Results | None = None
+    """After an Order; of no run and no worker, which is not this process' business."""
+    error: str = ""
+    served: bool = True
+    """False: no job of this run can be run here."""
+    traceback: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that what goes on to the learner can be shown: the process may say anything."""
+        if len(self.traceback) > 40 or not all(len(line) <= 1000 and line.isprintable() for line in self.traceback):
+            raise ValueError("a traceback of more than 40 lines, long lines, or unprintable ones")
+
+
+def send(link: socket.socket, message: object, seconds: float | None = None) -> None:
+    """Send a message, in time; a TimeoutError or another OSError where that cannot be."""
+    payload = codec.encode(message)
+    link.settimeout(seconds)
+    link.sendall(_LENGTH.pack(len(payload)) + payload)
+
+
+def receive(link: socket.socket, kind: type[M], seconds: float | None = None) -> M:
+    """The next message, in time.
+
+    Raises:
+      OSError: it did not come in time (TimeoutError), or the other side is gone.
+      MessageError: it is not of that kind.
+    """
+    until = None if seconds is None else time.monotonic() + seconds
+    (length,) = _LENGTH.unpack(_exactly(link, _LENGTH.size, until))
+    if length > _MOST:
+        raise MessageError(f"a message of {length} bytes; at most {_MOST} are taken", "large")
+    return codec.decode(bytes(_exactly(link, length, until)), kind, most=_MOST)
+
+
+def _exactly(link: socket.socket, count: int, until: float | None) -> bytearray:
+    read = bytearray()
+    while len(read) < count:
+        link.settimeout(None if until is None else max(1e-3, until - time.monotonic()))
+        part = link.recv(min(count - len(read), 1 << 20))
+        if not part:
+            raise ConnectionResetError("the other side is gone")
+        read += part
+    return read
+
+
+def serve(link: socket.socket) -> None:
+    """Do what the worker says until it hangs up."""
+    begin = receive(link, Begin)
+    try:
+        files = tuple(Path(path) for path in begin.files)
+        runner = Runner(*served(begin.spec, files), rollouts.backend(begin.backend).engine)
+    except Exception as error:  # whatever the code may raise
+        send(link, _failed(error, begin.files))
+        return
+    send(link, Answer(size=runner.size))
+    while True:
+        order = receive(link, Order)
+        try:
+            given = runner.run(order.mu, order.jobs, order.traces, order.normaliser)
+            answer = Answer(results=Results.carrying(given, order.jobs, run="", incarnation="", round=0, worker=""))
+        except Exception as error:
+            answer = _failed(error, begin.files)
+        send(link, answer)
+
+
+def _failed(error: Exception, files: tuple[str, ...]) -> Answer:
+    text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
+    if isinstance(plugins.root(error), FileNotFoundError):
+        text += "; files beside a class do not travel, but texts that its files() reads do"
+    lines = plugins.author_traceback(error)
+    for path in files:  # the author knows the file, not where it lies here
+        text, lines = text.replace(path, Path(path).name), tuple(line.replace(path, Path(path).name) for line in lines)
+    return Answer(error=brief(text), served=not isinstance(error, UnservedError), traceback=lines)
+
+
+def main() -> None:
+    """Give up what is not needed, then serve on the socket that was passed on."""
+    kernel = ctypes.CDLL(None)
+    kernel.prctl(_PARENT_DIED, signal.SIGKILL, 0, 0, 0)
+    kernel.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with socket.socket(fileno=int(sys.argv[1])) as link:
+        link.set_inheritable(False)
+        try:
+            serve(link)
+        except OSError:
+            return  # the worker is gone
+
+
+if __name__ == "__main__":
+    main()

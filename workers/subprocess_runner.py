@@ -1,0 +1,133 @@
+"""Code that came over the network, run in a process of its own: the worker's side of `workers.runner_process`."""
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from farm.arrays import FloatArray
+from farm.errors import FarmError, MessageError, UnservedError
+from farm.net.work import NOT_NORMALISED, Jobs, Simulated
+from workers.runner_process import Answer, Begin, Order, receive, send
+
+log = logging.getLogger(__name__)
+
+_BEGIN: Final = 60.0  # [s] to import the code and build the task
+_JOBS: Final = 300.0  # [s] for a chunk: the worker does nothing else meanwhile
+_KEPT: Final = (
+    *("PATH", "PYTHONPATH", "PYTHONHOME", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TZ"),
+    *("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),
+)
+"""Variables that the process is told; no other, which may be a secret."""
+
+
+class RunnerProcess:
+    """A process that has imported the farm and waits to be told what to run; nobody's code so far."""
+
+    def __init__(self, folder: Path) -> None:
+        """Start it in a folder."""
+        self._link, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "workers.runner_process", str(theirs.fileno())],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder,
+                env={name: os.environ[name] for name in _KEPT if name in os.environ}, pass_fds=(theirs.fileno(),),
+                start_new_session=True,
+            )  # fmt: skip
+        self.pid = self._process.pid
+
+    def ask(self, message: Begin | Order, seconds: float) -> Answer:
+        """Send a message and wait for what became of it.
+
+        Raises:
+          FarmError: the code raised, with its traceback, or the process died.
+          UnservedError: the run cannot be served, or nothing came in time.
+        """
+        try:
+            send(self._link, message, seconds)
+            answer = receive(self._link, Answer, seconds)
+        except TimeoutError:
+            self.close()
+            raise UnservedError(f"its code did not answer within {seconds:g} s and was ended") from None
+        except (OSError, MessageError) as error:
+            self.close()
+            kind = UnservedError if isinstance(message, Begin) else FarmError
+            raise kind(f"the process that runs its code ended (status {self._process.returncode}): {error}") from None
+        if answer.error:
+            raised = FarmError(answer.error) if answer.served else UnservedError(answer.error)
+            raised.traceback = answer.traceback
+            raise raised
+        return answer
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed, or died."""
+        return self._process.poll() is not None
+
+    def close(self) -> None:
+        """End the process and what it started."""
+        if not self.ended:
+            with suppress(ProcessLookupError):
+                os.killpg(self.pid, signal.SIGKILL)
+            self._process.wait()
+        self._link.close()
+
+
+class SubprocessRunner:
+    """Runs one run's jobs as `farm.rollouts.Runner` does, in a process that is begun again where it dies."""
+
+    def __init__(self, begin: Begin, folder: Path, process: RunnerProcess | None = None) -> None:
+        """Have the task built there.
+
+        Args:
+          begin: what the run simulates.
+          folder: where its processes run; an empty one.
+          process: that waits already.
+
+        Raises:
+          FarmError: the task cannot be built; says why, with the traceback where the code raised.
+        """
+        self._begin, self._folder = begin, folder
+        if process is not None and process.ended:
+            process.close()
+            process = None
+        self.size = self._start(process or RunnerProcess(folder))
+        """Parameters of the policy, P."""
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def run(
+        self, mu: FloatArray, jobs: Jobs, traces: str = "none", normaliser: FloatArray = NOT_NORMALISED
+    ) -> Simulated:
+        """Run jobs around a mean (P,); as `Runner.run`.
+
+        Raises:
+          FarmError: the code raised, with its traceback, or its process died.
+          UnservedError: it does not answer, or cannot be begun again.
+        """
+        if self._process.ended:
+            self._start(RunnerProcess(self._folder))
+        found = self._process.ask(Order(jobs=jobs, traces=traces, mu=mu, normaliser=normaliser), _JOBS).results
+        if found is None:
+            raise FarmError("the process that runs the run's code answered with no results")
+        return Simulated(found.returns, found.flags, found.steps, found.traces, found.trajectories, found.moments)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.close()
+
+    def _start(self, process: RunnerProcess) -> int:
+        self._process = process
+        try:
+            return process.ask(self._begin, _BEGIN).size
+        except FarmError:
+            process.close()
+            raise
