@@ -75,7 +75,7 @@ class Policy:
     def reset(self) -> None:
         """The moment of release: the fingers hold the object, and nothing else does."""
         mujoco.mj_setState(self.model, self.data, self.p["state"], self.p["state_kind"])
-        self.x, self.last = self.p["x"], self.p["start_command"]
+        self.x, self.last, self.released = self.p["x"], self.p["start_command"], self.data.qpos[8:].copy()
 
     def act(self) -> np.ndarray:
         """One action (8,) [rad]; the servos' targets follow from it."""
@@ -101,8 +101,8 @@ class Policy:
         if policy == "weighted-kernel":
             y, bandwidth = (x - self.p["origin"]) / self.p["spread"], self.config["width"] * np.sqrt(len(x))
             return self.config["weight_scale"] * theta[:, -1] * exp(powers(theta[:, :-1], y, bandwidth))
-        if policy == "linear":
-            return (theta[:, :-1] * x).sum(axis=-1) + theta[:, -1]
+        if policy in ("linear", "constant"):  # one sees everything, the other nothing
+            return (theta[:, :-1] * x[: theta.shape[1] - 1]).sum(axis=-1) + theta[:, -1]
         if policy == "mlp":
             for units in (*self.config["layers"], 8):
                 rows, theta = np.split(theta, [units * (len(x) + 1)])
@@ -159,7 +159,15 @@ class Policy:
             points - self.p["goal_points"],
         )
         terms = [-w * (v.ravel() * v.ravel()).sum() for w, v in zip(self.p["weights"], wrong, strict=True)]
-        return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"]])), held
+        moved = [self.moved()] if self.p["motion"] else []
+        return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"], *moved])), held
+
+    def moved(self) -> float:
+        """What it costs that the object is no longer where it was released."""
+        shift, now = self.data.qpos[8:11] - self.released[:3], self.data.qpos[11:]
+        distance, cosine = np.sqrt((shift * shift).sum()), np.abs((now * self.released[3:]).sum())
+        squares = (distance / self.p["moved"]) ** 2 + (1.0 - cosine) / (1.0 - self.p["turned_cosine"])
+        return float(-self.p["motion"] * np.minimum(squares, self.p["most_motion"]))
 
 
 def main() -> None:

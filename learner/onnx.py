@@ -124,6 +124,12 @@ def _layers(graph: Graph, policy: LoadedPolicy, x: str) -> str:
     return x
 
 
+def _constant(graph: Graph, policy: LoadedPolicy, x: str) -> str:
+    return graph.put(
+        "Add", graph.put("MatMul", x, np.zeros((policy.problem.spec.observation, len(policy.mu)))), policy.mu
+    )
+
+
 def _gaussians(graph: Graph, x: str, centres: AnyArray, bandwidth: float) -> str:
     """exp(-|c - x|^2 / (2 h^2)) of centres (K, d), (N, K)."""
     difference = graph.put("Sub", graph.put("Unsqueeze", x, np.array([1])), centres)
@@ -163,5 +169,5 @@ def _features(graph: Graph, policy: LoadedPolicy, x: str) -> str:
 
 _FORMS: Final[Mapping[str, Callable[[Graph, LoadedPolicy, str], str]]] = {
     "direct": _features, "projected": _features, "cosine": _features, "kernel": _kernel, "linear": _layers,
-    "mlp": _layers, "rbf": _rbf, "weighted-kernel": _weighted_kernel,
+    "mlp": _layers, "constant": _constant, "rbf": _rbf, "weighted-kernel": _weighted_kernel,
 }  # fmt: skip

@@ -20,6 +20,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "projected": {"features": 30},
     "cosine": {"features": 30},
     "kernel": {},
+    "constant": {"pose": "between", "motion": 0.3},
     "linear": {},
     "mlp": {"layers": (5, 3)},
     "rbf": {"centres": 4},
