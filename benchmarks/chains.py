@@ -2,10 +2,10 @@
 
     python benchmarks/chains.py [--seeds 20,21,22,23,24] [--policy constant] [--out runs/chains]
 
-The gaits are the presets middle-on, index-off, index-on and middle-off, learnt by the farm. A gait's rollouts are
-those after which the mean policy succeeds on at least 95 of 100 perturbed starts, and from then on each time it is looked
-at: after every generation of the first 200 rollouts, and at the end. The chain is
-tried on 50 other starts for 1000 control steps (100 s). What is there already is not learnt again.
+The gaits are the presets middle-on, index-off, index-on and middle-off, learnt by the farm. A gait's rollouts are those
+after which the mean policy succeeds on at least 95 of 100 perturbed starts, and from then on each time it is looked at:
+after every generation of the first 200 rollouts, and at the end. The chain is tried on 50 other starts for 1000 control
+steps (100 s). What is there already is not learnt again.
 """
 
 import argparse

@@ -17,7 +17,7 @@ from farm.rollouts import Runner
 from farm.tasks.gymnasium import Environment, EnvironmentConfig, make, reset_seed
 
 NAMES = (
-    *("Swimmer-v5", "Hopper-v5", "HalfCheetah-v5", "Walker2d-v5"),
+    *("Swimmer-v5", "Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5"),
     *("InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Reacher-v5", "Pusher-v5"),
 )
 

@@ -27,6 +27,7 @@ COMMANDS: Final = {
     "check": "checks a task of your own: sizes, same bits however batched, rollouts per second, a picture",
     "evaluate": "the learnt mean policy on perturbed starts",
     "replay": "any policy of a run again, at physics rate, into a recording or a video",
+    "chain": "learnt policies in turn, each from where the one before it ended",
     "compare": "several runs in one recording: curves overlaid, scenes side by side",
     "play": "the learnt policy in MuJoCo's interactive viewer: push what moves",
     "export": "the learnt policy as one file for plain MuJoCo and numpy",

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainCommand(Settings):
-    """Learnt policies in turn: the next one acts when the goal of the one before has been felt, the last leads to the
-    first. Says how many cycles they make from perturbed starts, and records them."""  # noqa: D205, D209
+    """Learnt policies in turn, each from where the one before it ended: how many cycles they make."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of the runs, in the order in which their policies act."""

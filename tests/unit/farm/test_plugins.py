@@ -24,7 +24,7 @@ def test_built_in() -> None:
     )  # fmt: skip
     assert len(found.digest()) == 64
     assert names("policies") == dict.fromkeys(
-        ("direct", "projected", "kernel", "cosine", "linear", "mlp", "rbf", "weighted-kernel"), "built in"
+        ("direct", "projected", "kernel", "cosine", "constant", "linear", "mlp", "rbf", "weighted-kernel"), "built in"
     )
 
 
