@@ -2,11 +2,12 @@
 
     python -m docs.results runs/thesis [--machine SENTENCE]        (docs/results itself: the page and figures again)
 
-Figures and data are copied; every number in the tables comes from the data. What is written by hand stands in
-docs/results/notes.md: under a heading with the experiment's name, what its result means.
+Data is put beside what is there, and figures are drawn; every number in the tables comes from the data. What is written
+by hand stands in docs/results/notes.md: under a heading with the experiment's name, what its result means.
 """
 
 import argparse
+import json
 import re
 import shutil
 from collections.abc import Iterator
@@ -52,28 +53,36 @@ def main() -> None:
     chosen = parser.parse_args()
     folder, out = ExperimentFolder.open(chosen.folder), HERE / "results"
     folder.gather()
-    (out / "data").mkdir(parents=True, exist_ok=True)
-    here = folder.path.resolve() == out.resolve()
-    if not here:
-        shutil.copy(folder.path / "experiment.json", out)
+    if folder.path.resolve() != out.resolve():
+        _take(folder, out)
     machine = out / "machine.txt"
     if chosen.machine:
         machine.write_text(chosen.machine + "\n", "utf-8")
     notes = dict(sections((out / "notes.md").read_text("utf-8"))) if (out / "notes.md").exists() else {}
-    parts = []
+    whole, parts = ExperimentFolder.open(out), []
+    for name in whole.experiments:
+        experiment, data = EXPERIMENTS[name], whole.data(EXPERIMENTS[name])
+        draw(experiment, data, out)[0].unlink()  # the SVG is enough here
+        parts.append(section(experiment, data, notes.get(name, "")))
+    head = HEAD.format(last=whole.trials - 1, machine=machine.read_text("utf-8").strip())
+    overview = "\n".join(summary(EXPERIMENTS[name], whole.data(EXPERIMENTS[name])) for name in whole.experiments)
+    table = f"| experiment | what | verdict |\n|---|---|---|\n{overview}\n\n"
+    (HERE / "results.md").write_text(head + table + "\n".join(parts), "utf-8")
+
+
+def _take(folder: ExperimentFolder, out: Path) -> None:
+    """Measure what is missing, and put a folder's data and experiments beside those that are here."""
+    (out / "data").mkdir(parents=True, exist_ok=True)
+    known = ExperimentFolder.open(out).experiments if (out / "experiment.json").exists() else ()
     for name in folder.experiments:
         experiment = EXPERIMENTS[name]
         measure(folder, experiment)
         for file in {*(f"{setup}.npz" for setup in experiment.curves.values()), f"{name}.npz"}:
-            if (folder.path / "data" / file).exists() and not here:
+            if (folder.path / "data" / file).exists():
                 shutil.copy(folder.path / "data" / file, out / "data")
-        data = folder.data(experiment)
-        draw(experiment, data, out)[0].unlink()  # the SVG is enough here
-        parts.append(section(experiment, data, notes.get(name, "")))
-    head = HEAD.format(last=folder.trials - 1, machine=machine.read_text("utf-8").strip())
-    overview = "\n".join(summary(EXPERIMENTS[name], folder.data(EXPERIMENTS[name])) for name in folder.experiments)
-    table = f"| experiment | what | verdict |\n|---|---|---|\n{overview}\n\n"
-    (HERE / "results.md").write_text(head + table + "\n".join(parts), "utf-8")
+    told = json.loads((folder.path / "experiment.json").read_text("utf-8"))
+    told["experiments"] = [name for name in EXPERIMENTS if name in (*known, *folder.experiments)]
+    (out / "experiment.json").write_text(json.dumps(told, indent=2) + "\n", "utf-8")
 
 
 def sections(text: str) -> Iterator[tuple[str, str]]:
