@@ -55,6 +55,8 @@ _EARLY: Final[Mapping[str, str]] = {
 }  # fmt: skip
 """Set-ups of 1500 rollouts, by state base."""
 
+_BETWEEN: Final = tuple(f"between-{name}" for name in OBJECTS)
+
 _RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb"}
 
 
@@ -101,6 +103,7 @@ SETUPS: Final[dict[str, RunConfig]] = {
     ),
     "joints-D8000-sehnke": _projected("joints", 8000, normaliser="sehnke"),
     **{f"default-{name}": _default(object=name) for name in OBJECTS},
+    **{f"between-{name}": _default(object=name, pose="between", generations=50) for name in OBJECTS},
     "default-direct": _default(policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
     "release-kernel": _default(**_RELEASE),
     "release-direct": _default(
@@ -457,6 +460,16 @@ _QUESTIONS: Final = [
         question="Thesis 5.2: can the gait be learnt on other objects, and does a policy work on objects it has "
         "never held?",
         curves={name: f"default-{name}" for name in OBJECTS},
+        figure=Transfer(objects=OBJECTS),
+        find=claims.transfer,
+    ),
+    Experiment(
+        name="objects-between",
+        title="Other objects, with the thumb between the fingers",
+        question="Can the gait be learnt on other objects within 1500 rollouts when the thumb stands between the "
+        "fingers (`--pose between`) and the start fits the size of the state, and does a policy work on objects it has "
+        "never held?",
+        curves={name: f"between-{name}-fitted" for name in OBJECTS},
         figure=Transfer(objects=OBJECTS),
         find=claims.transfer,
     ),
