@@ -48,7 +48,6 @@ def _default(**settings: Any) -> RunConfig:  # noqa: ANN401
 
 _WIDE: Final = ("contacts-D1500", "joints-tactile-D5400")
 _ACCURATE: Final = ("joints-D1600", "contacts-D3400", "tactile-D10800", "joints-tactile-D12600")
-_ALL: Final = ("joints-D1500", "contacts-D1500-N50", *_WIDE, *_ACCURATE)
 _EARLY: Final[Mapping[str, str]] = {
     "joints": "early-joints", "joints+contacts": "early-contacts", "tactile": "early-tactile",
     "joints+tactile": "early-joints-tactile",
@@ -121,7 +120,7 @@ FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     for suffix, names, parts in (
         (
             "fitted",
-            ("joints-D1500", *_WIDE, *_ACCURATE, "contacts-D1500-N50", *_EARLY.values()),
+            ("joints-D1500", *_WIDE, *_ACCURATE, "contacts-D1500-N50", *_EARLY.values(), *_BETWEEN),
             ("bandwidth", "initial_sigma"),
         ),
         ("width", _WIDE, ("bandwidth",)),
