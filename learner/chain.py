@@ -93,14 +93,17 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
       ConfigError: one does not; names the two.
     """
     if not policies:
-        raise ConfigError("a chain needs policies; expected one or more")
+        raise ConfigError("a chain needs policies: give one run or more, in the order in which they act")
     tasks: list[Any] = [policy.problem.task for policy in policies]
     for policy, task in zip(policies, tasks, strict=True):
         if task.ends is None:
             raise ConfigError(f"{policy.problem.config.task} cannot be chained: its task has no `ends`")
     for one, other in pairwise([*tasks, tasks[0]]):
         if one.ends[1] != other.ends[0]:
-            raise ConfigError(f"a policy that ends in {one.ends[1]} is not followed by one from {other.ends[0]}")
+            raise ConfigError(
+                f"a policy that ends in {one.ends[1]} is not followed by one from {other.ends[0]}: give runs of which "
+                "each begins where the one before ends, the first where the last does"
+            )
         if one.sources != other.sources:
             raise ConfigError(
                 f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different models: learn both with "

@@ -14,7 +14,7 @@ from rich.table import Table
 from farm import seeds, settings
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
-from farm.errors import writing
+from farm.errors import ConfigError, writing
 from farm.seeds import SEEDS
 from farm.settings import Settings, setting
 from learner.commands import recordings
@@ -59,6 +59,7 @@ def main(words: Sequence[str]) -> int:
 
     policies = [loaded(RunFolder.open(path)) for path in command.runs]
     check(policies)
+    check_lengths(policies, command)
     if command.video is not None:
         video.check(command.video)
     drawn = [seeds.trial(command.seed, i) for i in range(command.starts)]
@@ -80,6 +81,16 @@ def main(words: Sequence[str]) -> int:
     say(f"{said}; {found['lost']} of {command.starts} lost within {command.steps} control steps")
     _record(policies, command)
     return 0
+
+
+def check_lengths(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
+    """See that the tasks take as many steps, before any work is done: a ConfigError names the flag."""
+    for flag in ("steps", "shown"):
+        for policy in policies:
+            try:
+                replace(policy.problem.task.config, steps=getattr(command, flag))
+            except ConfigError as error:
+                raise ConfigError(f"--{flag}: {error}") from None
 
 
 def figures(chained: "Chained", policies: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import GRIPS
 from farm.tasks.finger_gait.task import FingerGait
 from learner.chain import chain
+from learner.commands.chain import ChainCommand, check_lengths
 from learner.config import configure
 from learner.replay import LoadedPolicy
 from learner.setup import problem
@@ -63,3 +64,10 @@ def test_gaits_that_do_not_follow_each_other(gait: Make) -> None:
         chain([add], drawn(1), 3)
     with pytest.raises(ConfigError, match="simulate different models"):
         chain([add, gait("index+middle+thumb", "index+thumb", "thick-bar")], drawn(1), 3)
+
+
+@pytest.mark.parametrize("flags", [{"shown": 2}, {"shown": 1001}, {"steps": 1001}], ids=str)
+def test_lengths_that_a_task_does_not_take_are_refused_beforehand(gait: Make, flags: dict[str, int]) -> None:
+    (flag, value), add = next(iter(flags.items())), gait("index+thumb", "index+middle+thumb")
+    with pytest.raises(ConfigError, match=f"--{flag}: steps is {value}; expected 3 to 1000"):
+        check_lengths([add], ChainCommand(runs=(), **flags))  # type: ignore[arg-type]
