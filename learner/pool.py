@@ -19,6 +19,7 @@ import numpy as np
 from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.errors import ConfigError, RunError
+from farm.net import keys
 from farm.net.session import free_endpoint
 from farm.net.tls import find
 from farm.net.work import Jobs
@@ -32,6 +33,7 @@ from learner.setup import problem
 
 log = logging.getLogger(__name__)
 
+_WORKERS: Final = 1024  # as of farm run
 _GATHER: Final = 256 << 20  # [bytes] of parameters that are given out at a time
 
 
@@ -68,13 +70,14 @@ class Farm:
           FarmError: nobody listens at `connect`.
         """
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+        if not endpoints and (type(workers) is not int or not 1 <= workers <= _WORKERS):
+            raise ConfigError(f"workers is {workers!r}; expected 1 to {_WORKERS}, or connect to a farm that has some")
+        keys.checked("farm", farm)
         self._problem = problem(configure(task, **settings))
         self._place = Placement(
             workers=0 if endpoints else workers, listen=free_endpoint(), connect=endpoints, farm=farm,
             tls=None if tls is None else find(Path(tls), "learner"), scheduler=SchedulerConfig(audit=audit),
         )  # fmt: skip
-        if not endpoints and workers < 1:
-            raise ConfigError(f"workers is {workers}; expected 1 or more, or connect to a farm that has some")
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
         self._holder: int | None = None  # the thread whose call it is
         with ExitStack() as stack:

@@ -142,8 +142,13 @@ def test_arrays_that_do_not_fit(pool: farm.Farm, thetas: object, seeds: object, 
         assert "\n" not in str(error.value)
 
 
-def test_no_workers_at_all() -> None:
-    with pytest.raises(farm.ConfigError, match="workers is 0; expected 1 or more"):
+def test_names_and_numbers_that_no_farm_has() -> None:
+    with pytest.raises(farm.ConfigError, match="farm 'a/b' is not a name"):
+        farm.Farm("finger-gait", workers=1, farm="a/b")
+    for workers in (1025, 1.5, "2"):
+        with pytest.raises(farm.ConfigError, match=f"workers is {workers!r}; expected 1 to 1024"):
+            farm.Farm("finger-gait", workers=workers)  # type: ignore[arg-type]
+    with pytest.raises(farm.ConfigError, match="workers is 0; expected 1 to 1024, or connect to a farm"):
         farm.Farm("finger-gait", workers=0)
 
 
