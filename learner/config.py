@@ -98,8 +98,13 @@ class RunConfig(Settings):
         if self.interactions is None:
             return 0
         least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
-        most = 8 * least if self.most_pairs is None else self.most_pairs
-        return min(max(-(-self.interactions * (pairs or least) // steps), least), most)
+        return min(max(-(-self.interactions * (pairs or least) // steps), least), self.pairs_at_most)
+
+    @property
+    def pairs_at_most(self) -> int:
+        """The most pairs of a generation, with interactions."""
+        least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
+        return 8 * least if self.most_pairs is None else self.most_pairs
 
 
 def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass

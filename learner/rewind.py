@@ -143,12 +143,13 @@ def _pairs(folder: RunFolder, generation: int) -> int:
     if config.interactions is None:
         return 0
     rollouts = {line.generation: line.rollouts for line in folder.progress()} | {0: 0}
-    if not {generation - 1, generation} <= rollouts.keys():
+    pairs, least = 0, config.algorithm_config.pairs  # type: ignore[attr-defined]
+    if {generation - 1, generation} <= rollouts.keys():
+        rows = (rollouts[generation] - rollouts[generation - 1]) // len(config.algorithm_config.signs())
+        pairs = rows * least // len(explored(config, config.algorithm_config.init(1))[0])
+    if not least <= pairs <= config.pairs_at_most:
         raise ConfigError(f"{folder.path}: progress.jsonl does not say how many pairs generation {generation} had")
-    signs = len(config.algorithm_config.signs())
-    rows = (rollouts[generation] - rollouts[generation - 1]) // signs
-    least: int = config.algorithm_config.pairs  # type: ignore[attr-defined]
-    return rows * least // len(explored(config, config.algorithm_config.init(1))[0])
+    return pairs
 
 
 def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:  # noqa: ANN401

@@ -114,6 +114,16 @@ def test_under_other_settings_of_the_task(task: str, tmp_path: Path) -> None:
         assert (values == again.returns[[4, 1]].tolist()) == same
 
 
+def test_a_number_of_pairs_that_cannot_be(task: str, tmp_path: Path) -> None:
+    learnt(task, tmp_path / "r", interactions=120)
+    path = tmp_path / "r" / "progress.jsonl"
+    first, *others = path.read_text().splitlines()
+    path.write_text("\n".join([json.dumps({**json.loads(first), "rollouts": 4_000_000}), *others, ""]))
+    for generation in (1, 2):
+        with pytest.raises(ConfigError, match=f"does not say how many pairs generation {generation} had"):
+            rewind(tmp_path / "r", generation)
+
+
 def test_rollouts_that_there_are_not(task: str, tmp_path: Path) -> None:
     learnt(task, tmp_path / "r")
     for generation in (0, 9):
