@@ -84,6 +84,8 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
     Raises:
       ConfigError: there is none, several fit, or it is for another role.
     """
+    if not folder.is_dir():
+        raise ConfigError(f"there is no folder {folder}; farm certificates makes it: copy it here")
     if (folder / "cert.pem").exists():
         return _read(folder, role)
     if role == "learner":

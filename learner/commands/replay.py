@@ -180,10 +180,16 @@ def _record_one(folder: RunFolder, path: Path, policy: "LoadedPolicy", name: str
 
 
 def config_of(words: Sequence[str]) -> RunConfig | None:
-    """The configuration of the run that the words name, so that its task's flags are known; None without one."""
+    """The configuration of the run that the words name, so that its task's flags are known; None without one.
+
+    Raises:
+      ConfigError: the first word is no run's folder.
+    """
     for word in words:
         if not word.startswith("-") and (Path(word) / "config.json").is_file():
             return RunFolder(Path(word)).read_config()
+    if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
+        RunFolder.open(Path(words[0]))  # says that there is none: its task's flags would be called unknown
     return None
 
 

@@ -70,6 +70,10 @@ MISTAKES = [
     (("evaluate", "nowhere"), "nowhere is not a run's folder"),
     (("evaluate", "nowhere", "--rollouts", "0"), "rollouts is 0; expected 1"),
     (("replay", "nowhere"), "nowhere is not a run's folder"),
+    (("replay", "nowhere", "--dropped", "2"), "nowhere is not a run's folder"),
+    (("play", "nowhere", "--friction", "0.5"), "nowhere is not a run's folder"),
+    (("chain",), "a chain needs policies: give one run or more"),
+    (("worker", "--tls", "nowhere"), "there is no folder nowhere; farm certificates makes it"),
     (("view", "nowhere"), "no recording in nowhere"),
     (("runs", "nowhere"), "there is no folder nowhere"),
 ]
