@@ -50,9 +50,14 @@ def sources(what: str) -> list[str]:
 
 
 def target(path: Path) -> Path:
-    """A file that a recording may be written to: it ends in .rrd, and no run goes on with it. Else a ConfigError."""
+    """A file that a recording may be written to: it ends in .rrd, folders alone are above it, and no run goes on with
+    it. Else a ConfigError, before any work is done."""  # noqa: D205, D209
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
+    there = next((each for each in path.absolute().parents if each.exists()), None)
+    if path.is_dir() or (there is not None and not there.is_dir()):
+        what = "it is a folder" if path.is_dir() else f"{there} is a file"
+        raise ConfigError(f"--to {path}: {what}; give another name")
     own = path.name == "replay.rrd" or path.name.startswith("run.")
     if own and (path.parent / "config.json").exists():
         raise ConfigError(f"--to {path} would replace the run's own recording: take another name")
