@@ -1,6 +1,6 @@
 """A robot as a worker, in plain Python with zenoh and msgpack: docs/protocol.md, "The worker's side, exactly".
 
-    farm learner --task rig.py:Rig --mixed --patience 10
+    farm run --task rig.py:Rig --mixed --patience 10 --listen tcp/127.0.0.1:7447    # its workers do what a rig cannot
     python robot_worker.py --connect tcp/127.0.0.1:7447
 
 The robot here is a pendulum, integrated against a clock of its own; put yours into `rollout`.
