@@ -106,8 +106,8 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
             )
         if one.sources != other.sources:
             raise ConfigError(
-                f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different models: learn both with "
-                "the same object and pose"
+                f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different models: learn both on "
+                "the same one"
             )
 
 
