@@ -42,7 +42,11 @@ def show_table(port: int, gone: Callable[[], bool]) -> bool:
     Returns:
       whether it is shown; where not, the recordings are there all the same.
     """
-    return _once_loaded(port, gone, lambda viewer, state: viewer.set_location(_table(state.catalog_url, state.location)))
+
+    def go(viewer: ViewerClient, state: ViewerState) -> None:
+        viewer.set_location(_table(state.catalog_url or "", state.location))
+
+    return _once_loaded(port, gone, go)
 
 
 def show_newest(port: int, gone: Callable[[], bool]) -> bool:

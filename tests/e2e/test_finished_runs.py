@@ -161,7 +161,7 @@ def test_one_rollout_and_those_that_the_task_ended(
 def test_the_recording_offers_the_commands(done: Farm) -> None:
     offered = texts(folder(done).recording, "/again")
     assert len(offered) == GENERATIONS
-    assert "farm replay runs/a --generation 0\n" in offered[0]
+    assert "farm replay runs/a --generation 1\n" in offered[0]
     assert "farm replay runs/a --generation 1 --best 5\nfarm replay runs/a --generation 1 --worst 5" in offered[0]
     for line, text in zip(done.progress("a"), offered, strict=True):
         assert ("--dropped" in text) == bool(line["ended"])
