@@ -201,7 +201,7 @@ def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
         each = int(np.prod(channel.shape[1:]))
         for i, name in enumerate(channel.names if each > 1 else [title(channel)]):
             count = each if each > 1 else channel.shape[0]
-            places.append((-0.1 * rows, first + (i + 0.5) * count))
+            places.append((-0.35 * rows, first + (i + 0.5) * count))
             texts.append(name)
         first += int(np.prod(channel.shape))
     places += [(0.0, 1.06 * rows), (float(steps), 1.06 * rows)]

@@ -34,7 +34,7 @@ def test_the_page_draws_the_hand(tmp_path: Path) -> None:
         with Browser(tmp_path / "profile") as browser:
             browser.open(found[1])
             farm.wait_for(lambda: _orange(browser.picture()) > 0.005, seconds=300)
-            assert browser.errors == []
+            assert browser.errors == [], browser.errors
             if wanted := os.environ.get("FARM_PICTURE"):
                 Path(wanted).write_bytes(browser.picture())
         process.terminate()
