@@ -94,7 +94,7 @@ def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
     return sorted(runs, key=lambda run: run.run)
 
 
-def _tables(runs: list[RunStatus], bundle: Bundle | None) -> Group:
+def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
     shown = [] if bundle is None else [plain(f"as {bundle.role} {bundle.name}, by the certificate in {bundle.folder}")]
     if not runs:
         return Group(*shown, "no runs: no learner answers")

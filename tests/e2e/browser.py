@@ -107,6 +107,6 @@ class Browser:
             self.errors.append(known["entry"]["text"])
         elif event.get("method") == "Fetch.requestPaused":
             # The viewer asks its maker's machines for news: they answer nothing, with internet and without.
-            anybody = [{"name": "Access-Control-Allow-Origin", "value": "*"}]
+            anybody = [{"name": f"Access-Control-Allow-{what}", "value": "*"} for what in ("Origin", "Headers")]
             answer = {"responseCode": 200, "responseHeaders": anybody, "body": base64.b64encode(b"{}").decode()}
             self._post("Fetch.fulfillRequest", requestId=known["requestId"], **answer)
