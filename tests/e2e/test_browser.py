@@ -39,6 +39,6 @@ def test_the_page_draws_the_hand(tmp_path: Path) -> None:
                 Path(wanted).write_bytes(browser.picture())
         process.terminate()
         said, _ = process.communicate(timeout=20)
-        assert said == "farm: the viewer is closed\n" or not said, said
+        assert "http" not in said, "one line says where"
     finally:
         farm.close()
