@@ -26,6 +26,7 @@ from rerun.experimental import ViewerClient
 from learner.run import free_endpoint
 
 SIZE: Final = "1600x1000"
+_BAR: Final = 37  # [pixels] on top, where the viewer warns of the machine that it runs on
 _PATIENCE: Final = 60.0  # [s] for the viewer to start, to load, to draw
 
 
@@ -67,7 +68,8 @@ class Viewer:
             if last == before:
                 break
         path.write_bytes(last)
-        Image.open(path).convert("RGB").save(path, optimize=True)
+        whole = Image.open(path).convert("RGB")
+        whole.crop((0, _BAR, *whole.size)).save(path, optimize=True)
         for view in self._client.get_state().views:
             self.errors += [f"{path.name}: {view.name}: {r.summary}" for r in view.reports if r.severity == "error"]
 
@@ -111,8 +113,8 @@ def main() -> None:
         _farm(folder, "run", *swim, "--name", "swim", "--quiet")
         for name, source, tab, at in (
             ("viewer", "runs/first/run.rrd", "Learning", ("generation", {"sequence": 90})),
-            ("rollout", "runs/first/run.rrd", "Rollout", ("sim_time", {"duration": 225.9})),
-            ("replay", "runs/first/gait.rrd", "", ("sim_time", {"duration": 1.2})),
+            ("rollout", "runs/first/run.rrd", "Rollout", ("sim_time", {"duration": 135.7})),
+            ("replay", "runs/first/rollout.rrd", "", ("sim_time", {"duration": 1.2})),
             ("compare", "compare.rrd", "", None),
             ("gym", "runs/swim/run.rrd", "Learning", ("generation", {"sequence": 15})),
         ):

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import io
 import math
+import re
 import sys
 import types
 from collections.abc import Sequence
@@ -16,6 +17,8 @@ from farm.errors import ConfigError
 
 C = TypeVar("C")
 
+_NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+None\)")
+_OR_NONE: Final = re.compile(r"\{None\}\|(\S+)|\{None,(\S+)")
 _FRAME: Final = "│╭╮╰╯─ \n"
 
 
@@ -160,16 +163,36 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
     distinct(default, program)
     said = io.StringIO()
+    shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")  # tyro asks it for frames
     extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, arguments)}
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(shown):
             style = (tyro.conf.OmitArgPrefixes, tyro.conf.UseAppendAction)
             return tyro.cli(kind, prog=program, args=arguments, config=style, **extra)
     except SystemExit as end:
         if end.code:
             raise ConfigError(_one_line(said.getvalue(), program)) from None
         sys.stderr.write(said.getvalue())
+        shown.seek(0)
+        sys.stdout.write(_without_none(shown.read()))
         raise
+
+
+def _without_none(text: str) -> str:
+    """A help text of tyro's without what it says of settings that need not be given; its columns stay."""
+    emptied = re.sub(_NO_DEFAULT, lambda found: re.sub(r"[^\s│]", " ", found[0]), text).splitlines(keepends=True)
+    kept = [
+        line for old, line in zip(text.splitlines(), emptied, strict=True) if line.strip("│ \n") or old == line[:-1]
+    ]
+
+    def given(line: str) -> str:
+        def without(found: re.Match[str]) -> str:
+            what = found[1] or "{" + found[2]
+            return what.ljust(len(found[0])) if line[0] in " │" else what
+
+        return re.sub(_OR_NONE, without, line)
+
+    return "".join(map(given, kept))
 
 
 def _emptied(default: C, arguments: Sequence[str]) -> C:

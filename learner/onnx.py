@@ -35,7 +35,7 @@ class Graph:
         try:
             import onnx
         except ImportError:
-            raise ConfigError("an .onnx file needs onnx: pip install 'rolloutfarm[onnx]'") from None
+            raise ConfigError("an .onnx file needs onnx: pip install onnx") from None
         self._onnx: Any = onnx
         self._nodes: list[Any] = []
         self._constants: list[Any] = []

@@ -24,7 +24,7 @@ COLUMNS: Final = {
 """Of the table, and their types, behind what is varied (text as it was given); names of summary.json, and the return
 of the mean policy before learning."""
 
-INSTALL: Final = "pip install 'rolloutfarm[parquet]' for table.parquet"
+INSTALL: Final = "it needs pyarrow: pip install pyarrow"
 """What to say where pyarrow is missing."""
 
 

@@ -299,6 +299,8 @@ def _worker_flags(place: Placement, problem: Problem) -> list[str]:
 def how_to_join(place: Placement, problem: Problem) -> str:
     """The command by which workers join."""
     host = socket.gethostname()  # for an address that means all of them, other machines need the name
+    if place.tls and place.tls.hosts and host not in place.tls.hosts:
+        host = place.tls.hosts[0]  # another would be refused
     tls = ["--tls", "worker-NAME"] if place.tls else []
     command = " ".join(["farm worker", *_worker_flags(place, problem), *tls])
     return command.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:")

@@ -6,6 +6,7 @@ not to a run: it builds each run's task from its specification and serves runs i
 
 import hashlib
 import logging
+import math
 import os
 import secrets
 import socket
@@ -47,6 +48,7 @@ _HELD: Final = 1000  # chunks of one run; credits keep an honest learner far bel
 _CREDITS: Final = 4  # times as many jobs of one run are held as were asked for: jobs are sent again, and cross others
 _TELL: Final = 1000  # different lines that are said once
 _MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
+_LOOK: Final = 10.0  # [s] without a learner of our farm, after which we look for others
 _MUTE: Final = 9.0  # times as long as a question stayed without an answer no other is asked
 
 
@@ -151,6 +153,7 @@ class Worker:
         self._mute = 0.0  # as _Served.mute, for all runs whose token was not seen
         self._spoke = time.monotonic()
         self._told: set[str] = set()
+        self._look = time.monotonic() + _LOOK
         self._ignored: Counter[str] = Counter()
 
     def join(self) -> None:
@@ -173,6 +176,7 @@ class Worker:
                 self._ignored[error.kind] += 1
                 self._tell(logging.WARNING, f"ignored a message on {event.key}: {error}")
         self._tell_idle()
+        self._look_around()
         chunk = self._next()
         if chunk is not None:
             self._run(chunk)
@@ -230,6 +234,16 @@ class Worker:
             self._runs[name].busy = now
         if idle or (not working and now - self._spoke >= IDLE):
             self._want(idle=tuple(idle))
+
+    def _look_around(self) -> None:
+        """Say once which farms are there when ours has had no learner for a while: --farm may be another there."""
+        if self._runs or time.monotonic() < self._look:
+            return
+        self._look = math.inf
+        seen = {key.partition("/")[0] for key in self._session.tokens(keys.learner_token("*", "*"), _ASK)}
+        if seen and self._config.farm not in seen:
+            text = f"no learner on farm {self._config.farm}; learners are on {', '.join(sorted(seen))}: see --farm"
+            self._tell(logging.WARNING, text)
 
     def _tell(self, level: int, text: str) -> None:
         """Say something once."""

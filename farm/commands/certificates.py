@@ -77,7 +77,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(CertificatesCommand, words, "farm certificates")
     if not _THERE:
-        raise ConfigError("making certificates needs cryptography: pip install 'rolloutfarm[certificates]'")
+        raise ConfigError("making certificates needs cryptography: pip install cryptography")
     with writing(f"to {command.dir}", ConfigError):
         {"new": _new, "add": _add, "renew": _renew}[command.action](command)
     return 0
@@ -263,7 +263,7 @@ class _Authority:
             extensions.append((x509.SubjectAlternativeName([_host(host) for host in hosts]), False))
         _write(folder, key, _certificate(name, key, self.certificate, self.key, days, extensions))
         shutil.copy(self.folder / "cert.pem", folder / "ca.pem")
-        (folder / "identity.json").write_text(json.dumps({"role": role, "name": name}) + "\n", "utf-8")
+        (folder / "identity.json").write_text(json.dumps({"role": role, "name": name, "hosts": hosts}) + "\n", "utf-8")
 
 
 def _certificate(

@@ -19,7 +19,7 @@ from farm.errors import FarmError, MessageError
 from farm.net import codec, keys
 from farm.net.session import LISTEN, Session, connect
 from farm.net.telemetry import RunStatus
-from farm.net.tls import find
+from farm.net.tls import Bundle, find
 
 _ANSWER = 1.0  # [s] that learners have to answer
 
@@ -64,11 +64,11 @@ def main(words: Sequence[str]) -> int:
             return 0
         console = wide()
         if not console.is_terminal:
-            console.print(_tables(runs))
+            console.print(_tables(runs, bundle))
             return 0
-        with Live(_tables(runs), console=console, auto_refresh=False) as live:
+        with Live(_tables(runs, bundle), console=console, auto_refresh=False) as live:
             while not stop.wait(1.0):
-                live.update(_tables(ask(session, command.farm, run)), refresh=True)
+                live.update(_tables(ask(session, command.farm, run), bundle), refresh=True)
     return 0
 
 
@@ -94,9 +94,10 @@ def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
     return sorted(runs, key=lambda run: run.run)
 
 
-def _tables(runs: list[RunStatus]) -> Group:
+def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
+    shown = [] if bundle is None else [plain(f"as {bundle.role} {bundle.name}, by the certificate in {bundle.folder}")]
     if not runs:
-        return Group("no runs: no learner answers")
+        return Group(*shown, "no runs: no learner answers")
     table = compact(time.strftime("runs at %H:%M:%S"))
     for name in ("run", "generation", "return", "mean policy", "open", "re-issued", "refused", "ignored"):
         table.add_column(name, justify="left" if name in ("run", "ignored") else "right", overflow="fold")
@@ -114,7 +115,7 @@ def _tables(runs: list[RunStatus]) -> Group:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
             workers.add_row(*map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored))))
-    return Group(table, workers)
+    return Group(*shown, table, workers)
 
 
 def _counts(ignored: Mapping[str, int]) -> str:

@@ -43,6 +43,8 @@ class Bundle:
     role: Role
     name: str
     """Common name of the certificate."""
+    hosts: tuple[str, ...] = ()
+    """Names and addresses that the learner's certificate is for; empty where the bundle does not tell."""
 
     def listening(self) -> dict[str, object]:
         """Zenoh's settings for a session that is dialled."""
@@ -84,10 +86,14 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
     Raises:
       ConfigError: there is none, several fit, or it is for another role.
     """
-    if not folder.is_dir():
-        raise ConfigError(f"there is no folder {folder}; farm certificates makes it: copy it here")
+    if not os.access(folder, os.R_OK | os.X_OK):
+        why = "this user may not read it" if folder.exists() else "there is no such folder"
+        raise ConfigError(f"--tls {folder}: {why}; expected the folder of a machine that farm certificates made")
     if (folder / "cert.pem").exists():
-        return _read(folder, role)
+        bundle = _read(folder, role)
+        if name and name != bundle.name:
+            raise ConfigError(f"--name {name}: the certificate in {folder} is for {bundle.name}; leave --name out")
+        return bundle
     if role == "learner":
         return _read(folder / "learner", role)
     wanted = folder / f"{role}-{name}"
@@ -102,15 +108,22 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
 
 def _read(folder: Path, role: Role) -> Bundle:
     missing = [name for name in _FILES if not (folder / name).is_file()]
+    closed = [name for name in _FILES if name not in missing and not os.access(folder / name, os.R_OK)]
+    if closed:
+        raise ConfigError(f"this user may not read {', '.join(closed)} in {folder}: chown it, or start as its owner")
     if missing:
         raise ConfigError(f"{folder} lacks {', '.join(missing)}: make it with farm certificates, and copy all of it")
     try:
         identity = json.loads((folder / "identity.json").read_text("utf-8"))
-        bundle = Bundle(folder, identity["role"], keys.checked("certificate", identity["name"]))
+        hosts = tuple(map(str, identity.get("hosts", ())))
+        bundle = Bundle(folder, identity["role"], keys.checked("certificate", identity["name"]), hosts)
     except (ValueError, KeyError, TypeError):
         raise ConfigError(f"{folder / 'identity.json'} is damaged") from None
     if bundle.role != role:
         raise ConfigError(f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here")
+    for name in _FILES[:3]:
+        if b"-----BEGIN " not in (folder / name).read_bytes():
+            raise ConfigError(f"{folder / name} is damaged: expected PEM; copy the bundle again")
     private(folder / "key.pem")
     return bundle
 

@@ -95,6 +95,13 @@ class Scene:
         """Radius of what moves, or of the scene where nothing does [m]."""
         return float(self.model.stat.extent) if self.mover is None else self.mover.radius
 
+    @cached_property
+    def free(self) -> str | None:
+        """The first drawn body that hangs on nothing, an object say; None where there is none."""
+        joints = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        bodies = [int(body) for body in self.model.jnt_bodyid[joints] if body in self._drawn]
+        return self.bodies[self._drawn.index(bodies[0])] if bodies else None
+
     @property
     def left_out(self) -> int:
         """Number of geometries that are not drawn: meshes and height fields."""

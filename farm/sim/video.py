@@ -27,7 +27,7 @@ def check(path: Path) -> None:
         raise ConfigError(f"--video {path}: expected a name that ends in {' or '.join(_NEEDS)}")
     package, name = _NEEDS[path.suffix]
     if importlib.util.find_spec(package) is None:
-        raise ConfigError(f"a {path.suffix} needs {name}: pip install 'rolloutfarm[video]'")
+        raise ConfigError(f"a {path.suffix} needs {name}: pip install {name}")
     if not path.parent.is_dir():
         raise ConfigError(f"cannot write {path}: there is no folder {path.parent}")
 

@@ -126,7 +126,7 @@ class CMAES(Settings):
         try:
             import cmaes
         except ImportError:
-            raise ConfigError(f"algorithm {self._name} needs cmaes: pip install 'rolloutfarm[cma]'") from None
+            raise ConfigError(f"algorithm {self._name} needs cmaes: pip install cmaes") from None
         return getattr(cmaes, self.optimiser)
 
     def _write(self, state: CMAState) -> Any:  # noqa: ANN401  the library's object

@@ -115,12 +115,16 @@ def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     yield "generations done", *(str(run.progress[-1].generation) for run in runs)
     yield "rollouts", *(str(run.progress[-1].rollouts) for run in runs)
     yield "return of the final policy", *said("mean_policy_return", ".3f")
-    success = {True: "yes", False: "no", None: "-"}
-    yield "it succeeds", *(success[run.summary.get("mean_policy_success")] for run in runs)
+    yield "it succeeds", *(_succeeds(run.summary) for run in runs)
     yield "robust success", *said("robust_success_rate", ".0%")
     yield "first success, generation", *(_first_success(run.progress) for run in runs)
     yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)
     yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)
+
+
+def _succeeds(summary: Mapping[str, Any]) -> str:
+    success = {True: "yes", False: "no", None: "-"}[summary.get("mean_policy_success")]
+    return "cut short" if success == "no" and summary.get("state") != "finished" else success
 
 
 def _first_success(progress: Sequence[GenerationStats]) -> str:

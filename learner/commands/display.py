@@ -20,7 +20,9 @@ from learner.run import Run
 from learner.telemetry.report import Report
 
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
-_SPARK: Final = 40  # fits into 80 columns
+_SPARK: Final = 80  # characters of a curve, at most
+_SPARK_LEAST: Final = 8
+_BESIDE_SPARK: Final = 33  # columns for what stands beside it
 _WORKERS: Final = 6  # shown by name
 
 Style = Literal["auto", "quiet", "json"]
@@ -142,8 +144,9 @@ class LiveDisplay(Display):
         table.add_row("return", f"{p.return_mean:.3f}", f"{p.return_min:.3f} to {p.return_max:.3f}, best {p.best:.3f}")
         said = {True: Text("succeeds", "green"), False: Text("does not succeed", "yellow"), None: Text()}
         table.add_row("mean policy", f"{p.mean_policy_return:.3f}", said[p.mean_policy_success])
-        low, high = min(self._returns), max(self._returns)
-        table.add_row("  so far", f"{low:.3f}", Text.assemble((spark(self._returns, _SPARK), "cyan"), f" {high:.3f}"))
+        first, now = self._returns[0], self._returns[-1]
+        width = max(_SPARK_LEAST, min(_SPARK, self._console.width - _BESIDE_SPARK))
+        table.add_row("  so far", f"{first:.3f}", Text.assemble((spark(self._returns, width), "cyan"), f" {now:.3f}"))
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:

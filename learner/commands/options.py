@@ -1,5 +1,6 @@
 """What a learner is told besides the run's configuration: nothing here changes a number."""
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -138,7 +139,11 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
     what = options.config.stem if options.config else options.preset or next(iter(configs.presets(config.task)))
     task = plugins.find("tasks", config.task).wire.replace(".py:", "-").replace(":", "-").replace("/", "-")
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-    return keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
+    name = keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
+    if options.name:
+        return name
+    later = (f"{name}-{number}" for number in itertools.count(2))  # another run of this second may have the name
+    return next(each for each in itertools.chain([name], later) if not (options.out / each).exists())
 
 
 def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[settings.C, RunFolder | None, RunConfig]:

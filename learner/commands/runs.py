@@ -60,13 +60,20 @@ def main(words: Sequence[str]) -> int:
         what = (
             row["run"], row["state"], str(row["generations"]),
             "" if value is None else f"{value:.3f}",
-            {True: "yes", False: "no", None: ""}[row["mean_policy_success"]],
+            _succeeds(row),
             "" if robust is None else f"{robust:.0%}",
             (row["parameters_sha256"] or "")[:8],
         )  # fmt: skip
         table.add_row(*(plain(text or "") for text in what))
     wide().print(table)
     return 0
+
+
+def _succeeds(row: dict[str, Any]) -> str:
+    """Whether the run's policy succeeds; of one that was cut short nobody knows what it would have learnt."""
+    if row["mean_policy_success"] is False and row["state"] != "finished":
+        return "not yet"
+    return {True: "yes", False: "no", None: ""}[row["mean_policy_success"]]
 
 
 def _row(folder: RunFolder) -> dict[str, Any]:

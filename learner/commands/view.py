@@ -1,23 +1,23 @@
 """`farm view`: recordings of runs in the Rerun viewer."""
 
-import logging
+import os
 import socket
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
+from urllib.parse import quote, urlsplit
 
 import tyro
 
 from farm import settings as arguments
 from farm.commands import logs
+from farm.commands.logs import say
 from farm.commands.screen import display
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, Interrupted, RunError
 from farm.processes import end
 from learner.commands import recordings
 from learner.run import check_rerun
-
-log = logging.getLogger(__name__)
 
 _PAGE = 9090  # where a browser finds the viewer, if nobody else is there
 _LOOK = 0.1  # [s] between two looks at the viewer
@@ -63,19 +63,23 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
       Interrupted: Ctrl-C or SIGTERM, which end the viewer as well.
     """
     from learner.recording.files import program
-    from learner.recording.viewing import free_port, show_table
+    from learner.recording.viewing import free_port, listens, show_newest, show_table
 
-    port = free_port()
+    port, page = free_port(), free_port(_PAGE)
     command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
-    if web:
-        page = free_port(_PAGE)
-        command += ["--web-viewer", "--web-viewer-port", str(page)]
-        tunnels = " ".join(f"-L {number}:127.0.0.1:{number}" for number in (page, port))
-        log.warning("over ssh: ssh %s %s, and open the page there", tunnels, socket.gethostname())
-    with stop_flag("closing the viewer") as stop, subprocess.Popen(command) as viewer:
+    command += ["--web-viewer", "--web-viewer-port", str(page)] if web else []
+    quiet = {"RUST_LOG": "warn"} | os.environ  # its own lines name an address that ssh does not reach
+    with stop_flag("closing the viewer") as stop, subprocess.Popen(command, env=quiet) as viewer:
         try:
-            if table and not web:
-                show_table(port, lambda: viewer.poll() is not None or stop.is_set())
+
+            def gone() -> bool:
+                return viewer.poll() is not None or stop.is_set()
+
+            if not web:
+                (show_table if table else show_newest)(port, gone)
+            elif listens(page, gone):
+                live = [source for source in sources if "://" in source]  # these a browser reads itself
+                say(_address(page, live or [f"rerun+http://127.0.0.1:{port}/proxy"]))
             while viewer.poll() is None and not stop.wait(_LOOK):
                 pass
         finally:
@@ -86,3 +90,11 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
     if viewer.returncode:
         raise RunError(f"Rerun's viewer ended with status {viewer.returncode}: {hint}")
     return 0
+
+
+def _address(page: int, streams: Sequence[str]) -> str:
+    """Where a browser finds the viewer with these streams, here and from another machine."""
+    ports = [page, *(urlsplit(stream).port for stream in streams)]
+    tunnels = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
+    asked = "&".join(f"url={quote(stream, safe='')}" for stream in streams)
+    return f"open http://127.0.0.1:{page}/?{asked}   (from elsewhere: ssh {tunnels} {socket.gethostname()} first)"

@@ -76,7 +76,7 @@ def _begun(name: str, folder: Path, config: Mapping[str, Any], done: int) -> Log
     try:
         logger: Logger = target(folder, config, done)
     except ImportError as error:
-        raise ConfigError(f"--log {name} needs {error.name}: pip install 'rolloutfarm[{name}]'") from None
+        raise ConfigError(f"--log {name} needs {error.name}: pip install {error.name}") from None
     except Exception as error:  # such as no account, or no network
         raise ConfigError(f"--log {name} cannot begin: {type(error).__name__}: {brief(str(error))}") from None
     return logger

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import rerun as rr
@@ -22,6 +22,7 @@ _PICTURES: Final = 0.42  # height of the pictures below a scene of 1
 _CAPTION: Final = 0.16  # and of a caption alone
 _LEGEND: Final = 6  # more curves than these have no legend: it would hide them
 _MARGIN: Final = 1.6  # so many rollouts before the cursor: the legend covers the older ones
+_SEAM: Final = 1000  # [ns] before its end a rollout's last frame stands
 _FIRST: Final = 1.2  # height of the first plots, whose legend is mostly the longest; of others 1
 _ROWS: Final = 3  # more plots of a rollout stand in two columns
 
@@ -48,14 +49,32 @@ class Eye:
 
 
 def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
-    """Layout of a run."""
+    """Layout of a run while it learns: the newest generation is in view."""
+    return _blueprint(_run(spec, eye), rrb.TimePanel(timeline="generation", play_state="following"))
+
+
+def finished(spec: TaskSpec, eye: Eye, generations: int) -> rrb.Blueprint:
+    """Layout of a run that is over after so many generations: its last policy's rollout plays, again and again."""
+    horizon = spec.steps * spec.period
+    begin, end = (round(1e9 * number * horizon) for number in (generations, generations + 1))
+    panel = rrb.TimePanel(
+        timeline="sim_time",
+        play_state="playing",
+        loop_mode="selection",
+        time_selection=rrb.components.AbsoluteTimeRange(min=begin, max=end - _SEAM),
+    )
+    return _blueprint(_run(spec, eye), panel)
+
+
+def _run(spec: TaskSpec, eye: Eye) -> rrb.Container:
     pictures = rrb.Horizontal(*_images(spec), name="Images")
     traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
     parts = [part for part, there in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if there]
     left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
-    tabs = rrb.Tabs(_learning(success=spec.success), _rollout(spec, spec.steps * spec.period), again, _config())
-    return _blueprint(_beside(left, _PICTURES, tabs, 0.45), "generation", "following")
+    horizon = spec.steps * spec.period
+    tabs = rrb.Tabs(_learning(success=spec.success), _rollout(spec, horizon), _farm(), again, _config())
+    return _beside(left, _PICTURES, tabs, 0.45)
 
 
 def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
@@ -65,7 +84,7 @@ def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
     below = rrb.Horizontal(shown, *images) if images else shown
     tabs = rrb.Tabs(_rollout(spec, window), _config())
     left = [_scene("Replay", eye), below]
-    return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), "sim_time", "playing")
+    return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), _playing())
 
 
 def comparison(
@@ -77,12 +96,10 @@ def comparison(
     """
     drawn = [f"+ {root}/{part}" for root in roots for part in ("world/**", "label")]
     scenes = _scene("Final policies: play the timeline sim_time" if learning else "Rollouts", eye, "/", drawn)
-    ends = rr.TimeRangeBoundary.infinite()
-    whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))  # also after a change of the timeline
     left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs" if learning else "Rollouts")]
 
     def plot(name: str, entity: str, legend: rrb.Corner2D | None = None) -> rrb.View:
-        return _plot(name, *(f"{root}/{entity}" for root in roots), legend=legend, axis_x=whole)
+        return _plot(name, *(f"{root}/{entity}" for root in roots), legend=legend)
 
     whole_run = rrb.Vertical(
         plot("Return of the mean policy", "return", legend=rrb.Corner2D.RightBottom),
@@ -104,17 +121,18 @@ def comparison(
     reward = plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom)
     rollout = _stacked([reward, *curves], [], "Rollout (sim_time)")
     if not learning:
-        return _blueprint(_beside(left, _PICTURES, rollout, 0.6), "sim_time", "playing")
-    return _blueprint(_beside(left, 1.0, rrb.Tabs(whole_run, rollout), 0.5), "generation", "following")
+        return _blueprint(_beside(left, _PICTURES, rollout, 0.6), _playing())
+    following = rrb.TimePanel(timeline="generation", play_state="following")
+    return _blueprint(_beside(left, 1.0, rrb.Tabs(whole_run, rollout), 0.5), following)
 
 
-def _blueprint(root: rrb.Container, timeline: str, play: Literal["following", "playing"]) -> rrb.Blueprint:
-    return rrb.Blueprint(
-        root,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play),
-    )
+def _blueprint(root: rrb.Container, time: rrb.TimePanel) -> rrb.Blueprint:
+    time.state = "collapsed"
+    return rrb.Blueprint(root, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
+
+
+def _playing() -> rrb.TimePanel:
+    return rrb.TimePanel(timeline="sim_time", play_state="playing", loop_mode="all")
 
 
 def _beside(
@@ -163,23 +181,33 @@ def _config() -> rrb.View:
 
 
 def _learning(*, success: bool) -> rrb.Container:
+    """Curves whose legends stand where curves seldom are: returns rise, sigma falls."""
     bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
     log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
+    returns = ("/learning/return", "/learning/return_std", "/learning/mean_policy/return")
+    rates = ("/learning/success", "/learning/mean_policy/success")
     return rrb.Vertical(
-        _plot("Return", "/learning/return", "/learning/return_std", legend=bottom),
+        _plot("Return", *returns, legend=bottom),
         rrb.Horizontal(
-            *([_plot("Success", "/learning/success", legend=bottom)] if success else []),
+            *([_plot("Success", *rates, legend=bottom)] if success else []),
             _plot("Sigma", "/learning/sigma", legend=top),
             _plot("Norm of mu", "/learning/mean_norm", legend=None),
         ),
-        rrb.Horizontal(
-            _plot("Farm", "/farm/workers", "/farm/reissued"),
-            _plot("Rollouts a second", "/farm/rollouts_per_s", legend=None),
-            _plot("Lost rollouts", "/learning/lost", legend=top),
-        ),
         rrb.TextLogView(origin="/log", name="Log", columns=log),
-        row_shares=[2.4, 1.1, 1.1, 1],
+        row_shares=[2.2, 1.4, 1],
         name="Learning",
+    )
+
+
+def _farm() -> rrb.Container:
+    """A curve a plot, which needs no legend; lost rollouts are mostly none."""
+    top = rrb.Corner2D.RightTop
+    return rrb.Vertical(
+        _plot("Workers", "/farm/workers", legend=None),
+        _plot("Rollouts per second", "/farm/rollouts_per_s", legend=None),
+        _plot("Lost rollouts", "/learning/lost", legend=top),
+        _plot("Jobs given out again", "/farm/reissued", legend=None),
+        name="Farm",
     )
 
 
@@ -187,10 +215,12 @@ def _plot(
     name: str,
     *entities: str,
     legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop,
-    axis_x: rrb.TimeAxis | None = None,
 ) -> rrb.View:
+    """Curves over all their time, also while the cursor moves and after a change of the timeline."""
+    ends = rr.TimeRangeBoundary.infinite()
+    whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))
     shown = rrb.PlotLegend(legend, visible=legend is not None)
-    return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=shown, axis_x=axis_x)
+    return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=shown, axis_x=whole)
 
 
 def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:

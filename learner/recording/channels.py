@@ -4,8 +4,9 @@ Scalars are curves at /NAME, flags state lanes at /NAME/LABEL, images pictures a
 their bodies, at /world/BODY/NAME), arrows and points are at /world/NAME.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -14,12 +15,15 @@ import rerun as rr
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.sim.channels import Channel
 from farm.sim.scene import Scene
+from farm.tasks.base import TaskSpec
 from learner.recording.curves import lines, pack, palette, ramp
 from learner.recording.solids import rotate
 
 STATES: Final = ("off", "on")
 """Names of a flag's values."""
 
+_TEXT: Final = (230, 230, 230)
+_SHADES: Final = 32  # of a scale
 _OFF: Final = (52, 54, 58)
 _ARROW: Final = (255, 255, 255)  # of arrows without colours
 _POINT_RADIUS: Final = 0.0085  # in radii of the scene
@@ -61,6 +65,8 @@ class ChannelDrawing:
             size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
             style = rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)
             yield from ((entity, style) for entity in entities(channel))
+            for entity in entities(channel):
+                yield from scale(entity, width, height, channel.top, channel.unit)
             for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
                 yield entity, rr.Points3D.from_fields(positions=places, radii=_POINT_RADIUS * self._size)
 
@@ -169,6 +175,39 @@ def trace(values: AnyArray, top: float) -> rr.DepthImage:
     """A rollout's trace (T, K) as a picture of K rows and T columns, brightest at `top`."""
     image = np.ascontiguousarray(values.T, dtype=np.float32)
     return rr.DepthImage(image, depth_range=(0.0, top), **_STYLE)
+
+
+def scale(entity: str, width: int, height: int, top: float, unit: str) -> Iterator[tuple[str, Any]]:
+    """A bar of a picture's colours to its right, from 0 to `top` [unit]; the picture has width x height pixels."""
+    x, thick = width + 0.12 * height, 0.02 * height
+    ends = np.linspace(height, 0.0, _SHADES + 1)
+    steps = [[(x, lower), (x, upper)] for lower, upper in pairwise(ends.tolist())]
+    shades = ramp(np.linspace(0.0, top, _SHADES), top)
+    yield f"{entity}/scale", rr.LineStrips2D(steps, colors=shades, radii=thick)
+    said = [f"{top:g} {unit}".strip(), "0"]
+    yield f"{entity}/scale/ends", labels([(x + 0.2 * height, 0.0), (x + 0.2 * height, 0.95 * height)], said)
+
+
+def labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Points2D:
+    """Texts at places in a picture [pixels]."""
+    return rr.Points2D(places, labels=texts, radii=0.0, colors=[_TEXT] * len(texts), show_labels=True)
+
+
+def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
+    """What is written beside a trace's picture: whose values its rows are, how long it is, and its colours."""
+    steps, rows = spec.trace
+    first, places, texts = 0, [], []
+    for channel in spec.traced:
+        each = int(np.prod(channel.shape[1:]))
+        for i, name in enumerate(channel.names if each > 1 else [title(channel)]):
+            count = each if each > 1 else channel.shape[0]
+            places.append((-0.35 * rows, first + (i + 0.5) * count))
+            texts.append(name)
+        first += int(np.prod(channel.shape))
+    places += [(0.0, 1.06 * rows), (float(steps), 1.06 * rows)]
+    texts += ["0", f"{steps * spec.period:g} s"]
+    yield f"{entity}/axes", labels(places, texts)
+    yield from scale(entity, steps, rows, spec.traced[0].top, spec.traced[0].unit)
 
 
 def scalars(values: FloatArray) -> rr.ComponentColumnList:

@@ -85,7 +85,7 @@ def _record(
         names = [(root + entity, value) for entity, value in _names(run, colour, compared, learning=learning)]
         log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
         if learning:
-            _send_curves(stream, root, run.progress)
+            _send_curves(stream, root, run.progress, run.rollout.value)
         _send_rollout(stream, root, run, compared)
     flush(stream)
     stream.disconnect()
@@ -125,14 +125,19 @@ def _names(run: Shown, colour: Colour, compared: Channel | None, *, learning: bo
         yield entity, lines((run.name,), (colour,))
 
 
-def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats]) -> None:
-    """The learning curves. The mean policy's return and success are those of the mean that was explored around."""
+def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats], final: float) -> None:
+    """The learning curves. A mean policy's return stands at the updates and rollouts behind it."""
     at = [
         rr.TimeColumn("generation", sequence=[s.generation for s in progress]),
         rr.TimeColumn("rollouts", sequence=[s.rollouts for s in progress]),
     ]
+    behind = [
+        rr.TimeColumn("generation", sequence=[s.generation - 1 for s in progress] + [progress[-1].generation]),
+        rr.TimeColumn("rollouts", sequence=[0] + [s.rollouts for s in progress]),
+    ]
+    returns = [s.mean_policy_return for s in progress] + [final]
+    stream.send_columns(f"{root}/return", behind, rr.Scalars.columns(scalars=returns))
     for entity, values in (
-        ("/return", [s.mean_policy_return for s in progress]),
         ("/success", [np.nan if s.success_rate is None else s.success_rate for s in progress]),
         ("/sigma", [s.sigma_mean for s in progress]),
     ):

@@ -62,13 +62,15 @@ def pack(colour: Colour) -> int:
 
 def static(*, success: bool) -> list[tuple[str, Any]]:
     """Names and colours of the learning curves, in the order of `statistics`; with success where the task knows it."""
-    returns = ("mean", "min", "max", "best", "baseline", "mean policy")
-    colours = (SKY, VERMILLION, GREEN, ORANGE, GREY, YELLOW)
+    returns = ("mean", "min", "max", "best", "baseline")
+    colours = (SKY, VERMILLION, GREEN, ORANGE, GREY)
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
-    succeeded = [("/learning/success", lines(("exploring", "mean policy"), (SKY, YELLOW)))]
+    mean_policy = lines(("mean policy",), (YELLOW,))
+    succeeded = [("/learning/success", lines(("exploring",), (SKY,))), ("/learning/mean_policy/success", mean_policy)]
     return [
         ("/learning/return", lines(returns, colours, hidden=("mean", "min", "max"))),
         ("/learning/return_std", band),
+        ("/learning/mean_policy/return", mean_policy),
         ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",))),
         ("/learning/mean_norm", lines(("norm of mu",), (SKY,))),
         *(succeeded if success else []),
@@ -80,14 +82,14 @@ def static(*, success: bool) -> list[tuple[str, Any]]:
 
 
 def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
-    """A generation's values; rate is of exploring rollouts [1/s]."""
+    """What a generation's exploring rollouts gave; rate is of these [1/s]."""
     s = stats
     baseline = np.nan if s.baseline is None else s.baseline
     success = []
-    if s.success_rate is not None and s.mean_policy_success is not None:
-        success.append(("/learning/success", rr.Scalars([s.success_rate, float(s.mean_policy_success)])))
+    if s.success_rate is not None:
+        success.append(("/learning/success", rr.Scalars([s.success_rate])))
     band = rr.Measurements.from_fields(values=[s.return_mean], variances=[s.return_std**2])
-    returns = [s.return_mean, s.return_min, s.return_max, s.best, baseline, s.mean_policy_return]
+    returns = [s.return_mean, s.return_min, s.return_max, s.best, baseline]
     return [
         ("/learning/return", rr.Scalars(returns)),
         ("/learning/return_std", band),
@@ -99,3 +101,9 @@ def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
         ("/farm/rollouts_per_s", rr.Scalars([rate])),
         ("/farm/reissued", rr.Scalars([s.reissued])),
     ]
+
+
+def mean_policy(value: float, success: bool | None) -> list[tuple[str, Any]]:
+    """The return of a mean policy, and whether it succeeds (None where the task knows no success)."""
+    succeeds = [] if success is None else [("/learning/mean_policy/success", rr.Scalars([float(success)]))]
+    return [("/learning/mean_policy/return", rr.Scalars([value])), *succeeds]

@@ -3,20 +3,28 @@
 Bodies hang flat below /world: /world/<body>, with its geometries as children.
 """
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 
+from farm.arrays import FloatArray
 from farm.sim.channels import Camera
 from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
+from learner.recording.blueprint import Eye
 from learner.recording.channels import ChannelDrawing, Columns, scalars
 from learner.recording.curves import lines
 from learner.recording.solids import solid, xyzw
 from learner.setup import Problem
+
+CAPTION: Final = "/world/caption"
+"""Entity of what is written in the scene."""
+
+_WHITE: Final = (255, 255, 255)
+_ABOVE: Final = 0.75  # so many radii of the scene above its middle stands the caption
 
 
 class Drawing:
@@ -42,6 +50,7 @@ class Drawing:
             if name in self.scene.fixed:
                 turned = rr.Quaternion(xyzw=xyzw(pose[3:]))
                 yield f"/world/{name}", rr.Transform3D(translation=pose[:3], quaternion=turned)
+        yield CAPTION, rr.Points3D.from_fields(colors=[_WHITE], radii=[0.0], show_labels=True)
         yield "/reward/terms", lines(self.spec.terms)
         yield "/actions", lines([str(i + 1) for i in range(self.spec.action)])
         for channel in self._channels.values():
@@ -55,6 +64,35 @@ class Drawing:
             if found != (count, *shape):
                 raise ValueError(f"{name} of shape {found}, expected {(count, *shape)}: another scene or task?")
 
+    def captions(self, rollouts: Sequence[tuple[str, Trajectory]]) -> Columns:
+        """What stands in the scene about the frames of rollouts with their names, one after the other.
+
+        That is the rollout's name, return and success, and how far the first free body has moved since its start.
+        """
+        eye = Eye.of(self.scene, self.camera)
+        place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
+        followed = self.scene.mover.body if eye.tracked and self.scene.mover else None
+        places = [place + self._moved(rollout, followed) for _, rollout in rollouts]
+        texts = [text for name, rollout in rollouts for text in self._texts(name, rollout)]
+        values = rr.Points3D.columns(positions=np.concatenate(places), labels=texts)
+        return Columns(CAPTION, values.partition(np.ones(len(texts), dtype=int)))
+
+    def _moved(self, rollout: Trajectory, body: str | None) -> FloatArray:
+        """How far a body has moved since the start [m], (F, 3); without one, not at all."""
+        if body is None:
+            return np.zeros((len(rollout.times), 3))
+        places = rollout.bodies[:, self.scene.bodies.index(body), :3]
+        return places - places[0]
+
+    def _texts(self, name: str, rollout: Trajectory) -> list[str]:
+        success = {True: "success", False: "no success", None: ""}[rollout.success]
+        value = "" if np.isnan(rollout.value) else f"return {rollout.value:.3f}"
+        head = "\n".join(filter(None, (name, ", ".join(filter(None, (value, success))))))
+        if self.scene.free is None:
+            return [head] * len(rollout.times)
+        moved = np.linalg.norm(self._moved(rollout, self.scene.free), axis=1)
+        return [f"{head}\n{self.scene.free} moved {_length(each)}" for each in moved.tolist()]
+
     def columns(self, rollout: Trajectory) -> Iterator[Columns]:
         """Columns of a rollout's frames, or of those of several that are joined; it is checked first."""
         self.check(rollout)
@@ -67,3 +105,7 @@ class Drawing:
         begins = np.cumsum(rollout.times == 0.0)
         for name, channel in self._channels.items():
             yield from channel.columns(rollout.channels[name], rollout.bodies, begins)
+
+
+def _length(metres: float) -> str:
+    return f"{1000 * metres:.1f} mm" if metres < 1.0 else f"{metres:.2f} m"

@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -55,9 +56,7 @@ def compact(path: Path) -> bool:
     merged, home = _left_behind(path)
     try:
         tidy(path)
-        optimize = [program(), "rrd", "optimize", *map(str, found), "-o", str(merged)]
-        command = [sys.executable, "-ISc", _ENDS_WITH_PARENT, str(os.getpid()), *optimize]
-        subprocess.run(command, env=_quiet(home.absolute()), check=True, capture_output=True, timeout=COMPACTING)
+        _call([program(), "rrd", "optimize", *map(str, found), "-o", str(merged)], _quiet(home.absolute()))
         merged.replace(path)
         for old in found:
             if old != path:
@@ -68,6 +67,37 @@ def compact(path: Path) -> bool:
     finally:
         tidy(path)
     return True
+
+
+def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
+    """Have a compacted recording open with one layout, which `layout` writes to a file: it keeps several in any order.
+
+    Raises:
+      OSError: the disk is full, or Rerun's command fails; the file is as it was.
+    """
+    from rerun.chunk import RrdReader
+
+    merged, home = _left_behind(path)
+    try:
+        environment = _quiet(home.absolute())
+        bare, own = home / "bare.rrd", home / "layout.rbl"
+        reader = RrdReader(path)
+        [store] = reader.recordings()
+        reader.stream(store=store).write_rrd(bare, application_id=store.application_id, recording_id=store.recording_id)
+        layout(own)
+        merge = [program(), "rrd", "merge", str(bare), str(own), "-o", str(merged)]
+        _call(merge, environment)
+        merged.replace(path)
+    except (RuntimeError, ValueError, subprocess.SubprocessError) as error:
+        raise OSError(f"no layout in {path}: {error}") from error
+    finally:
+        tidy(path)
+
+
+def _call(command: list[str], environment: dict[str, str]) -> None:
+    """Run a command of Rerun's, which ends with this process."""
+    bound = [sys.executable, "-ISc", _ENDS_WITH_PARENT, str(os.getpid()), *command]
+    subprocess.run(bound, env=environment, check=True, capture_output=True, timeout=COMPACTING)
 
 
 def tidy(path: Path) -> None:

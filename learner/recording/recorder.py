@@ -3,8 +3,11 @@
 One recording a run, its id the run's name. Every row stands on three timelines:
 
     generation   updates done, a sequence
-    sim_time     generation x length of a rollout + time in its sample rollout, a duration without gaps
+    sim_time     generation x length of a rollout + time in that rollout, a duration without gaps
     wall_time    when it was recorded; a rollout's frames fill the time since the last one
+
+A mean policy, its rollout among it, stands at the number of updates that led to it, 0 for the first: generation G
+explores around the mean after G - 1 updates. A finished run's last policy stands at its last generation.
 
 A file is never overwritten: a run that goes on writes run.part2.rrd, and closing merges the parts
 into run.rrd and compacts it. All parts opened together are one recording as well.
@@ -15,7 +18,7 @@ import logging
 import shutil
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +26,7 @@ from typing import Any, Final
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
@@ -30,11 +34,22 @@ from farm.net.stats import GenerationStats
 from farm.sim.trajectory import Trajectory, joined
 from learner.recording import blueprint, curves
 from learner.recording.blueprint import Eye
-from learner.recording.channels import trace
+from learner.recording.channels import axes, trace
 from learner.recording.drawing import Drawing
-from learner.recording.files import compact
+from learner.recording.files import compact, with_layout
 from learner.recording.replay import record_replay
-from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, send_properties, times
+from learner.recording.rows import (
+    APPLICATION,
+    begin,
+    file_sink,
+    flush,
+    log_static,
+    markdown,
+    row,
+    send,
+    send_properties,
+    times,
+)
 
 log = logging.getLogger(__name__)
 
@@ -85,6 +100,7 @@ class Recorder:
         self._last = time.time() - self._horizon
         self._held: list[_Held] = []
         self._broken = False
+        self._finished: rrb.Blueprint | None = None
         self._drawing, self._again = drawing, again
         self.replay = partial(record_replay, run=run, drawing=drawing, config=config)
         """Records named rollouts into a file of their own."""
@@ -99,9 +115,12 @@ class Recorder:
             sinks.append(rr.GrpcServerSink(host, port))
         if path is not None:
             sinks.append(file_sink(path))
-        self._stream = begin(run, sinks, blueprint.learning(spec, Eye.of(scene, drawing.camera)))
+        self._eye = Eye.of(scene, drawing.camera)
+        self._stream = begin(run, sinks, blueprint.learning(spec, self._eye))
         send_properties(self._stream, "run", properties or {})
         static = [*self._drawing.static(), *curves.static(success=spec.success), ("/config", markdown(config))]
+        if spec.traced:
+            static += [each for entity in ("/traces/best", "/traces/worst") for each in axes(entity, spec)]
         log_static(self._stream, static)
 
     def generation(
@@ -127,19 +146,16 @@ class Recorder:
         self._check_space()
         if sample is not None:
             self._drawing.check(sample)
-        self._generation = stats.generation
-        start, now = self._generation * self._horizon, time.time()
+        self._generation, before, now = stats.generation, stats.generation - 1, time.time()
         at = self._at(now)
-        for entity, values in curves.statistics(stats, rate):
-            self._stream.send_columns(entity, at, row(values))
+        self._send(at, curves.statistics(stats, rate))
+        self._send(self._at(now, before), curves.mean_policy(stats.mean_policy_return, stats.mean_policy_success))
         if self._again is not None:
             self._stream.send_columns("/again", at, row(markdown(self._again(stats))))
         for name, values in traces.items():
             self._stream.send_columns(f"/traces/{name}", at, row(self._trace(name, values)))
         if sample is not None:
-            wall = now + (sample.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
-            end = start + self._horizon - SEAM
-            self._held.append(_Held(now, stats.generation, np.minimum(start + sample.times, end), wall, sample))
+            self._hold(sample, before, now)
         self._last = now
         if self._held and now - self._held[0].since >= HOLD:
             self._draw()
@@ -154,6 +170,21 @@ class Recorder:
         if self._held:
             self._draw()
             self._flush()
+
+    def final(self, rollout: Trajectory) -> None:
+        """Record the finished run's mean policy, and have viewers open with its rollout, playing again and again.
+
+        Raises:
+          ValueError: it is a rollout of another scene or task.
+          OSError: the file takes no more.
+        """
+        self._drawing.check(rollout)
+        now = time.time()
+        self._send(self._at(now), curves.mean_policy(rollout.value, rollout.success))
+        self._hold(rollout, self._generation, now)
+        self._finished = blueprint.finished(self._drawing.spec, self._eye, self._generation)
+        self._stream.send_blueprint(self._finished)
+        self.settle()
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a line; levels are those of the standard library."""
@@ -174,8 +205,8 @@ class Recorder:
         self._draw()
         self._flush()
         self._stream.disconnect()
-        if self._path is not None and merge:
-            compact(self._path)
+        if self._path is not None and merge and compact(self._path) and self._finished is not None:
+            with_layout(self._path, partial(self._finished.save, APPLICATION))
 
     def _trace(self, name: str, values: AnyArray) -> Any:  # noqa: ANN401  (archetypes have no public base)
         """A trace as an archetype; see `generation`."""
@@ -194,7 +225,8 @@ class Recorder:
         lengths = [len(one.sim) for one in held]
         numbers = np.repeat([one.generation for one in held], lengths)
         sim, wall = np.concatenate([one.sim for one in held]), np.concatenate([one.wall for one in held])
-        columns = self._drawing.columns(joined([one.rollout for one in held]))
+        captions = self._drawing.captions([(f"generation {one.generation}", one.rollout) for one in held])
+        columns = [*self._drawing.columns(joined([one.rollout for one in held])), captions]
         send(self._stream, columns, "generation", numbers, sim, wall)
 
     def _flush(self) -> None:
@@ -214,9 +246,20 @@ class Recorder:
             text = f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are needed"
             raise OSError(errno.ENOSPC, text)
 
-    def _at(self, now: float) -> list[rr.TimeColumn]:
-        """Where the generation begins, recorded now [s since the epoch]."""
-        numbers = np.array([self._generation])
+    def _send(self, at: list[rr.TimeColumn], values: Iterable[tuple[str, Any]]) -> None:
+        for entity, archetype in values:
+            self._stream.send_columns(entity, at, row(archetype))
+
+    def _hold(self, rollout: Trajectory, generation: int, now: float) -> None:
+        """Have a mean policy's rollout wait to be written, with those that come soon."""
+        start = generation * self._horizon
+        wall = now + (rollout.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
+        sim = np.minimum(start + rollout.times, start + self._horizon - SEAM)
+        self._held.append(_Held(now, generation, sim, wall, rollout))
+
+    def _at(self, now: float, generation: int | None = None) -> list[rr.TimeColumn]:
+        """Where a generation begins (None: the one that was recorded last), recorded now [s since the epoch]."""
+        numbers = np.array([self._generation if generation is None else generation])
         return times("generation", numbers, numbers * self._horizon, np.array([now]))
 
 

@@ -45,7 +45,8 @@ def record_replay(
         at = times("rollout", np.array([number]), np.array([start]))
         stream.send_columns("/rollout", at, row(_caption(name, rollout)))
         numbers = np.full(len(rollout.times), number)
-        send(stream, drawing.columns(rollout), "rollout", numbers, start + rollout.times)
+        columns = [*drawing.columns(rollout), drawing.captions([(name, rollout)])]
+        send(stream, columns, "rollout", numbers, start + rollout.times)
         start += float(rollout.times[-1]) + PAUSE
     flush(stream)
     stream.disconnect()

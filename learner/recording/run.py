@@ -175,6 +175,7 @@ class RunRecording(logging.Handler):
         if mean is not None:
             result = {"generations": generation, "return": mean.value, "success": mean.success}
             self.thread.put(lambda: self._recorder.result(result))
+            self.thread.put(lambda: self._recorder.final(mean))
             rollouts.append((f"mean policy after generation {generation}", mean))
         if rollouts:
             self._write_replay(rollouts)
@@ -198,12 +199,12 @@ def markdown(config: RunConfig) -> str:
 def again(folder: str, ending: str, stats: GenerationStats) -> str:
     """The commands that show a generation again, Markdown; `ending` is the task's word for what it ended.
 
-    What is in view is the mean that was explored around: that of the generation before.
+    The rollout in view is of the mean policy after that generation.
     """
     replay = f"farm replay {folder} --generation"
     chosen = ["--best 5", "--worst 5", *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else [])]
     side = "\n".join(f"{replay} {stats.generation} {which}" for which in chosen)
     return (
         f"### Generation {stats.generation} again\n\nThe rollout in view, at physics rate:\n\n"
-        f"```\n{replay} {stats.generation - 1}\n```\n\nExploring rollouts, side by side:\n\n```\n{side}\n```"
+        f"```\n{replay} {stats.generation}\n```\n\nExploring rollouts, side by side:\n\n```\n{side}\n```"
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-from rerun.experimental import ViewerClient
+from rerun.experimental import ViewerClient, ViewerState
 
 log = logging.getLogger(__name__)
 
@@ -25,22 +25,60 @@ def free_port(rather: int = 0) -> int:
         return int(probe.getsockname()[1])
 
 
+def listens(port: int, gone: Callable[[], bool]) -> bool:
+    """Wait until somebody listens on a port of this machine; false where the viewer is gone before."""
+    until = time.monotonic() + _LOADING
+    while time.monotonic() < until and not gone():
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return True
+        time.sleep(_PERIOD)
+    return False
+
+
 def show_table(port: int, gone: Callable[[], bool]) -> bool:
     """Go from the recordings that the viewer on this port loads to the table of them all.
 
     Returns:
       whether it is shown; where not, the recordings are there all the same.
     """
+
+    def go(viewer: ViewerClient, state: ViewerState) -> None:
+        viewer.set_location(_table(state.catalog_url or "", state.location))
+
+    return _once_loaded(port, gone, go)
+
+
+def show_newest(port: int, gone: Callable[[], bool]) -> bool:
+    """Begin at the newest rollout where a recording plays: a layout has no place for the cursor.
+
+    Returns:
+      whether the recording is loaded.
+    """
+    return _once_loaded(port, gone, _go_to_newest)
+
+
+def _go_to_newest(viewer: ViewerClient, state: ViewerState) -> None:
+    recording = next(each for each in state.recordings if each.store_id == state.active_recording)
+    last = {line.name: line.end for line in recording.timelines}
+    if recording.current_timeline == "sim_time" and last.get("generation"):
+        rollouts = last["generation"] + 1  # one after the other, all given the same time
+        begin = 1e-9 * (last["sim_time"] or 0) * (rollouts - 1) / rollouts
+        viewer.set_time("sim_time", duration=begin, play_state="playing")
+
+
+def _once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
+    """Do something with the viewer on this port as soon as its recordings are loaded, and return whether it was."""
     until = time.monotonic() + _LOADING
     while time.monotonic() < until and not gone():
         try:
             viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             state = viewer.get_state()
             if state.catalog_url and not state.loading and state.active_recording:
-                viewer.set_location(_table(state.catalog_url, state.location))
+                act(viewer, state)
                 return True
-        except Exception as error:  # not listening yet, or a viewer of the user's that knows no tables
-            log.debug("no table yet: %s", error)
+        except Exception as error:  # not listening yet, or a viewer of the user's that cannot be asked
+            log.debug("not yet: %s", error)
         time.sleep(_PERIOD)
     return False
 

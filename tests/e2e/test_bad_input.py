@@ -73,7 +73,10 @@ MISTAKES = [
     (("replay", "nowhere", "--dropped", "2"), "nowhere is not a run's folder"),
     (("play", "nowhere", "--friction", "0.5"), "nowhere is not a run's folder"),
     (("chain",), "a chain needs policies: give one run or more"),
-    (("worker", "--tls", "nowhere"), "there is no folder nowhere; farm certificates makes it"),
+    (
+        ("worker", "--tls", "nowhere"),
+        "--tls nowhere: there is no such folder; expected the folder of a machine that farm certificates made",
+    ),
     (("view", "nowhere"), "no recording in nowhere"),
     (("runs", "nowhere"), "there is no folder nowhere"),
 ]

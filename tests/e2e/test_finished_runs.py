@@ -161,7 +161,7 @@ def test_one_rollout_and_those_that_the_task_ended(
 def test_the_recording_offers_the_commands(done: Farm) -> None:
     offered = texts(folder(done).recording, "/again")
     assert len(offered) == GENERATIONS
-    assert "farm replay runs/a --generation 0\n" in offered[0]
+    assert "farm replay runs/a --generation 1\n" in offered[0]
     assert "farm replay runs/a --generation 1 --best 5\nfarm replay runs/a --generation 1 --worst 5" in offered[0]
     for line, text in zip(done.progress("a"), offered, strict=True):
         assert ("--dropped" in text) == bool(line["ended"])
@@ -249,9 +249,10 @@ def test_a_comparison_holds_each_runs_numbers(done: Farm) -> None:
         (batch,) = [b for b in entities[f"/runs/{name}/return"] if "generation" in b.schema.names]
         (column,) = [n for n in batch.schema.names if n.endswith("scalars")]
         lines = done.progress(name)
-        assert [v[0] for v in batch.column(column).to_pylist()] == [p["mean_policy_return"] for p in lines]
-        assert batch.column("generation").cast("int64").to_pylist() == [p["generation"] for p in lines]
-        assert batch.column("rollouts").cast("int64").to_pylist() == [p["rollouts"] for p in lines]
+        returns = [*(p["mean_policy_return"] for p in lines), done.summary(name)["mean_policy_return"]]
+        assert [v[0] for v in batch.column(column).to_pylist()] == returns
+        assert batch.column("generation").cast("int64").to_pylist() == [0, *(p["generation"] for p in lines)]
+        assert batch.column("rollouts").cast("int64").to_pylist() == [0, *(p["rollouts"] for p in lines)]
         frames = sum(b.num_rows for b in entities[f"/runs/{name}/world/object"] if "sim_time" in b.schema.names)
         assert frames == len(again(done, name).trajectory.times)
     (batch,) = entities["/table"]

@@ -10,6 +10,7 @@ import pytest
 from farm.__main__ import main
 from farm.commands import certificates
 from farm.errors import ConfigError
+from farm.net import tls
 from farm.net.tls import find
 
 x509 = pytest.importorskip("cryptography.x509")
@@ -168,3 +169,24 @@ def test_a_key_that_others_can_read(folder: Path, capsys: pytest.CaptureFixture[
     assert find(folder, "worker").name == "w1"
     (folder / "ca" / "key.pem").chmod(0o644)
     assert "can be read by others (mode 0644)" in refused(["add", str(folder), "--worker", "w2"], capsys)
+
+
+def test_another_name_than_the_certificates_is_refused(folder: Path) -> None:
+    [bundle] = folder.glob("worker-*")
+    own = bundle.name.removeprefix("worker-")
+    assert tls.find(bundle, "worker", own).name == own
+    with pytest.raises(ConfigError, match=f"--name other: the certificate in {bundle} is for {own}; leave --name out"):
+        tls.find(bundle, "worker", "other")
+
+
+def test_a_bundle_that_cannot_be_read(folder: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no such folder; expected the folder of a machine"):
+        tls.find(folder / "nowhere", "learner")
+    (folder / "learner" / "cert.pem").write_text("no certificate")
+    with pytest.raises(ConfigError, match=r"cert\.pem is damaged: expected PEM; copy the bundle again$"):
+        tls.find(folder, "learner")
+
+
+def test_workers_are_told_a_name_that_the_certificate_has(folder: Path) -> None:
+    bundle = tls.find(folder, "learner")
+    assert bundle.hosts == tuple(hosts(folder / "learner"))

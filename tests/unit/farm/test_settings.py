@@ -253,3 +253,19 @@ def test_a_value_nested_beyond_what_can_be_shown() -> None:
         deep = [deep]
     with pytest.raises(ConfigError, match="^config.json: maximum recursion depth exceeded"):
         from_dict(Everything, {"count": deep}, "config.json")
+
+
+@pytest.mark.parametrize("width", [58, 80, 120])
+def test_help_is_silent_on_what_need_not_be_given(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    with pytest.raises(SystemExit):
+        arguments.parse(Everything, ["--help"], "farm try")
+    said = capsys.readouterr().out
+    for none in ("(default: None)", "{None}|", "{None,"):
+        assert none not in said
+    assert "--limit INT" in said
+    assert "(default: 3)" in said
+    assert "{a,b}" in said
+    assert max(len(line) for line in said.splitlines()) == width

@@ -1,6 +1,7 @@
 """A run's configuration: parts chosen by name, to JSON and back, what is refused and with which words, what changed."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from farm.tasks.finger_gait.task import FingerGaitConfig
 from learner import config as configs
 from learner.algorithms import PGPE
 from learner.algorithms.snes import SNES
+from learner.commands.options import LearnerOptions, run_name
 from learner.config import RunConfig, changed_by, changes, configure, presets
 
 CODE = """
@@ -294,3 +296,13 @@ def test_presets_are_known_by_what_they_set(task: str, pole: str) -> None:
         assert configs.preset_of(config) == preset
         assert configs.preset_of(changed_by(config, {"gamma": 0.123})) == "own"
         assert configs.properties(config)["preset"] == preset
+
+
+def test_runs_of_one_second_have_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.gmtime", lambda: time.struct_time((2026, 1, 2, 3, 4, 5, 4, 2, 0)))
+    chosen, names = LearnerOptions(out=tmp_path), []
+    for _ in range(3):
+        names.append(run_name(chosen, RunConfig()))
+        (tmp_path / names[-1]).mkdir()
+    first = "finger-gait-default-s0-20260102-030405"
+    assert names == [first, f"{first}-2", f"{first}-3"]

@@ -131,7 +131,7 @@ def test_one_that_fails_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixt
     ("name", "said"),
     [
         ("mlflow", "unknown logger 'mlflow'; known are tensorboard, wandb, or FILE.py:CLASS"),
-        ("tensorboard", r"--log tensorboard needs tensorboardX: pip install 'rolloutfarm\[tensorboard\]'"),
+        ("tensorboard", r"--log tensorboard needs tensorboardX: pip install tensorboardX$"),
         ("own.py:Shy", "--log own.py:Shy cannot begin: RuntimeError: no account"),
         ("own.py:Nothing", "--log own.py:Nothing: it is no logger: it has no generation and no end"),
     ],

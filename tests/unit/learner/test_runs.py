@@ -76,3 +76,10 @@ def test_csv_has_a_column_for_each_name_in_a_summary(runs: Path, capsys: pytest.
     assert (last["run"], last["steps"]) == ('a "z", indeed', "7")
     assert main(["runs", str(runs), "--csv", "--json"]) == 2
     assert "--json and --csv exclude each other" in capsys.readouterr().err
+
+
+def test_a_run_that_was_cut_short_has_not_failed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, state in (("a", "interrupted"), ("z", "finished")):
+        damage(runs, json.dumps({**GOOD, "run": name, "mean_policy_success": False, "state": state}))
+        words = table(runs, capsys)[0].split()
+        assert ("not" in words, "no" in words) == ((True, False) if state == "interrupted" else (False, True))

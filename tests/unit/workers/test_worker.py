@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stage import BEGINNING, FARM, Learner, Runner, Stage, at_work, indices, until
+from stage import BEGINNING, FARM, WAIT, Learner, Runner, Stage, at_work, indices, until
 
 from farm import plugins
 from farm.errors import ConfigError
 from farm.net import codec, keys
 from farm.net.messages import Refusal, Spec, WorkRequest
+from farm.net.session import connect
 from farm.net.work import Results
 from farm.rollouts import SIMULATION
 from farm.sim.engines import CAPACITY
@@ -240,3 +241,16 @@ def test_settings_that_make_no_sense() -> None:
         with pytest.raises(ConfigError, match=words):
             WorkerConfig(**values)  # type: ignore[arg-type]
     assert keys.checked("worker", WorkerConfig().name)
+
+
+def test_a_worker_of_another_farm_hears_which_there_are(
+    real: Stage, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(workers, "_LOOK", 0.0)
+    learner = Learner(real.session, "r")
+    learner.announce()
+    with connect((real.endpoint,), WAIT, lambda: False) as session:
+        worker = workers.Worker(workers.WorkerConfig(connect=(real.endpoint,), farm="elsewhere", name="w"), session)
+        worker.join()
+        until(lambda: (worker.turn(), caplog.messages)[1])
+    assert caplog.messages == [f"no learner on farm elsewhere; learners are on {FARM}: see --farm"]

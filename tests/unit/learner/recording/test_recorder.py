@@ -1,6 +1,7 @@
 """Recordings are written for real and read back with Rerun's own reader."""
 
 import pickle
+import re
 import socket
 import subprocess
 import sys
@@ -53,10 +54,14 @@ def test_generations_are_recorded_on_every_timeline(start, stats, rollout, trace
         recorder.generation(stats(generation), rollout(), traces(), rate=120.0)
     recorder.close()
     rows = read()
-    assert rows.column("/learning/return", "scalars")[2] == [-4.7, -40.0, -1.0, -0.5, -5.0, -4.0]
+    assert rows.column("/learning/return", "scalars")[2] == [-4.7, -40.0, -1.0, -0.5, -5.0]
     assert rows.column("/learning/return_std", "variances") == [[4.0]] * 3
     assert rows.column("/learning/lost", "scalars") == [[2.0, 0.0, 0.0]] * 3
-    assert rows.column("/learning/success", "scalars") == [[0.25, 0.0]] * 3
+    assert rows.column("/learning/success", "scalars") == [[0.25]] * 3
+    assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0]] * 3
+    assert rows.column("/learning/mean_policy/return", "generation") == [0, 1, 2], "updates behind each policy"
+    assert rows.column("/learning/mean_policy/success", "scalars") == [[0.0]] * 3
+    assert rows.column("/world/caption", "generation") == [0] * 16 + [1] * 16 + [2] * 16
     assert rows.column("/farm/rollouts_per_s", "scalars") == [[120.0]] * 3
     for entity in ("/world/ball", "/reward/terms", "/pads/left", "/world/touch/push", "/world/goals"):
         assert len(rows.times(entity)) == 3 * 16, entity
@@ -74,10 +79,31 @@ def test_rollouts_follow_each_other_without_gap(start, stats, rollout, read):
     recorder.close()
     rows = read()
     at = np.array(rows.times("/touch/force")) / 1e9
-    expected = np.concatenate([6.0 + np.arange(16) * 0.1, 7.5 + np.arange(16) * 0.1])
+    expected = np.concatenate([4.5 + np.arange(16) * 0.1, 6.0 + np.arange(16) * 0.1])
     np.testing.assert_allclose(at, expected, atol=2e-6)
     assert (np.diff(at) > 0).all(), "a last frame is hidden behind the next rollout's first"
     assert rows.times("/learning/return") == [6_000_000_000, 7_500_000_000]
+
+
+def test_a_finished_run_opens_with_its_last_policy_playing(start, stats, rollout, read, tmp_path):
+    recorder = start()
+    for generation in (1, 2):
+        recorder.generation(stats(generation), rollout(), {}, rate=1.0)
+    recorder.final(rollout(31, step=0.05))
+    recorder.close()
+    rows, reader = read(), RrdReader(tmp_path / "run.rrd")
+    assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0], [-4.0], [-3.25]]
+    assert rows.column("/world/caption", "generation") == [0] * 16 + [1] * 16 + [2] * 31
+    [*_, last] = rows.column("/world/caption", "labels")
+    assert re.fullmatch(r"generation 2\nreturn -3\.250, success\nball moved \d+\.\d+ m", last[0])
+    [layout] = reader.blueprints()
+    panel = [chunk for chunk in reader.stream(store=layout) if chunk.entity_path == "/time_panel"]
+    batches = [chunk.to_record_batch() for chunk in panel]
+    names = [(batch, name) for batch in batches for name in batch.schema.names if name.startswith("TimePanel")]
+    values = {name: batch.column(name).to_pylist()[0] for batch, name in names}
+    assert values["TimePanelBlueprint:timeline"] == ["sim_time"]
+    [selected] = values["TimePanelBlueprint:time_selection"]
+    assert (selected["min"], round(selected["max"], -4)) == (3_000_000_000, 4_500_000_000)
 
 
 def test_traces_come_back_bit_by_bit(start, stats, traces, read):
@@ -162,8 +188,8 @@ def test_rollouts_written_together_are_as_written_one_by_one(start, stats, rollo
         found.append({(e, n): rows.column(e, n) for e, n in names if ":" in n or n == "generation"})
     assert len(found[0]) > 60
     assert found[0] == found[1]
-    assert found[0]["/actions", "generation"] == [g for g, n in enumerate(lengths, 1) for _ in range(n)]
-    assert set(found[0]["/touch/state/left", "generation"]) == {1, 2, 3, 4}, "a rollout begins with its state"
+    assert found[0]["/actions", "generation"] == [g for g, n in enumerate(lengths) for _ in range(n)]
+    assert set(found[0]["/touch/state/left", "generation"]) == {0, 1, 2, 3}, "a rollout begins with its state"
 
 
 def test_a_torn_file_is_repaired(start, stats, spec, scene_text, tmp_path, read):

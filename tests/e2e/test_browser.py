@@ -1,0 +1,44 @@
+"""`farm view --web` in a real browser."""
+
+import io
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser, need_chromium
+from PIL import Image
+from processes import Farm
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # the browser draws by the processor alone
+
+
+def _orange(picture: bytes) -> float:
+    """Which part of the left half is of the bar's colour: it is drawn there, and nothing else is orange."""
+    pixels = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+    red, green, blue = np.moveaxis(pixels[60:, : pixels.shape[1] // 2], -1, 0)
+    return float(((red > 150) & (green > 80) & (green < 0.8 * red) & (blue < 0.4 * red)).mean())
+
+
+def test_the_page_draws_the_hand(tmp_path: Path) -> None:
+    need_chromium()
+    farm = Farm(tmp_path)
+    try:
+        farm.call("run", "--name", "r", "--pairs", "3", "--generations", "4")
+        process = farm.start("view", "runs/r", "--web")
+        assert process.stdout
+        line = process.stdout.readline()
+        found = re.fullmatch(r"open (http://127\.0\.0\.1:\d+/\?url=\S+)   \(from elsewhere: ssh -L .* first\)\n", line)
+        assert found, line
+        with Browser(tmp_path / "profile") as browser:
+            browser.open(found[1])
+            farm.wait_for(lambda: _orange(browser.picture()) > 0.005, seconds=300)
+            assert browser.errors == [], browser.errors
+            if wanted := os.environ.get("FARM_PICTURE"):
+                Path(wanted).write_bytes(browser.picture())
+        process.terminate()
+        said, _ = process.communicate(timeout=20)
+        assert "http" not in said, "one line says where"
+    finally:
+        farm.close()
