@@ -75,7 +75,7 @@ MISTAKES = [
     (("chain",), "a chain needs policies: give one run or more"),
     (
         ("worker", "--tls", "nowhere"),
-        "--tls nowhere: there is no such folder; expected the folder of a machine that farm certificates made",
+        "--tls nowhere: there is no such folder; expected the",
     ),
     (("view", "nowhere"), "no recording in nowhere"),
     (("runs", "nowhere"), "there is no folder nowhere"),
