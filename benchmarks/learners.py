@@ -1,4 +1,4 @@
-"""Every algorithm with every policy, at an equal budget: the gait and three environments (docs/learners.md holds ours).
+"""Every algorithm with every policy, at an equal budget: the gait and three environments.
 
     python benchmarks/learners.py [--tasks gait,Reacher-v5] [--seeds 5] [--out FILE.jsonl]
 
@@ -62,8 +62,8 @@ TASKS: Final[Mapping[str, tuple[str, int, Mapping[str, dict[str, Any]]]]] = {
 """Task, exploring rollouts, policies."""
 
 ENOUGH: Final = 0.95
-LOOK: Final = 100  # rollouts between two looks at the gait
-STARTS: Final = 50  # of a look
+LOOK: Final = 150  # rollouts between two looks at the gait
+STARTS: Final = 40  # of a look
 
 
 @dataclass

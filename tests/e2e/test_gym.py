@@ -19,6 +19,7 @@ from learner.scheduler.scheduler import SchedulerConfig
 pytestmark = pytest.mark.slow
 
 TASK = ("--task", "gym:Pusher-v5", "--steps", "20")
+PHYSICS = 20 * 5  # physics steps of a rollout
 SMALL = (*TASK, "--pairs", "6", "--generations", "6")
 
 
@@ -95,9 +96,11 @@ def test_the_recording_shows_the_scene(learnt: Farm) -> None:
     progress = learnt.progress("r")
     assert [values[p["generation"]][0] for p in progress] == [p["return_mean"] for p in progress]
     object_moves = [key for key in content(path) if key[0] == "/world/object" and key[1].endswith("translation")]
-    assert len(object_moves) == 6 * 21
+    assert len(object_moves) == 6 * 21 + PHYSICS + 1, "six means at control rate, and the last policy at physics rate"
     assert {"/world/world", "/world/goal", "/actions", "/reward/terms"} <= set(batches)
-    rewards = [value for key, value in content(path).items() if key[0] == "/reward/terms" and key[2] == 6]
+    rewards = [
+        value for key, value in content(path).items() if key[0] == "/reward/terms" and key[2] == 5
+    ]  # before the 6th update
     assert np.sum(rewards) == pytest.approx(progress[-1]["mean_policy_return"], rel=1e-6)
     replays = read(learnt.folder / "runs" / "r" / "replay.rrd")
     assert "/world/object" in replays

@@ -83,7 +83,12 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     said = finish(process)
     assert "run over after generation 12, all recorded in recordings/r" in said
     own, other = farm.folder / "runs/r", farm.folder / "recordings/r"
-    assert content(own / "run.rrd") == content(other / "run.rrd")
+    theirs = content(other / "run.rrd")
+    for key, values in content(own / "run.rrd").items():
+        # Commands that show a generation again name the run's folder, which is not here.
+        told = str(values).replace("runs/r", "RUN") if key[0] == "/again" else str(values)
+        assert told == str(theirs.pop(key)), key
+    assert not theirs
     names = {entity for entity, *_ in content(other / "run.rrd")}
     assert {"/learning/return", "/joints/position", "/traces/best", "/log"} <= names
     assert kept(farm) == ["replay.rrd", "run.rrd"]
@@ -114,7 +119,7 @@ def test_who_joins_late_has_everything(farm: Farm) -> None:
     finish(process)
     assert generations(farm.folder / FILE) == numbers(20)
     shown = {generation for entity, _, generation, _ in content(farm.folder / FILE) if entity == "/joints/position"}
-    assert shown == set(numbers(20)), "rollouts from before are there too"
+    assert shown == {0, *numbers(20)}, "rollouts from before are there too"
 
 
 def test_a_recorder_killed_and_started_again(farm: Farm) -> None:
