@@ -1,5 +1,6 @@
 """What a run leaves behind to look at: recordings, figures, tables; read back and computed again."""
 
+import contextlib
 import json
 import signal
 import socket
@@ -172,7 +173,11 @@ def test_view_takes_its_viewer_with_it(recorded: Farm, ending: signal.Signals) -
     process = recorded.start("view", "runs/r", "--web")
 
     def viewers() -> list[int]:
-        return [pid for pid in children(process.pid) if Path(f"/proc/{pid}/exe").resolve().name == "rerun"]
+        found = []
+        for pid in children(process.pid):
+            with contextlib.suppress(FileNotFoundError):  # a child that has just ended
+                found += [pid] if Path(f"/proc/{pid}/exe").resolve().name == "rerun" else []
+        return found
 
     recorded.wait_for(viewers)
     [viewer] = viewers()
