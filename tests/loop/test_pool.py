@@ -219,10 +219,11 @@ def test_with_certificates(thetas: FloatArray, alone: FloatArray, tmp_path: Path
 
 
 _INTERRUPTED = """
-import sys
+import signal
 import numpy as np
 import farm
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # this may run in the background, where Ctrl-C is ignored
 with farm.Farm("finger-gait", policy="linear", workers=2) as pool:
     try:
         while True:
