@@ -42,7 +42,7 @@ def safe(certs: Path) -> Iterator[Stage]:
 
 
 class Author(Learner):
-    """A learner of a run whose task is a class in a file, which it sends to who asks."""
+    """A learner of a run whose task is a class in a file; workers may ask it for the file."""
 
     def __init__(self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None) -> None:
         self.source = file.read_bytes()
