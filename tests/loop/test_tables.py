@@ -14,6 +14,7 @@ TABLES = Path(__file__).parents[2] / "benchmarks" / "tables.py"
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     ("words", "settings"),
     [
