@@ -56,7 +56,8 @@ class Audit:
     def begin(self, jobs: int) -> None:
         """A round of so many jobs."""
         self._round += 1
-        self._by = np.full(jobs, -1)  # whose answer counts, as a place in self._parties; -1: nobody who is checked
+        # Place in self._parties of the host whose answer counts; -1: a host that is not checked.
+        self._by = np.full(jobs, -1)
         self._checks: dict[int, _Check] = {}
         self._agreed: set[int] = set()
         self._chosen = False

@@ -160,9 +160,9 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
     assert '  File "pole.py", line 3, in look' in "\n".join(said[first:])
     ended(process)
     task.write_text(POLE)
-    mended = learner(farm, router, certs, "mended")
-    mended.communicate(timeout=60)
-    assert mended.returncode == 0
+    repaired = learner(farm, router, certs, "repaired")
+    repaired.communicate(timeout=60)
+    assert repaired.returncode == 0
     assert worker.poll() is None
 
 
