@@ -2,8 +2,8 @@
 #
 #   docker build --target worker --tag rolloutfarm-worker .
 #
-# BASE: any image with Python 3.11 and its venv module. UID: who the programs run as; files that
-# are mounted into them (certificates) have to be readable for that user.
+# BASE: any image with Python 3.11 and its venv module. UID: the user that the programs run as; files
+# that are mounted into them (certificates) must be readable for this user.
 ARG BASE=python:3.11-slim
 
 FROM ${BASE} AS build
@@ -35,7 +35,7 @@ FROM program AS worker
 COPY --from=build /opt/farm /opt/farm
 CMD ["worker"]
 
-# The same package: a learner that leaves recording to others needs no Rerun.
+# The same package: a learner that does not record needs no Rerun.
 FROM worker AS learner
 CMD ["learner", "--no-record"]
 

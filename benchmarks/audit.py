@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--generations", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    print("| pairs | --audit | rollouts/s | against none |\n|---|---|---|---|")
+    print("| pairs | --audit | rollouts/s | ratio to no checks |\n|---|---|---|---|")
     for pairs in (15, 100):
         config = configure(pairs=pairs, generations=max(10, arguments.generations * 15 // pairs))
         rates = np.array([[_rate(config, audit) for audit in AUDITS] for _ in range(arguments.repeats)])
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def _rate(config: RunConfig, audit: float) -> float:
-    """Exploring rollouts a second, from the tenth part of the generations on."""
+    """Exploring rollouts per second, from the tenth part of the generations on."""
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
     flags = ["--connect", place.listen, "--log-level", "WARNING"]
     times: list[float] = []

@@ -1,8 +1,8 @@
-"""After how many rollouts a preset's mean policy does the gait, in this process (docs/seeds.md holds ours).
+"""After how many rollouts a preset's mean policy succeeds, in this process (results are in docs/seeds.md).
 
     python benchmarks/early.py [--preset default] [--first 20] [--seeds 10] [--policy constant]
 
-The mean policy is tried on 100 perturbed starts after every generation of the first 200 rollouts, then after every 15th
+The mean policy is tried on 100 perturbed starts after every generation of the first 500 rollouts, then after every 15th
 and the last; on the nominal start after every 5th. `--policy constant` learns 8 numbers that do not see the state.
 """
 

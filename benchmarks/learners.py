@@ -38,7 +38,7 @@ ALGORITHMS: Final[Mapping[str, dict[str, Any]]] = {
     "cma-es": {"population": 20},
     "sep-cma": {"population": 20},
 }
-"""Settings besides start and sigma; twenty rollouts a generation."""
+"""Settings besides start and sigma; twenty rollouts per generation."""
 
 GAIT: Final[Mapping[str, dict[str, Any]]] = {
     "constant": {"initial_mu": 0.0, "initial_sigma": 0.2},

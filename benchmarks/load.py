@@ -1,4 +1,4 @@
-"""What a farm does under loads that nobody plans: many learners, idle workers, huge and tiny generations; one table.
+"""What a farm does under unusual loads: many learners, idle workers, huge and tiny generations; one table.
 
     python benchmarks/load.py [--seconds 10] [--learners 40]
 
@@ -26,12 +26,12 @@ def main() -> None:
     parser.add_argument("--learners", type=int, default=40)
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without ending what it began
-    print("| load | generations/s | rollouts/s | a generation [ms] | learner: cores | learner MB |")
+    print("| load | generations/s | rollouts/s | time per generation [ms] | learner: cores | learner MB |")
     print("|---|---|---|---|---|---|")
     for what, workers, pairs in (
-        ("one pair a generation, 1 worker", 1, 1),
-        ("20 000 pairs a generation, 16 workers", 16, 20_000),
-        ("200 workers, one pair a generation", 200, 1),
+        ("one pair per generation, 1 worker", 1, 1),
+        ("20 000 pairs per generation, 16 workers", 16, 20_000),
+        ("200 workers, one pair per generation", 200, 1),
     ):
         m = measure(workers, pairs, 0.0, arguments.seconds)
         rate = m.pairs_per_second / pairs
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def _learners(count: int, seconds: float) -> None:
-    """So many learners behind one router, and four workers who serve them all."""
+    """This number of learners behind one router, and four workers that serve all of them."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         endpoint, generations = free_endpoint(), 20
         router = stack.enter_context(process(["-m", "farm", "router", "--listen", endpoint], folder))

@@ -2,10 +2,10 @@
 
     python benchmarks/recording.py [--blocks 10] [--repeats 3] [--long 500]
 
-A run at N 15 that is recorded in two blocks of ten generations of every four, the middle ones: both kinds of blocks
-have the same share of a noisy machine and of the learning (rollouts take longer as fewer end early). Into a file, and
-live with no viewer, one that watches, and one that has stopped. Compared are the medians of a generation's time, and
-the processor time of the learner's thread and of the recorder's.
+A run at N 15 is recorded in the middle two of every four blocks of ten generations. So both kinds of blocks have the
+same share of a noisy machine and of the learning (rollouts take longer as fewer end early). It is recorded into a
+file, and live without a viewer, with one that watches, and with one that has stopped. The table compares the median
+time per generation, and the processor time of the learner's thread and of the recorder's.
 """
 
 import argparse
@@ -42,7 +42,7 @@ KINDS = {
 
 @dataclass
 class Times:
-    """Of generations, each list one number a generation [ms]."""
+    """Of generations, each list one number per generation [ms]."""
 
     wall: list[float] = field(default_factory=list)
     """From report to report."""
@@ -64,7 +64,8 @@ def main() -> None:
         for name, kind in KINDS.items():
             _run(configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *found[name])
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}")
-    print("\n| recorded | a generation [ms] | recorded | longest | learner's thread | recorded | of it | recorder |")
+    print("\n| recorded | time per generation [ms] | recorded | longest | learner's thread | recorded | difference "
+          "| recorder |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
     for name, (without, with_) in found.items():
         wall, thread, process = (

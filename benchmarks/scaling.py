@@ -2,11 +2,11 @@
 
     python benchmarks/scaling.py [--workers 1,4,16,64,256,1000] [--pair 0.02] [--seconds 12]
 
-A worker is the farm's own `Worker` on a session of its own; instead of simulating it makes returns up, and what
-it has to say waits until simulating would be over. A learner process learns from them. All share this machine, so
-the emulation takes processor time that a real farm's learner would not have to share; the table has both. Beyond 64
-workers a pair takes longer, so that there are not more pairs a second than at 64: what is measured is then what so
-many workers cost, not so many rollouts.
+An emulated worker is the farm's own `Worker` with its own session. Instead of simulating, it makes up returns and
+sends them when simulating would be over. A learner process learns from them. All share this machine, so the emulation
+takes processor time that a real farm's learner would not have to share; the table has both. With more than 64 workers a
+pair takes longer, so that there are never more pairs per second than with 64. So the table then shows the cost of the
+workers, not of more rollouts.
 """
 
 import argparse
@@ -46,7 +46,7 @@ from farm.tasks.base import Task
 from workers.worker import IDLE, Worker, WorkerConfig
 
 TOGETHER = 32  # emulated workers a process
-MOST = 3200  # pairs a second that are tried
+MOST = 3200  # pairs per second that are tried
 PAIRS = 1000  # a generation; beyond 64 workers as many a worker as there
 LOOK = 1.0  # [s] between two looks at whether workers have nothing to do
 
@@ -126,7 +126,7 @@ class Emulated(Worker):
 
 
 class Noted(Events):
-    """Events that somebody is told of; not of a round's mean, which is of use with jobs alone."""
+    """Events that are sent on; not a round's mean, which is useful only together with jobs."""
 
     def __init__(self, tell: Callable[[], None]) -> None:
         """Know how to tell."""
@@ -150,7 +150,7 @@ class Agenda:
         self._number = itertools.count()  # of equals the first
 
     def add(self, at: float, send: Callable[[], None]) -> None:
-        """Have something sent then [s]."""
+        """Send something at that time [s]."""
         heapq.heappush(self._due, (at, next(self._number), send))
 
     def follow(self, workers: Sequence[Emulated], over: threading.Event) -> None:
@@ -198,8 +198,8 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without ending what it began
     counts = [int(word) for word in arguments.workers.split(",")]
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}\n")
-    print("| workers | ms a pair | N | all joined after [s] | rollouts/s | ideal | efficiency | learner: cores | "
-          "us a pair | MB | emulation: cores |")  # fmt: skip
+    print("| workers | ms per pair | N | all joined after [s] | rollouts/s | ideal | efficiency | learner: cores | "
+          "us per pair | MB | emulation: cores |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for count in counts:
         pair, pairs = max(arguments.pair, count / MOST), max(PAIRS, PAIRS * count // 64)
@@ -211,7 +211,7 @@ def main() -> None:
             flush=True,
         )
     print("\nA generation's time [ms], where simulating takes none (16 workers):\n")
-    print("| N | median | us a pair, learner |\n|---|---|---|")
+    print("| N | median | learner: us per pair |\n|---|---|---|")
     for pairs in (15, 100, 1000):
         m = measure(16, pairs, 0.0, arguments.seconds)
         print(f"| {pairs} | {1e3 * m.latency:.1f} | {1e6 * m.cpu / m.pairs_per_second:.0f} |", flush=True)

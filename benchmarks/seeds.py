@@ -1,8 +1,8 @@
-"""How surely a preset learns: runs of several seeds, one table (docs/seeds.md holds ours).
+"""How reliably a preset learns: runs of several seeds, one table (results are in docs/seeds.md).
 
     python benchmarks/seeds.py [--preset default] [--seeds 10] [--out runs/seeds-default]
 
-A run that is there already is not repeated; an interrupted one goes on.
+An existing run is not repeated; an interrupted one is resumed.
 """
 
 import argparse

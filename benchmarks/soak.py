@@ -2,9 +2,9 @@
 
     python benchmarks/soak.py [--minutes 60] [--every 3]
 
-A learner runs while, every few seconds, a worker is killed or another one joins (one to four at a
-time). Then the same number of generations is learnt again with nobody disturbed: the hashes must agree, and memory
-must not have grown, but for the rollouts that a learner keeps for recorders that join late; the exit status says so.
+A learner runs while, every few seconds, a worker is killed or another one joins (one to four at a time). Then the same
+number of generations is learnt again, undisturbed. The hashes must agree, and memory must not have grown, except by
+the rollouts that a learner keeps for recorders that join late. The exit status is 1 otherwise.
 """
 
 import argparse
@@ -82,7 +82,7 @@ def main() -> None:
         with open_run(calm, Path(folder) / "calm", place) as run:
             for _ in run.learn():
                 pass
-    print("| minutes | generations | rollouts | killed | joined | re-issued | learner MB | worker MB | same hash |")
+    print("| minutes | generations | rollouts | killed | joined | reissued | learner MB | worker MB | same hash |")
     print("|---|---|---|---|---|---|---|---|---|")
     print(
         f"| {arguments.minutes:g} | {soaked['generations']} | {soaked['rollouts']} | {crowd.killed} | {crowd.joined} "

@@ -1,47 +1,94 @@
-"""Makes docs/results.md and docs/results/ from a folder of `python -m benchmarks.thesis thesis`.
+"""Makes docs/results.md and the pages under docs/results/ from a folder of `python -m benchmarks.thesis thesis`.
 
-    python -m docs.results runs/thesis [--machine SENTENCE]        (docs/results itself: the page and figures again)
+    python -m docs.results runs/thesis [--machine SENTENCE]        (docs/results itself: pages and figures again)
 
 Data is put beside what is there, and figures are drawn; every number in the tables comes from the data. What is written
-by hand stands in docs/results/notes.md: under a heading with the experiment's name, what its result means.
+by hand is in docs/results/notes.md: under an experiment's name, what its result means; under `page NAME`, the answer at
+the top of a page. There `{NAME}` becomes an experiment's link and verdict.
 """
 
 import argparse
 import json
+import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from benchmarks.thesis.catalogue import EXPERIMENTS, TRIALS, minutes
-from benchmarks.thesis.experiment import Data, Experiment, judge, spread, verdict
+from benchmarks.thesis.experiment import Data, Experiment, Finding, judge, spread, verdict
 from benchmarks.thesis.figures import draw
 from benchmarks.thesis.folder import ExperimentFolder
 from benchmarks.thesis.measure import measure
 
 HERE = Path(__file__).parent
 
+PAGES: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
+    "direct-learning": (
+        "Can the weights of the features be learnt directly?",
+        ("fig-4.1", "text-4.1.1", "text-4.1.2", "text-4.3", "why-race", "cosine", "direct-few"),
+    ),
+    "convergence": ("Does the search converge?", ("fig-4.2", "fig-4.2-fitted")),
+    "features": ("How many features does the kernel need?", ("fig-4.3", "table-3.2", "why-features")),
+    "state-bases": (
+        "What should the controller see?",
+        ("fig-4.4", "why-contacts", "equal-accuracy", "fig-4.4-fitted", "equal-accuracy-fitted"),
+    ),
+    "pairs": (
+        "Few pairs per generation, or many?", ("fig-4.5", "fig-4.6", "fig-4.5-fitted", "fig-4.6-fitted"),
+    ),
+    "start": ("Where should the search begin?", ("text-8000", "why-start", "start-fitted", "why-fitted")),
+    "scaling": ("Does the size of the returns matter?", ("text-3.5.2",)),
+    "baselines": ("What are pairs and baselines worth?", ("baselines",)),
+    "objects": ("Does it work with other objects?", ("objects", "objects-between")),
+    "chain": ("Can gaits be chained?", ("release", "chain")),
+    "friction": ("How much friction does it take?", ("friction",)),
+}  # fmt: skip
+"""Pages by name: the question, and the experiments that answer it."""
+
+FUTURE: Final = "future-work"
+"""The page on what the thesis proposes (5.2)."""
+
 HEAD = """# Results
 
-What Plage 2016 found, and the questions it left open, with this project: question by question, claim by claim. This
-page is made by `docs/results.py` from the data in `docs/results/`. From a checkout, `python -m benchmarks.thesis plot
-docs/results` draws the figures again from it, and `python -m benchmarks.thesis NAME` does an experiment anew (`thesis`
-instead of a name all of them; `--list` says what each costs).
+What Plage 2016 found, and the questions it left open, with this project: one page per question, claim by claim.
+Everything here is made by `docs/results.py` from the data in `docs/results/`. From a checkout, `python -m
+benchmarks.thesis plot docs/results` draws the figures again from it, and `python -m benchmarks.thesis NAME` does an
+experiment anew (`thesis` instead of a name: all of them; `--list` says what each costs).
+
+| question | experiment | verdict |
+|---|---|---|
+{overview}
+
+What the thesis proposes as future work (5.2), and what came of it, row by row: [{future}](results/{future}.md).
+
+Results that have pages of their own:
+
+| question | answer |
+|---|---|
+| [Does touch decide?](touch.md) | {touch} |
+| [How long does a chain of gaits go on?](chain.md) | ten cycles or more in five seeds of five |
+| [Can an object be turned?](turning.md) | a plate, by a script, not learnt: 360 degrees from each of 200 starts |
+| [How surely do the presets learn?](seeds.md) | `default` in ten seeds of ten, `thesis` in eight of ten |
+| [How do the learners compare with published scores?](learners.md) | a table per environment |
+
+## How to read the pages
 
 A set-up is run with seeds 0 to {last}. Its settings are the preset `thesis` with what the figure's caption or text
-says, or what the preset `default` was then: mu 1.75, sigma 0.8, N 15, alpha_mu 0.1 (`docs/method.md`). **Learnt**
+says, or what the preset `default` was then: mu 1.75, sigma 0.8, N 15, alpha_mu 0.1 ([method.md](method.md)). **Learnt**
 means: the final mean policy does the gait on the nominal start and on at least 80 % of 100 perturbed ones. Numbers are
 the mean over the trials, and in brackets the least and the greatest. To compare returns (weights *projected*): holding
 still gives -5.4, the three-finger grip's commands at once -0.07.
 
 Nothing was tuned until it agreed. A verdict is arithmetic: each part of a claim is a comparison in
-`benchmarks/thesis/claims.py`; *reproduced* says that all hold, *in part* some, *not reproduced* none. Why a
-result is as it is, is said below it, and what stands behind that in the experiments whose names begin with `why-`.
+`benchmarks/thesis/claims.py`; *reproduced* says that all hold, *in part* some, *not reproduced* none. Questions of ours
+have no claim: the table says which set-ups learn. The text below a result explains it; the evidence is in the
+experiments whose names begin with `why-`.
 
 {machine}
-
 """
 
 
@@ -59,15 +106,21 @@ def main() -> None:
     if chosen.machine:
         machine.write_text(chosen.machine + "\n", "utf-8")
     notes = dict(sections((out / "notes.md").read_text("utf-8"))) if (out / "notes.md").exists() else {}
-    whole, parts = ExperimentFolder.open(out), []
-    for name in whole.experiments:
-        experiment, data = EXPERIMENTS[name], whole.data(EXPERIMENTS[name])
-        draw(experiment, data, out)[0].unlink()  # the SVG is enough here
-        parts.append(section(experiment, data, notes.get(name, "")))
-    head = HEAD.format(last=whole.trials - 1, machine=machine.read_text("utf-8").strip())
-    overview = "\n".join(summary(EXPERIMENTS[name], whole.data(EXPERIMENTS[name])) for name in whole.experiments)
-    table = f"| experiment | what | verdict |\n|---|---|---|\n{overview}\n\n"
-    (HERE / "results.md").write_text(head + table + "\n".join(parts), "utf-8")
+    whole = ExperimentFolder.open(out)
+    known = {name: whole.data(EXPERIMENTS[name]) for name in whole.experiments}
+    for name, data in known.items():
+        draw(EXPERIMENTS[name], data, out)[0].unlink()  # the SVG is enough here
+    for page in PAGES:
+        (out / f"{page}.md").write_text(question(page, known, notes), "utf-8")
+    (out / f"{FUTURE}.md").write_text(filled(notes.get(f"page {FUTURE}", ""), known) + "\n", "utf-8")
+    head = HEAD.format(
+        overview="\n".join(row for page in PAGES for row in summary(page, known)),
+        future=FUTURE,
+        touch=touch(out / "touch" / "bias-0.05.json"),
+        last=whole.trials - 1,
+        machine=machine.read_text("utf-8").strip(),
+    )
+    (HERE / "results.md").write_text(head, "utf-8")
 
 
 def _take(folder: ExperimentFolder, out: Path) -> None:
@@ -92,14 +145,77 @@ def sections(text: str) -> Iterator[tuple[str, str]]:
         yield name.strip(), body.strip()
 
 
-def summary(experiment: Experiment, data: Data) -> str:
-    """A row of the overview."""
+def question(page: str, known: Mapping[str, Data], notes: Mapping[str, str]) -> str:
+    """A page: question, answer, verdicts, and a section for each experiment."""
+    title, names = PAGES[page]
+    names = tuple(name for name in names if name in known)
+    answer = filled(notes.get(f"page {page}", ""), known)
+    table = ["| experiment | what | verdict |", "|---|---|---|"]
+    for name in names:
+        table.append(f"| {link(name, page)} | {EXPERIMENTS[name].title} | {said(EXPERIMENTS[name], known[name])} |")
+    parts = [section(EXPERIMENTS[name], known[name], notes.get(name, "")) for name in names]
+    top = [f"# {title}", *([answer] if answer else []), "\n".join(table)]
+    return "\n\n".join([*top, "All questions, and how to read this page: [results.md](../results.md).", *parts]) + "\n"
+
+
+def filled(text: str, known: Mapping[str, Data]) -> str:
+    """A note with links and verdicts in the places of {NAME}."""
+    return re.sub(r"\{([a-z0-9.-]+)\}", lambda m: f"{link(m[1])}: {said(EXPERIMENTS[m[1]], known[m[1]])}", text)
+
+
+def link(name: str, page: str = "", folder: str = "") -> str:
+    """A link to an experiment's section, from its own page or from another one."""
+    at = next(each for each, (_, names) in PAGES.items() if name in names)
+    file = "" if at == page else f"{folder}{at}.md"
+    return f"[{name}]({file}#{anchor(EXPERIMENTS[name])})"
+
+
+def summary(page: str, known: Mapping[str, Data]) -> Iterator[str]:
+    """A page's rows of the overview."""
+    title, names = PAGES[page]
+    first = f"[{title}](results/{page}.md)"
+    for name in names:
+        if name in known:
+            what = EXPERIMENTS[name].title
+            yield f"| {first} | {link(name, folder='results/')} {what} | {said(EXPERIMENTS[name], known[name])} |"
+            first = ""
+
+
+def said(experiment: Experiment, data: Data) -> str:
+    """What came out, in a few words."""
     found = judge(experiment, data)
     if experiment.claim:
-        said = f"**{verdict(found)}**: {sum(f.holds for f in found)} of {len(found)} parts"
-    else:
-        said = "; ".join(f"{f.part}: {'yes' if f.holds else 'no'}" for f in found) or "open"
-    return f"| [{experiment.name}](#{anchor(experiment)}) | {experiment.title} | {said} |"
+        return f"**{verdict(found)}**: {sum(f.holds for f in found)} of {len(found)} parts"
+    return "; ".join(_grouped(found)) or "open"
+
+
+def _grouped(found: Sequence[Finding]) -> list[str]:
+    """Parts with the same last words are named together."""
+    end = os.path.commonprefix([f.part[::-1] for f in found])[::-1]
+    _, space, verb = end.partition(" ")
+    if len(found) < 2 or not space:
+        return [f"{f.part}: {'yes' if f.holds else 'no'}" for f in found]
+    yes, no = ([f.part.removesuffix(f" {verb}") for f in found if f.holds is held] for held in (True, False))
+    if not yes:
+        return [f"none {verb}"]
+    if not no:
+        return [f"each {verb}"]
+    return [f"{verb}: {_listed(yes)}", f"not: {_listed(no)}"]
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return " / ".join(parts) if any(", " in part for part in parts) else ", ".join(parts)
+
+
+def touch(path: Path) -> str:
+    """What the fragile bar's data says."""
+    found = {name: 100.0 * np.array(values) for name, values in json.loads(path.read_text("utf-8")).items()}
+    felt, blind = found["forces"], {n: v for n, v in found.items() if not re.match("forces|cop|tactile", n)}
+    best = max(np.median(values) for values in blind.values())
+    return (
+        f"yes: with three forces {int((felt >= 95.0).sum())} of {len(felt)} seeds succeed on at least 95 % of the "
+        f"starts, median {np.median(felt):.3g} %; the best without touch has {best:.3g} %"
+    )
 
 
 def anchor(experiment: Experiment) -> str:
@@ -122,7 +238,7 @@ def section(experiment: Experiment, data: Data, note: str) -> str:
         lines += ["| | | numbers |", "|---|---|---|"]
         lines += [f"| {f.part} | {'yes' if f.holds else 'no'} | {f.numbers} |" for f in found]
         lines.append("")
-    lines += [f"![{experiment.title}](results/{experiment.name}.svg)", ""]
+    lines += [f"![{experiment.title}]({experiment.name}.svg)", ""]
     if note:
         lines += [note, ""]
     if data.series:
@@ -136,7 +252,7 @@ def section(experiment: Experiment, data: Data, note: str) -> str:
         lines += ["\\* wall time of its runs, four at a time on the same workers.", ""]
     cost = f", about {minutes(tuple(experiment.curves.values())) * TRIALS:.0f} min on two cores" if data.series else ""
     again = f"Again: `python -m benchmarks.thesis {experiment.name}`{cost}"
-    lines += [f"{again}; the figure alone: `python -m benchmarks.thesis plot docs/results`.", ""]
+    lines += [f"{again}; the figure alone: `python -m benchmarks.thesis plot docs/results`."]
     return "\n".join(lines)
 
 

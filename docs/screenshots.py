@@ -1,10 +1,10 @@
 """Pictures of the real Rerun viewer on a run, without a screen.
 
-    python docs/screenshots.py [--out docs/pictures] [--runs FOLDER]
+    python docs/screenshots.py [--out docs/pictures]
 
-Learns short runs, and takes the viewer's pictures of one live, of its file (both tabs), of a replay, of a comparison
-and of an environment of Gymnasium. Needs a Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1) and the extras
-`learner` and `gym`. Exit status 1 if a view of the viewer reports an error.
+Learns short runs, and takes the viewer's pictures of one live, of its file (both tabs), of a replay, of a comparison,
+of an environment of Gymnasium and of the fragile bar. Needs a Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)
+and the extras `learner` and `gym`. Exit status 1 if a view of the viewer reports an error.
 """
 
 import argparse
@@ -111,11 +111,13 @@ def main() -> None:
         _farm(folder, "compare", "runs/first", "runs/other", "--to", "compare.rrd")
         swim = ("--task", "gym:Swimmer-v5", "--steps", "300", "--generations", "15")
         _farm(folder, "run", *swim, "--name", "swim", "--quiet")
+        _farm(folder, "run", "--task", "fragile-bar", "--name", "bar", "--quiet")
         for name, source, tab, at in (
             ("viewer", "runs/first/run.rrd", "Learning", ("generation", {"sequence": 90})),
             ("rollout", "runs/first/run.rrd", "Rollout", ("sim_time", {"duration": 135.7})),
             ("replay", "runs/first/rollout.rrd", "", ("sim_time", {"duration": 1.2})),
             ("compare", "compare.rrd", "", None),
+            ("fragile", "runs/bar/run.rrd", "Rollout", ("sim_time", {"duration": 51.2})),
             ("gym", "runs/swim/run.rrd", "Learning", ("generation", {"sequence": 15})),
         ):
             with viewer() as shown:

@@ -23,7 +23,7 @@ COTH = (-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 /
 
 
 def cos(x: np.ndarray) -> np.ndarray:
-    """Cosine of |x| < 10^6, with the same bits on every processor; numpy's has others on some."""
+    """Cosine of |x| < 10^6, with the same bits on every processor; numpy's differs on some."""
     k = np.floor(x * (1.0 / math.pi))
     r = (k + 0.5) * PI[0] - x + (k + 0.5) * PI[1] + (k + 0.5) * PI[2]
     r = np.where(k % 2 == 0, r, -r)
@@ -163,7 +163,7 @@ class Policy:
         return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"], *moved])), held
 
     def moved(self) -> float:
-        """What it costs that the object is no longer where it was released."""
+        """The cost of the object being away from where it was released."""
         shift, now = self.data.qpos[8:11] - self.released[:3], self.data.qpos[11:]
         distance, cosine = np.sqrt((shift * shift).sum()), np.abs((now * self.released[3:]).sum())
         squares = (distance / self.p["moved"]) ** 2 + (1.0 - cosine) / (1.0 - self.p["turned_cosine"])

@@ -1,9 +1,7 @@
 """A robot as a worker, in plain Python with zenoh and msgpack: docs/protocol.md, "The worker's side, exactly".
 
-    farm run --task rig.py:Rig --mixed --patience 10 --listen tcp/127.0.0.1:7447    # its workers do what a rig cannot
-    python robot_worker.py --connect tcp/127.0.0.1:7447
-
-The robot here is a pendulum, integrated against a clock of its own; put yours into `rollout`.
+farm run --task rig.py:Rig --mixed --patience 10 --listen tcp/127.0.0.1:7447    # its workers do what a rig cannot
+python robot_worker.py --connect tcp/127.0.0.1:7447
 """
 
 import argparse
@@ -26,7 +24,7 @@ LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}  # struct's, of an ar
 
 
 def rollout(theta: list[float], clock: float) -> float:
-    """The return of 50 control steps of 50 ms by the rig's clock; a RuntimeError where the rig could not do them."""
+    """The return of 50 steps of 50 ms by the rig's clock, or a RuntimeError: put your robot here."""
     angle, speed, value, begun = 0.3 + random.uniform(-0.1, 0.1), 0.0, 0.0, time.monotonic()
     for step in range(1, 51):
         action = theta[0] * math.sin(angle) + theta[1] * math.cos(angle) + theta[2] * 0.1 * speed + theta[3]
@@ -36,7 +34,7 @@ def rollout(theta: list[float], clock: float) -> float:
         if abs(speed) > 7.0:
             raise RuntimeError(f"the rig's guard stopped it in step {step}: faster than 7 rad/s")
         value += math.cos(angle)
-        time.sleep(max(0.0, begun + 0.05 * step / clock - time.monotonic()))
+        time.sleep(max(0.0, clock and begun + 0.05 * step / clock - time.monotonic()))
     return value
 
 
@@ -47,7 +45,7 @@ def array(dtype: str, shape: list[int], values: list[float]) -> msgpack.ExtType:
 
 
 def numbers(_: int, data: bytes) -> list[float]:
-    """The numbers of an array, one behind the other."""
+    """The numbers of an array, one after another."""
     (dtype, _), raw = msgpack.unpackb(data[1 : 1 + data[0]]), data[1 + data[0] :]
     return struct.unpack(f"<{len(raw) // struct.calcsize(LETTERS[dtype])}{LETTERS[dtype]}", raw)
 
@@ -63,11 +61,11 @@ class Worker:
         self.token = session.liveliness().declare_token(f"farm/live/worker/{self.id}")  # last, or jobs are lost
 
     def serve(self) -> None:
-        """Take in what comes; where nothing does for a second, say that there is nothing."""
+        """Handle events as they arrive; if there is none for a second, say that there is nothing to do."""
         while True:
             try:
                 sample = self.events.get(timeout=1.0)
-                if "/live/" in (key := str(sample.key_expr)):
+                if "/live/learner/" in (key := str(sample.key_expr)):
                     (self.runs.add if sample.kind == zenoh.SampleKind.PUT else self.runs.discard)(key.split("/")[-1])
                     self.want()
                 else:
@@ -78,7 +76,7 @@ class Worker:
                 print("ignored a message:", ascii(error))
 
     def want(self, idle: tuple[str, ...] = ()) -> None:
-        """Ask for a job at a time. The canary is empty: nobody gets these numbers a second time."""
+        """Ask for one job at a time. The canary is empty, because these numbers cannot be repeated."""
         own = {"version": "robot_worker", "canary": "", "host": os.uname().nodename, "cores": 1, "ignored": {}}
         self.say(f"want/{self.id}", "WorkRequest", worker=self.id, credits=1, idle=list(idle), **own)
 
@@ -89,8 +87,8 @@ class Worker:
 
     def ask(self, run: str, what: str) -> bytes:
         """What the run's learner answers, empty where it does not."""
-        replies = self.session.get(f"farm/run/{run}/{what}", timeout=1.0)
-        return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok), b"")
+        said = self.session.get(f"farm/run/{run}/{what}", timeout=1.0)
+        return next((reply.ok.payload.to_bytes() for reply in said if reply.ok), b"")
 
     def round(self, run: str) -> dict:
         """The round that is on, and whether it is of a run that the rig knows."""
@@ -126,8 +124,7 @@ class Worker:
                 continue
             n, own = len(values), {"trajectories": [], "traces": array("<f4", [0, 0, 0], [])}
             own |= {"returns": array("<f8", [n], values), "flags": array("|b1", [n, 4], [False] * 4 * n)}
-            own |= {"jobs": array("<i8", [1], [index]), "steps": array("<i8", [n], [50] * n)}
-            self.say(key, "Results", **head, **own)
+            self.say(key, "Results", **head, **own, jobs=array("<i8", [1], [index]), steps=array("<i8", [n], [50] * n))
             print(f"job {index} of round {head['round']}:", *(f"{value:.2f}" for value in values), flush=True)
 
 
@@ -135,16 +132,19 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="A simulated rig as a worker.")
     parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="where a learner or a router listens")
     parser.add_argument("--tls", type=Path, help="a folder worker-NAME of farm certificates")
-    parser.add_argument("--clock", type=float, default=10.0, help="the rig's, times real time")
+    parser.add_argument("--clock", type=float, default=10.0, help="the rig's, times real time; 0 does not wait")
     given, config, name = parser.parse_args(), zenoh.Config(), "rig"
     settings = {"mode": "client", "connect/endpoints": [given.connect], "connect/timeout_ms": -1}
     settings |= {"connect/retry": {"period_max_ms": 1000}, "transport/link/tls/enable_mtls": bool(given.tls)}
-    if given.tls:
-        name = json.loads((given.tls / "identity.json").read_text())["name"]
-        for key in ("root_ca_certificate ca", "connect_certificate cert", "connect_private_key key"):
-            settings[f"transport/link/tls/{key.split()[0]}"] = str(given.tls / f"{key.split()[1]}.pem")
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, also while nobody answers
-    with zenoh.open(config) as session:
-        Worker(session, name, given.clock).serve()
+    try:
+        if given.tls:
+            name = json.loads((given.tls / "identity.json").read_text())["name"]
+            for key in ("root_ca_certificate ca", "connect_certificate cert", "connect_private_key key"):
+                settings[f"transport/link/tls/{key.split()[0]}"] = str(given.tls / f"{key.split()[1]}.pem")
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        with zenoh.open(config) as session:
+            Worker(session, name, given.clock).serve()
+    except (OSError, ValueError, KeyError, zenoh.ZError) as error:
+        parser.error(f"it cannot begin with these: {error}")

@@ -1,4 +1,4 @@
-"""The front door: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
+"""The command line: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
 
 import errno
 import os
@@ -16,28 +16,28 @@ if TYPE_CHECKING:
     from types import FrameType
 
 _PIPE: Final = 141
-"""Exit status when whoever read standard output went away, as of a shell: 128 and SIGPIPE."""
+"""Exit status if the reader of standard output went away, as in a shell: 128 and SIGPIPE."""
 
 COMMANDS: Final = {
-    "run": "learner and local workers together: learns a task and records it",
-    "learner": "the learner alone; workers join it from anywhere",
-    "worker": "workers alone; they serve whichever learners are there",
-    "tasks": "tasks, policies, algorithms and backends: what there is, from where, with its settings",
-    "new-task": "writes a task of your own to start from, 30 lines that run",
-    "check": "checks a task of your own: sizes, same bits however batched, rollouts per second, a picture",
-    "evaluate": "the learnt mean policy on perturbed starts",
-    "replay": "any policy of a run again, at physics rate, into a recording or a video",
-    "chain": "learnt policies in turn, each from where the one before it ended",
-    "compare": "several runs in one recording: curves overlaid, scenes side by side",
-    "play": "the learnt policy in MuJoCo's interactive viewer: push what moves",
-    "export": "the learnt policy as one file for plain MuJoCo and numpy",
-    "sweep": "settings x seeds on one set of workers; a table and a figure",
-    "record": "a run's recording made on any machine, over the network",
+    "run": "starts a learner and local workers: learns a task and records it",
+    "learner": "starts the learner alone; workers join it from any machine",
+    "worker": "starts workers alone; they serve every learner they find",
+    "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
+    "new-task": "writes a task of 31 lines that runs, to start from",
+    "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
+    "evaluate": "tries the learnt mean policy on perturbed starts",
+    "replay": "simulates any policy or rollout of a run again, into a recording or a video",
+    "chain": "lets learnt policies act one after another, and counts the cycles",
+    "compare": "puts several runs into one recording: curves together, scenes side by side",
+    "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
+    "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
+    "sweep": "learns settings x seeds on one set of workers; a table and a figure",
+    "record": "records a run on any machine, over the network",
     "view": "opens the recordings of runs in the Rerun viewer",
-    "runs": "a table of the runs in a folder",
-    "status": "which runs and workers a farm has, and how they are doing",
-    "router": "a permanent router that learners and workers connect to",
-    "certificates": "a small certificate authority, for farms of several machines",
+    "runs": "prints a table of the runs in a folder",
+    "status": "shows the runs and workers of a farm, and how they are doing",
+    "router": "starts a permanent router that learners and workers connect to",
+    "certificates": "makes certificates for a farm of several machines",
 }
 """What the built-in commands are for."""
 
@@ -75,14 +75,14 @@ def _run(words: Sequence[str], *, own: bool) -> int:
 
 
 def _signals(handler: "Callable[[int, FrameType | None], Any] | signal.Handlers") -> None:
-    """Handle Ctrl-C and SIGTERM; what this process was told to ignore (nohup, a job of a script) stays ignored."""
+    """Handle Ctrl-C and SIGTERM; signals that this process was told to ignore (as by nohup) stay ignored."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
 
 
 def _streams() -> None:
-    """See that no file of ours becomes standard output or error because that is closed."""
+    """Make sure that no file takes the place of standard output or error if these are closed."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -120,7 +120,7 @@ def _ended(error: BaseException) -> int:
 
 
 def _unwritten() -> OSError | None:
-    """Why standard output does not take what was written to it, if so; what it did not take is given up then."""
+    """Why standard output did not take what was written to it, or None; the rest is discarded."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -131,7 +131,7 @@ def _unwritten() -> OSError | None:
 
 
 def _system(error: OSError) -> str:
-    """What the system refused, and what to do about that."""
+    """What the system refused, and the remedy."""
     hints = {errno.EMFILE: "allow more of them: ulimit -n 1024", errno.ENOSPC: "make room"}
     try:
         Path.cwd()
@@ -148,8 +148,8 @@ def _overview() -> str:
     others = {name: origin for name, origin in plugins.names("commands").items() if name not in COMMANDS}
     rows = "".join(f"  farm {name:<14}{text}\n" for name, text in (COMMANDS | others).items())
     return (
-        "rolloutfarm: policy search on any task, with as many MuJoCo workers on as many machines as you like.\n\n"
-        f"{rows}\n  farm COMMAND --help says what a command takes; farm --version.\n"
+        "rolloutfarm: policy search on any MuJoCo task, with as many workers on as many machines as you like.\n\n"
+        f"{rows}\n  farm COMMAND --help lists the settings of a command; farm --version prints the version.\n"
     )
 
 

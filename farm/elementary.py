@@ -165,7 +165,7 @@ def _polynomial(coefficients: tuple[FloatArray, ...], z: FloatArray, out: FloatA
 
 
 def _otherwise(function: Callable[[float], float], x: FloatArray, out: FloatArray, scratch: FloatArray) -> None:
-    """Ask the C library where the argument is too large for ours: rare, and nothing is fast there."""
+    """Use the C library's function if the argument is too large for ours; this is rare, and need not be fast."""
     np.abs(x, out=scratch)
     if np.maximum.reduce(scratch) <= _LARGE:
         return

@@ -1,12 +1,12 @@
-"""What can go wrong, as a tree.
+"""The errors, as a tree.
 
-FarmError                 anything we can say in one line
+FarmError                 anything that can be explained in one line
   ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
     CheckpointError       a run folder that cannot be continued or read
     UnservedError         a run that this machine's workers do not know, lack something for, or may not serve
-  MessageError            bytes from the network that are not what they should be
-  TaskError               a task or policy of the user's that gives arrays which make no sense (exit status 1)
-  RunError                a run that cannot go on (exit status 1)
+  MessageError            bytes from the network that are no valid message
+  TaskError               a user's task or policy whose arrays make no sense (exit status 1)
+  RunError                a run that cannot continue (exit status 1)
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
 
@@ -18,15 +18,15 @@ _LINE: Final = 500  # characters
 
 
 def brief(text: str) -> str:
-    """One printable line of at most 500 characters, of whatever text: for logs, and for what others are told."""
+    """One printable line of at most 500 characters, from any text: for logs, and for messages to other machines."""
     line = " ".join(text[: 2 * _LINE].split())[:_LINE]
     return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
 def printable(text: str, kept: str = "") -> str:
-    r"""The text with whatever is not to be seen escaped, as \x1b: it may come from anybody, and terminals obey it.
+    r"""The text with invisible characters escaped, as \x1b: any machine may have sent it, and terminals obey it.
 
-    Letters of all languages stay; characters in `kept` do as well.
+    Letters of all languages are kept, and so are the characters in `kept`.
     """
     return "".join(
         letter if letter.isprintable() or letter in kept else letter.encode("unicode_escape").decode()
@@ -38,7 +38,7 @@ class FarmError(Exception):
     """One clear line: what was wrong, what was expected, what to do."""
 
     traceback: tuple[str, ...] = ()
-    """Of an error in code that ran in another process: what its author wants to see, in printable lines."""
+    """The traceback of an error in code that ran in another process, in printable lines for its author."""
 
 
 class ConfigError(FarmError):
@@ -53,12 +53,16 @@ class MessageError(FarmError):
         self.kind = kind
 
 
+class NameTakenError(ConfigError):
+    """A new run's name is another run's: its folder exists, or a learner on the farm has it."""
+
+
 class CheckpointError(ConfigError):
     """A run folder that cannot be continued or read."""
 
 
 class UnservedError(ConfigError):
-    """A run that this machine's workers do not know, lack something for, or may not serve; others may."""
+    """A run that this machine's workers do not know, lack something for, or may not serve; other workers may."""
 
 
 class TaskError(FarmError):
@@ -66,7 +70,7 @@ class TaskError(FarmError):
 
 
 class RunError(FarmError):
-    """A run that cannot go on; what was learnt so far is saved."""
+    """A run that cannot continue; what was learnt so far is saved."""
 
 
 class Interrupted(FarmError):  # noqa: N818  not an error
@@ -75,7 +79,7 @@ class Interrupted(FarmError):  # noqa: N818  not an error
 
 @contextmanager
 def writing(what: object, kind: type[FarmError] = RunError) -> Iterator[None]:
-    """Have an error of the file system say in one line what could not be written."""
+    """Turn an error of the file system into one line that says what could not be written."""
     try:
         yield
     except OSError as error:

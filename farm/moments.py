@@ -18,7 +18,7 @@ class Moments:
     """Of the observations of B rollouts, step by step (Welford 1962)."""
 
     def __init__(self, rollouts: int, size: int) -> None:
-        """None so far, of observations of that size."""
+        """None so far, of observations of this size."""
         self.table = np.zeros((rollouts, 1 + 2 * size))
         """(B, 1 + 2 d)"""
         self._size = size

@@ -77,7 +77,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
 """Kinds of plug-ins, and the built-in ones by name. Strings, because nothing in farm/ imports a learner or worker."""
 
 SOURCE_LIMIT: Final = 1_000_000
-"""Bytes that a file may have which travels to workers."""
+"""Largest size of a file that is sent to workers [bytes]."""
 
 _LINES: Final = 40  # of a traceback that others are told
 _WIDTH: Final = 250  # characters of each
@@ -87,16 +87,16 @@ _MODULES: Final = "rolloutfarm_file_"  # prefix of the modules that files become
 
 @dataclass(frozen=True)
 class Plugin:
-    """A class and where it is from."""
+    """A class, and where it comes from."""
 
     kind: str
     """One of BUILT_IN's."""
     name: str
-    """By which it is chosen; of a file its path, the class behind a colon."""
+    """The name by which it is chosen; for a file its path, then a colon and the class."""
     target: Any
     """The class; of a command a function."""
     variant: str = ""
-    """What stands behind the colon of a name that is many: `Swimmer-v5` of `gym:Swimmer-v5`."""
+    """The part after the colon in a name with variants: `Swimmer-v5` of `gym:Swimmer-v5`."""
     release: str = ""
     """Package and version that it comes from; empty for the farm's own and for files."""
     file: Path | None = None
@@ -106,7 +106,7 @@ class Plugin:
 
     @property
     def wire(self) -> str:
-        """Its name as others know it: a file without its folder."""
+        """Its name on other machines: for a file without its folder."""
         return self.name if self.file is None else f"{self.file.name}:{self.target.__name__}"
 
     @property
@@ -216,7 +216,7 @@ def _where(error: BaseException, path: Path) -> str:
 
 
 def author_frames(error: BaseException) -> list[str]:
-    """The part of a traceback that lies in classes from files, as text; empty where none does."""
+    """The part of a traceback that is in classes from files, as text; empty if there is none."""
     files = {module.__file__ for name, module in list(sys.modules.items()) if name.startswith(_MODULES)}
     return traceback.format_list([each for each in traceback.extract_tb(error.__traceback__) if each.filename in files])
 

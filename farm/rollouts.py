@@ -21,14 +21,14 @@ from farm.tasks import loop
 from farm.tasks.base import Task
 
 SIMULATION = "farm.tasks.loop"
-"""The module whose code, with all it imports, decides every rollout's numbers besides task and policy."""
+"""The module whose code, with all its imports, decides every rollout's numbers, together with task and policy."""
 
 
 class Runner:
     """Runs one run's jobs."""
 
     def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine) -> None:
-        """Simulate what all rollouts need; a ConfigError where the task cannot be begun."""
+        """Prepare what all rollouts need; a ConfigError if the task cannot start."""
         quiet()
         self.task, self.policy = task, policy
         self.spec, self.scene = policy.spec, Scene(task.model)
@@ -54,29 +54,29 @@ class Runner:
         Raises:
           UnservedError: the normaliser is of other observations.
         """
-        theta, seeds, first = jobs.theta(mu), jobs.seeds(), np.cumsum(jobs.rollouts) - jobs.rollouts
+        theta, seeds = jobs.theta(mu), jobs.seeds()
         policies, wanted = self._normalised(normaliser), normaliser.shape[-1]
         kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: normalised in its own way
-        kind_of = np.repeat(kinds, jobs.rollouts)
+        kind_of, there = np.repeat(kinds, jobs.rollouts), set(kinds.tolist())
         returns, flags = np.zeros(len(theta)), np.zeros((len(theta), 4), dtype=bool)
         steps = np.zeros(len(theta), dtype="<i8")
         moments = np.zeros((len(theta), 1 + 2 * wanted) if wanted else (0, 0))
         seen: dict[int, WireTrajectory] = {}
         values = np.empty((0, *self.spec.trace), dtype="<f4")
         for kind, policy in enumerate(policies):
-            rows, physics = np.flatnonzero(kind_of == kind), kind > 0
-            if not len(rows):
+            if kind not in there:
                 continue
+            rows, physics = np.flatnonzero(kind_of == kind), kind > 0
             rollouts = loop.run(
-                self.task, policy, self.sim, theta[rows], [seeds[row] for row in rows], int(physics),
+                self.task, policy, self.sim, theta[rows], [seeds[row] for row in rows.tolist()], int(physics),
                 moments=bool(wanted) and not physics,
             )  # fmt: skip
             returns[rows], flags[rows], steps[rows] = rollouts.returns, rollouts.flags, rollouts.steps
             if rollouts.moments.size:
                 moments[rows] = np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
-            place = {int(row): at for at, row in enumerate(rows)}
             for job in np.flatnonzero(jobs.seen & (kinds == kind)).tolist():
-                seen[job] = WireTrajectory.of(self.trajectory(rollouts, place[int(first[job])]))
+                first = int(jobs.rollouts[:job].sum())
+                seen[job] = WireTrajectory.of(self.trajectory(rollouts, int(np.searchsorted(rows, first))))
             if not physics:
                 exploring = ~np.repeat(jobs.seen, jobs.rollouts)[rows]
                 chosen = traced(traces if self.spec.traced else "none", rollouts.returns, exploring)
@@ -106,10 +106,10 @@ class Runner:
 
 
 def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
-    """The task and the policy of a run that somebody else specified; of files these may be served.
+    """The task and the policy of a run that a learner specified; these files may be served.
 
     Raises:
-      UnservedError: it names something that is not here, is not allowed, or has other code here.
+      UnservedError: it names something that is missing here, is not allowed, or has different code here.
     """
     try:
         task_class = _plugin("tasks", spec.task, spec.code.get("task"), spec.release, files)
@@ -119,7 +119,9 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
         task = build_task(task_class, spec.task_config, spec.files)
         sizes = task.spec()
         if sizes.release != spec.task_release:
-            raise UnservedError(f"the run has {spec.task} of {spec.task_release}, here is {sizes.release}")
+            raise UnservedError(
+                f"the run uses {spec.task} of {spec.task_release}, but {sizes.release} is installed here"
+            )
         config = settings.from_dict(policy_class.target.Config, spec.policy_config, spec.policy)
         return task, policy_class.target(config, sizes, spec.constants)
     except UnservedError:
@@ -129,7 +131,7 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
 
 
 def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping[str, str] | None) -> Task:
-    """A task from its class, the settings in a table, and the texts that the run carries."""
+    """A task from its class, the settings in a table, and the run's texts."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
     try:
         return cast("Task", plugin.target(config, plugin.variant, files))
@@ -148,18 +150,19 @@ def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple
     from_file = plugins.named_file(name) != ""
     found = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
     if not (isinstance(found.target, type) and issubclass(found.target, base)):
-        raise UnservedError(f"{name} is no {base.__name__}")
+        raise UnservedError(f"{name} is not a {base.__name__}")
     if from_file:
         return found
     if found.release != release:
-        raise UnservedError(f"the run has {name} of {release or 'the farm'}, here is {found.release or 'the farm'}'s")
+        own, there = found.release or "rolloutfarm", release or "rolloutfarm"
+        raise UnservedError(f"the run uses {name} of {there}, but here {name} belongs to {own}")
     if found.digest() != digest:
         raise UnservedError(f"its code of {name!r} differs from the learner's: {_SAME}")
     return found
 
 
 def backend(name: str) -> Backend:
-    """The backend of that name; a ConfigError where there is no such, or it is none."""
+    """The backend with this name; a ConfigError if there is none, or if it is no backend."""
     target = plugins.find("backends", name).target
     if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
         raise ConfigError(f"{name} is no backend: it needs capacity and engine(model)")

@@ -1,4 +1,4 @@
-"""Settings as dataclasses: checked, read from flags and from JSON. The only validator, and the only door to tyro."""
+"""Settings as dataclasses: checked, read from flags and from JSON. The only module that imports tyro."""
 
 import contextlib
 import copy
@@ -17,7 +17,7 @@ from farm.errors import ConfigError
 
 C = TypeVar("C")
 
-_NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+None\)")
+_NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+(None|'')\)")
 _OR_NONE: Final = re.compile(r"\{None\}\|(\S+)|\{None,(\S+)")
 _FRAME: Final = "│╭╮╰╯─ \n"
 
@@ -179,7 +179,7 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
 
 def _without_none(text: str) -> str:
-    """A help text of tyro's without what it says of settings that need not be given; its columns stay."""
+    """A help text of tyro without its remarks on optional settings; its columns stay aligned."""
     emptied = re.sub(_NO_DEFAULT, lambda found: re.sub(r"[^\s│]", " ", found[0]), text).splitlines(keepends=True)
     kept = [
         line for old, line in zip(text.splitlines(), emptied, strict=True) if line.strip("│ \n") or old == line[:-1]
@@ -209,7 +209,7 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
 
 
 def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
-    """See that every flag is there once: a plug-in's settings may be called as a command's own. Else a ConfigError."""
+    """Check that every flag exists only once: a plug-in's setting may have a command's name. Else a ConfigError."""
     owners: dict[str, str] = {}
     waiting = [default] if dataclasses.is_dataclass(default) else []
     while waiting:

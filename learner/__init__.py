@@ -1,1 +1,1 @@
-"""Who learns and shows: asks an algorithm, keeps the books, records."""
+"""The learner: runs a search algorithm, gives out jobs, saves, records and shows."""

@@ -1,6 +1,7 @@
 """Everything a resume needs, in one file that is replaced atomically."""
 
 import hashlib
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from farm.arrays import FloatArray
 from farm.errors import CheckpointError, MessageError
 from farm.net import codec
 from farm.net.codec import array
+
+log = logging.getLogger(__name__)
 
 _MAGIC: Final = b"rolloutfarm checkpoint 2\n"
 _SCHEMA: Final = 2  # of what follows, whichever version messages have
@@ -38,11 +41,11 @@ class Checkpoint:
     config: dict[str, Any]
     """As in config.json."""
     state: dict[str, Any]
-    """The algorithm's state: what its `to_dict` told."""
+    """The algorithm's state, from its `to_dict`."""
     rollouts: int
     """Exploring rollouts so far."""
     reissued: int
-    """Jobs given out again so far."""
+    """Jobs reissued so far."""
     seconds: float
     """Wall time so far [s]."""
     solved: int
@@ -69,15 +72,38 @@ class Checkpoint:
     """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
 
 
-def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Replace the file by a new one, or leave the old one as it is."""
+def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
+    """Replace the file by a new one, or leave the old one as it is.
+
+    A killed process loses nothing. When the power fails, the file may be torn; `durable` keeps a copy that is whole
+    then, `FILE.safe`; it waits for the disk, which takes longer than a short generation.
+    """
     body = codec.encode(checkpoint, _SCHEMA)
+    content = _MAGIC + hashlib.sha256(body).digest() + body
+    if durable:
+        _replace(_safe(path), content, sync=True)
+    _replace(path, content)
+
+
+def settle(path: Path) -> None:
+    """Write the file itself to the disk, and delete the copy."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    _safe(path).unlink(missing_ok=True)
+
+
+def _safe(path: Path) -> Path:
+    return path.with_name(path.name + ".safe")
+
+
+def _replace(path: Path, content: bytes, *, sync: bool = False) -> None:
     aside = path.with_name(path.name + ".new")
     try:
         with aside.open("wb") as file:
-            file.write(_MAGIC + hashlib.sha256(body).digest() + body)
-            file.flush()
-            os.fsync(file.fileno())
+            file.write(content)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
         aside.replace(path)
     except OSError:
         aside.unlink(missing_ok=True)
@@ -85,11 +111,23 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(path: Path) -> Checkpoint:
-    """The checkpoint in a file.
+    """The checkpoint in a file, or in its copy where the file is torn.
 
     Raises:
       CheckpointError: there is none, or it is truncated or of another version.
     """
+    try:
+        return _read(path)
+    except CheckpointError as error:
+        try:
+            found = _read(_safe(path))
+        except CheckpointError:
+            raise error from None
+        log.warning("%s is missing or damaged; going on from its copy %s", path, _safe(path).name)
+        return found
+
+
+def _read(path: Path) -> Checkpoint:
     try:
         content = path.read_bytes()
     except OSError as error:

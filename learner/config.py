@@ -24,7 +24,7 @@ _PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Settings):
-    """A run. Same configuration, same numbers to the last bit, however many workers there are.
+    """A run. The same configuration gives the same numbers to the last bit for any number of workers.
 
     What is left out is the first preset of the task: `RunConfig(task="gym:Swimmer-v5")` can be learnt.
     """
@@ -46,22 +46,24 @@ class RunConfig(Settings):
     generations: int = setting(None, least=0, most=10_000_000)  # filled in below
     """Updates of the search distribution."""
     stop_when_solved: int | None = setting(None, least=1)
-    """End after so many generations in a row in which the mean policy succeeded."""
+    """End when the mean policy has succeeded in this number of successive generations, at least those of --average."""
     stop_after_steps: int | None = setting(None, least=1)
-    """End after the generation in which the exploring rollouts have made so many control steps in all."""
+    """End after the generation in which the exploring rollouts reach this total number of control steps."""
+    average: int = setting(1, least=1)
+    """The final policy is the average of the means after this number of last generations."""
     interactions: int | None = setting(None, least=1)
-    """Control steps that a generation should have: the next one gets as many pairs as would have made so many, from
-    --pairs to --most-pairs (Toklu 2020)."""
+    """Control steps that a generation should have. Each generation gets as many pairs as would have made this number
+    in the previous one, from --pairs to --most-pairs (Toklu 2020)."""
     most_pairs: int | None = setting(None, least=1)
-    """With interactions: the most pairs of a generation; None: eight times --pairs."""
+    """With --interactions: largest number of pairs in a generation; by default eight times --pairs."""
     init_from: str | None = None
     """Start from the mean, sigma and constants of another run: its folder."""
     init_sigma: Literal["run", "fresh"] = "run"
-    """With init-from: take that run's sigma as well, or start with --initial-sigma."""
+    """With --init-from: take that run's sigma as well, or start with --initial-sigma."""
     start: Literal["printed", "fitted"] = "printed"
-    """Begin with --bandwidth and --initial-sigma as they are, or as they suit the observation (kernel, projected)."""
+    """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies kernel, projected)."""
     traces: Literal["all", "extremes", "none"] = "extremes"
-    """Traces that are recorded: of all rollouts, of the best and worst of a generation, or none."""
+    """Which traces are recorded: those of all rollouts, of the best and worst of each generation, or none."""
 
     def __post_init__(self) -> None:
         """Fill in what is left out, and check every value."""
@@ -82,7 +84,7 @@ class RunConfig(Settings):
     def _check_interactions(self) -> None:
         least = getattr(self.algorithm_config, "pairs", None)
         if self.interactions is not None and least is None:
-            raise ConfigError(f"--interactions needs an algorithm with --pairs, which {self.algorithm} has not")
+            raise ConfigError(f"--interactions needs an algorithm with --pairs, which {self.algorithm} does not have")
         if self.most_pairs is not None and self.interactions is None:
             raise ConfigError("--most-pairs is for --interactions: give both")
         if self.most_pairs is not None and least is not None and self.most_pairs < least:
@@ -136,7 +138,7 @@ _GENERAL: Final[Mapping[str, Any]] = {
     "initial_sigma": 1.0, "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.5,
     "learning_rate_sigma": 0.1, "sigma_rule": "capped", "max_speed": 1.0,
 }  # fmt: skip
-"""The settings that runs begin with, where the task has none of its own."""
+"""The settings that runs start from, if the task has none of its own."""
 
 
 def settings_class(kind: str, name: str) -> type[Any]:
@@ -148,7 +150,7 @@ def settings_class(kind: str, name: str) -> type[Any]:
     target = plugins.find(kind, name).target
     base = {"tasks": Task, "policies": Policy}.get(kind)
     if base is not None and not (isinstance(target, type) and issubclass(target, base)):
-        raise ConfigError(f"{name} is no {base.__name__}: derive its class from farm.{base.__name__}")
+        raise ConfigError(f"{name} is not a {base.__name__}: derive its class from farm.{base.__name__}")
     config = getattr(target, "Config", target)
     if base is None and not all(hasattr(config, each) for each in ("signs", "init", "restore", "ask", "tell")):
         raise ConfigError(f"{name} is no algorithm: it needs signs, init, restore, ask and tell")
@@ -171,7 +173,7 @@ def _part(kind: str, name: str, given: Mapping[str, Any]) -> Any:  # noqa: ANN40
 
 
 def presets(task: str) -> dict[str, Mapping[str, Any]]:
-    """Settings that runs of a task begin with, by preset and flag; the first one unless told otherwise."""
+    """Settings that runs of a task start from, by preset and flag; the first preset is the default."""
     settings_class("tasks", task)
     own = plugins.find("tasks", task).target.presets
     if not isinstance(own, Mapping) or not own or not all(isinstance(each, Mapping) for each in own.values()):
@@ -222,7 +224,7 @@ _APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved", "s
 
 
 def preset_of(config: RunConfig) -> str:
-    """The preset that a configuration is but for seed and length, "own" where it is none."""
+    """The preset that a configuration equals except for seed and length, "own" if there is none."""
     for name in presets(config.task):
         if {change[0] for change in changes(configure(config.task, name), config)} <= _APART:
             return name

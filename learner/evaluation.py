@@ -21,7 +21,7 @@ class Nominal:
     value: float
     """Its return."""
     success: bool | None
-    """None where the task knows no success."""
+    """None if the task does not define success."""
     trajectory: Trajectory | None
 
 
@@ -31,7 +31,7 @@ class Evaluation:
 
     mean: Nominal
     robust_success_rate: float | None
-    """Part of the perturbed rollouts that succeeded; None where the task knows no success."""
+    """Share of the perturbed rollouts that succeeded; None if the task does not define success."""
     robust_return: float
     """Mean return of the perturbed rollouts."""
     replay: Trajectory | None

@@ -1,4 +1,4 @@
-"""The figure of a sweep; the package's only door to matplotlib, which is an extra."""
+"""The figure of a sweep; the package's only module that imports matplotlib, which is an extra."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from learner.outcomes import Curve
 INSTALL: Final = "figures need matplotlib: pip install matplotlib"
 
 _COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9")
-"""Okabe and Ito's, told apart by the colour-blind; beyond them dashes change."""
+"""Colours of Okabe and Ito, for the colour-blind; after the last one, dashes change."""
 
 _DASHES: Final = ("-", "--", ":", "-.")
 _STYLE: Final = {
@@ -22,7 +22,7 @@ _STYLE: Final = {
 
 
 def available() -> bool:
-    """Whether matplotlib is there."""
+    """Whether matplotlib is installed."""
     return importlib.util.find_spec("matplotlib") is not None
 
 

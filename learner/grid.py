@@ -63,7 +63,7 @@ class Sweep:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The settings' parts of run names: what they vary, or their number where that makes no name of its own."""
+        """The settings' parts of run names: the varied values, or a number if these make no valid name."""
         plain = [_plain(setting.values) for setting in self.settings]
         count = Counter(plain)
         return tuple(
@@ -84,7 +84,7 @@ class Sweep:
         }
 
     def prepare(self) -> None:
-        """Make the folder, or go on with it; seeds may be added.
+        """Make the folder, or continue with it; seeds may be added.
 
         Raises:
           ConfigError: it is another sweep's, or something else's.
@@ -101,7 +101,7 @@ class Sweep:
             replace_text(file, json.dumps(told, indent=2) + "\n")
 
     def _check_same(self, file: Path) -> None:
-        """See that what is there is this sweep, perhaps with fewer seeds."""
+        """Check that an existing sweep is this one, perhaps with fewer seeds."""
         try:
             told = json.loads(file.read_text("utf-8"))
         except ValueError as error:
@@ -134,7 +134,7 @@ def _words(vary: object) -> str:
 
 
 def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
-    """NAME=V1,V2,... each, as values by name with underscores; a ConfigError where one is no such, or comes twice."""
+    """The values of each NAME=V1,V2,..., by name with underscores; a ConfigError if a word is malformed or repeated."""
     out: dict[str, list[str]] = {}
     for word in given:
         name, equals, listed = word.partition("=")
@@ -152,7 +152,7 @@ def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """A-B or A,B,C, or both, as seeds in that order; a ConfigError where one is no such, too large, or comes twice."""
+    """A-B or A,B,C, or both, as seeds in that order; a ConfigError if one is malformed, too large or repeated."""
     out: list[int] = []
     for part in text.split(","):
         found = _RANGE.fullmatch(part.strip())
@@ -168,7 +168,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str, str]]:
-    """Every combination of values, the last name's changing fastest; a ConfigError where that is too many runs."""
+    """Every combination of values; the last name changes fastest. A ConfigError if there are too many runs."""
     found = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
     if len(found) * seeds > MOST:
         raise ConfigError(f"{len(found)} settings x {seeds} seeds are {len(found) * seeds} runs; expected up to {MOST}")
@@ -176,7 +176,7 @@ def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str
 
 
 def check(sweep: Sweep) -> None:
-    """See that no two settings are the same runs, and that names of runs can be used; else a ConfigError."""
+    """Check that no two settings give the same runs, and that run names are valid; else a ConfigError."""
     seen: dict[str, Setting] = {}
     for setting in sweep.settings:
         other = seen.setdefault(json.dumps(configs.to_dict(setting.config)), setting)

@@ -1,5 +1,6 @@
 """The learning loop: ask, simulate, tell, save, and say how it went."""
 
+import errno
 import hashlib
 import itertools
 import logging
@@ -35,6 +36,12 @@ REPLAY_EVERY: Final = 10
 """Generations between two recordings of the best rollout at physics rate: near its end, most bring a new best."""
 
 
+DURABLE_EVERY: Final = 1.0
+"""Time between two checkpoints that survive a power failure [s]; the others survive a killed learner only."""
+
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)  # the disk, or the user's share of it
+
+
 class Learner:
     """One run, from its start or its checkpoint to its end."""
 
@@ -52,18 +59,20 @@ class Learner:
         except ValueError as error:
             raise CheckpointError(f"{folder.checkpoint}: {error}") from None
         self._before = at.reissued
+        self._written = configs.to_dict(self.config)
+        self._durable = time.monotonic()
         self._signs = self.config.algorithm_config.signs()
         self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.traced else "none"
         folder.save(self._at)
 
     @property
     def run(self) -> str:
-        """The name that the run began with; its folder may have another by now."""
+        """The name that the run began with; its folder may have been renamed since."""
         return self._at.run
 
     @property
     def spec(self) -> Spec:
-        """What workers simulate, under the folder's name: copies of a run may go on side by side."""
+        """What workers simulate, under the folder's name, so that copies of a run can continue side by side."""
         return self.problem.specification(self.folder.name)
 
     @property
@@ -80,7 +89,8 @@ class Learner:
     def over(self) -> bool:
         """Whether no generation is left to do."""
         config, at = self.config, self._at
-        solved = config.stop_when_solved is not None and at.solved >= config.stop_when_solved
+        # Of an average, all means that go into it must have succeeded.
+        solved = config.stop_when_solved is not None and at.solved >= max(config.stop_when_solved, config.average)
         spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
         return self.state.generation >= config.generations or solved or spent
 
@@ -111,9 +121,10 @@ class Learner:
                 self._save(progress)
             except OSError as error:
                 self.state, self._at = before, last
+                advice = "make room and --resume it" if error.errno in _FULL else "--resume it"
                 raise RunError(
-                    f"cannot write to {self.folder.path}: {error.strerror}; the run stands as of generation "
-                    f"{before.generation}: make room and --resume it"
+                    f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to generation "
+                    f"{before.generation}: {advice}"
                 ) from None
             if progress.failed == returns.size and not hopeless:
                 log.warning("the physics of all %d rollouts blew up: farm check shows how they start", returns.size)
@@ -129,9 +140,11 @@ class Learner:
             )
 
     def evaluate(self, farm: Dispatcher) -> Evaluation:
-        """The mean policy at the end of the run."""
+        """The mean policy at the end of the run, averaged over its last generations if the run says so."""
         jobs = Jobs.joined([evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()])
-        farm.begin(self.state.generation, self.state.mu, jobs, normaliser=self._normalisers())
+        at = self.state.generation
+        mu = self.folder.average(at, self.state.mu, self.config.average)
+        farm.begin(at, mu, jobs, normaliser=self._normalisers())
         results, last = farm.collect(), EVALUATION_ROLLOUTS
         return Evaluation(
             mean=Nominal(
@@ -193,7 +206,7 @@ class Learner:
         return seeds.training(self.config.seed, generation, index) if self.config.task_config.perturb else None
 
     def _replay_job(self) -> list[Jobs]:
-        """The best rollout so far once more at physics rate, if that has not been done."""
+        """The best rollout so far at physics rate, if it has not been simulated yet."""
         best = self._at.best
         return [] if best is None or self._at.replayed else [Jobs.single(best.theta, "physics", best.seed)]
 
@@ -218,7 +231,7 @@ class Learner:
             generation, replayed = self.state.generation, False
         self._at = replace(
             self._at,
-            config=configs.to_dict(self.config),
+            config=self._written,
             state=self.state.to_dict(),
             rollouts=self._at.rollouts + returns.size,
             steps=self._at.steps + steps,
@@ -267,7 +280,10 @@ class Learner:
     def _save(self, progress: GenerationStats) -> None:
         mu, sigma, seen = self.state.mu, self.state.sigma, normaliser(self._at.moments)
         self.folder.append(progress, mu, sigma, self.config.generations, seen)
-        self.folder.save(self._at)
+        now = time.monotonic()
+        durable = now - self._durable > DURABLE_EVERY
+        self._durable = now if durable else self._durable
+        self.folder.save(self._at, durable=durable)
 
 
 def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[FloatArray, Jobs]:

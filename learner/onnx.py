@@ -24,7 +24,7 @@ IR: Final = 8
 
 
 class Graph:
-    """Operators one behind the other; each value is known by its name, and N is the size of a batch."""
+    """Operators one after another; each value is known by its name, and N is the size of a batch."""
 
     def __init__(self) -> None:
         """Begin empty.
@@ -41,7 +41,7 @@ class Graph:
         self._constants: list[Any] = []
 
     def put(self, operator: str, *values: str | AnyArray | float, to: str = "", **attributes: Any) -> str:  # noqa: ANN401
-        """Apply an operator to values by name, or to constants; says the name of what comes out."""
+        """Apply an operator to values by name, or to constants; returns the name of the result."""
         names = [value if isinstance(value, str) else self._constant(value) for value in values]
         out = to or f"v{len(self._nodes)}"
         self._nodes.append(self._onnx.helper.make_node(operator, names, [out], **attributes))

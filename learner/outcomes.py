@@ -79,7 +79,7 @@ def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> 
 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:
-    """Mean and standard deviation of a column over its runs, where it is known; None where it never is."""
+    """Mean and standard deviation of a column over its runs, where it is known; None if it never is."""
     known = [float(row[column]) for row in table if row[column] is not None]
     return (float(np.mean(known)), float(np.std(known))) if known else None
 
@@ -90,9 +90,9 @@ class Curve:
 
     label: str
     rollouts: FloatArray
-    """Exploring rollouts that the policy had behind it, (G,)"""
+    """Exploring rollouts before this policy, (G,)"""
     returns: FloatArray
-    """(runs, G), nan behind a run's end and where the physics blew up"""
+    """(runs, G), nan after a run's end and where the physics blew up"""
 
 
 def curves(sweep: Sweep) -> list[Curve]:
@@ -106,7 +106,7 @@ def curves(sweep: Sweep) -> list[Curve]:
 
 
 def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Rollouts behind each mean policy of a run, and its return; the first line is of the policy before learning."""
+    """Rollouts before each mean policy of a run, and its return; the first line is the policy before learning."""
     folder = RunFolder(path)
     progress, summary = folder.progress(), folder.read_summary() or {}
     rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
@@ -118,7 +118,7 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
-    """Runs of one setting, whose generations have the same rollouts, side by side; those that ended earlier as nan."""
+    """Runs of one setting, whose generations have equal numbers of rollouts; nan after the end of shorter runs."""
     longest = max((rollouts for rollouts, _ in runs), key=len)
     returns = np.full((len(runs), len(longest)), np.nan)
     for row, (_, values) in zip(returns, runs, strict=True):

@@ -25,7 +25,7 @@ from farm.net.tls import find
 from farm.net.work import Jobs
 from farm.sim.trajectory import Trajectory
 from learner.config import configure
-from learner.run import Placement, connected, dispatch
+from learner.run import Placement, check_workers, connected, dispatch
 from learner.scheduler.dispatcher import Stopped
 from learner.scheduler.membership import Admission
 from learner.scheduler.scheduler import SchedulerConfig
@@ -33,14 +33,13 @@ from learner.setup import problem
 
 log = logging.getLogger(__name__)
 
-_WORKERS: Final = 1024  # as of farm run
 _GATHER: Final = 256 << 20  # [bytes] of parameters that are given out at a time
 
 
 class Farm:
-    """Workers that evaluate parameters of a task's policy: each exactly once, in order, whatever dies.
+    """Workers that evaluate parameters of a task's policy: each exactly once, in order, even if workers die.
 
-    Usable from several threads, which take turns. Ctrl-C ends a call; the pool stays usable.
+    Several threads can use it, and take turns. Ctrl-C ends a call; the pool stays usable.
     """
 
     def __init__(
@@ -54,28 +53,30 @@ class Farm:
         audit: float = 0.02,
         **settings: Any,  # noqa: ANN401  any setting of task and policy
     ) -> None:
-        """Start local workers, or join a farm whose workers are elsewhere.
+        """Start local workers, or use those of a farm.
 
         Args:
           task: name of the task, or FILE.py:CLASS.
           workers: processes on this machine; none are started with `connect`.
-          connect: where a router listens that workers connect to as well.
+          connect: address of a router that workers are connected to.
           farm: name of the farm.
           tls: folder with a learner's certificates.
-          audit: part of the evaluations that a second host repeats, where there is one.
-          settings: of task and policy as `farm.configure` takes them, such as policy="linear", preset, perturb.
+          audit: share of the evaluations that a second host repeats, if there is one.
+          settings: of task and policy as in `farm.configure`, such as policy="linear", preset, perturb.
 
         Raises:
           ConfigError: a setting makes no sense.
-          FarmError: nobody listens at `connect`.
+          FarmError: there is no router at `connect`.
         """
-        endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-        if not endpoints and (type(workers) is not int or not 1 <= workers <= _WORKERS):
-            raise ConfigError(f"workers is {workers!r}; expected 1 to {_WORKERS}, or connect to a farm that has some")
+        endpoints = (connect,) if isinstance(connect, str) else connect
+        if not isinstance(endpoints, Sequence) or not all(isinstance(each, str) for each in endpoints):
+            raise ConfigError(f"connect is {connect!r}; expected tcp/HOST:PORT or tls/HOST:PORT, or several of them")
+        if not endpoints:
+            check_workers(workers)
         keys.checked("farm", farm)
         self._problem = problem(configure(task, **settings))
         self._place = Placement(
-            workers=0 if endpoints else workers, listen=free_endpoint(), connect=endpoints, farm=farm,
+            workers=0 if endpoints else workers, listen=free_endpoint(), connect=tuple(endpoints), farm=farm,
             tls=None if tls is None else find(Path(tls), "learner"), scheduler=SchedulerConfig(audit=audit),
         )  # fmt: skip
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
@@ -103,11 +104,11 @@ class Farm:
 
         Args:
           thetas: parameters of B rollouts.
-          seeds: of each rollout's start and conditions, whole numbers below 2^32; None: the nominal ones.
+          seeds: one for each rollout's start and conditions, whole numbers below 2^32; None: nominal conditions.
 
         Raises:
-          ConfigError: thetas or seeds are not what they should be; nothing was sent.
-          RunError: an evaluation failed wherever it was tried, or the pool is closed.
+          ConfigError: thetas or seeds have a wrong shape or value; nothing was sent.
+          RunError: an evaluation failed on every worker that tried it, or the pool is closed.
         """
         theta = self._parameters(thetas)
         drawn = self._seeds(seeds, len(theta))
@@ -118,9 +119,9 @@ class Farm:
             return self._farm.collect().returns.copy()
 
     def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
-        """As `map`, but pairs (index, return) as they come; a later one of an index takes an earlier one's place.
+        """Like `map`, but yields (index, return) as they arrive; a later return of an index replaces the earlier one.
 
-        The call is over when its last pair was taken, or by `close` of the iterator; until then others wait.
+        The call ends when its last pair was taken, or when the iterator is closed. Until then other calls wait.
         """
         theta = self._parameters(thetas)
         drawn = self._seeds(seeds, len(theta))
@@ -148,7 +149,7 @@ class Farm:
         return found
 
     def close(self) -> None:
-        """End the workers that were started; whoever waits gets a RunError. Closing twice does no harm."""
+        """End the workers that were started; a waiting call gets a RunError. Closing twice does no harm."""
         self._closed.set()
         mine = self._holder == threading.get_ident()  # an imap that this thread never takes to its end
         if not mine:
@@ -169,13 +170,15 @@ class Farm:
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
-        """One call at a time.
+        """Allow one call at a time.
 
         Raises:
           RunError: this thread's own imap is not over, for which it would wait for ever; or the pool is closed.
         """
         if self._holder == threading.get_ident():
-            raise RunError("an imap of this thread is not over: take its last pair, or close() it, before another call")
+            raise RunError(
+                "an imap of this thread has not ended: take its last pair, or close() it, before another call"
+            )
         with self._taken:
             self._holder = threading.get_ident()
             try:

@@ -85,8 +85,15 @@ def load(path: str | Path, generation: int | None = None, **changed: Any) -> Loa
     return loaded(folder, generation, task)
 
 
-def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -> LoadedPolicy:  # noqa: ANN401
-    """The same, with settings of the task as a whole; None for the run's own.
+def loaded(
+    folder: RunFolder,
+    generation: int | None = None,
+    task: Any = None,  # noqa: ANN401
+    average: int | None = None,
+) -> LoadedPolicy:
+    """The same, with settings of the task as a whole, and the average of so many last means.
+
+    Without `average`: the run's own for the policy that it ended with, 1 for an earlier generation.
 
     Raises:
       ConfigError: it is not stored, or cannot be simulated like that.
@@ -97,6 +104,8 @@ def loaded(folder: RunFolder, generation: int | None = None, task: Any = None) -
     chosen = last if generation is None else generation
     seen = normaliser(at.moments)
     mu, seen = (at.state["mu"], seen) if chosen == last else _earlier(folder, config, chosen, seen)
+    own = config.average if generation is None else 1
+    mu = folder.average(chosen, mu, own if average is None else average)
     return LoadedPolicy(seeing(restored(folder, at, task), seen), chosen, mu)
 
 
@@ -113,7 +122,7 @@ def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  #
     found = problem(replace(config, stop_when_solved=None), at.constants, files)
     if changed := [name for name in ("task", "policy") if at.code.get(name) != found.code[name]]:
         log.warning(
-            "%s: the code of its %s has changed since the run began; these are numbers of today's",
+            "%s: the code of its %s has changed since the run began; these are the numbers of the present code",
             folder.path, " and ".join(changed),
         )  # fmt: skip
     return found

@@ -78,7 +78,7 @@ class Rewound:
         return (policy or self.policy).rollouts(self.theta[rows], [self.seeds[i] for i in rows])
 
     def rollout(self, index: int) -> Replay:
-        """One of them at physics rate; a ConfigError where there is none."""
+        """One of them at physics rate; a ConfigError if there is none."""
         return self.again([index])[0]
 
 
@@ -92,7 +92,7 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
 
 
 def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
-    """The same of a folder that is open.
+    """The same, for an open folder.
 
     The state before the generation is made of mu and sigma in `parameters` where `ask` looks at nothing else; for
     other algorithms, and where that generation is not stored, the run is learnt again up to there.
@@ -104,7 +104,7 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
     last = int(at.state["generation"])
     chosen = last if generation is None else generation
     if not 1 <= chosen <= last:
-        behind = f"it has generations 1 to {last} behind it" if last else "it has no generation behind it"
+        behind = f"it has done generations 1 to {last}" if last else "it has done no generation"
         raise ConfigError(f"generation {chosen} of the run in {folder.path} has no rollouts: {behind}")
     state, seen = _before(folder, at, chosen)
     policy = LoadedPolicy(seeing(restored(folder, at), seen), chosen - 1, state.mu)
@@ -153,14 +153,14 @@ def _pairs(folder: RunFolder, generation: int) -> int:
 
 
 def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:  # noqa: ANN401
-    """Whether `ask` draws the same without what the state has besides mu and sigma, such as a covariance."""
+    """Whether `ask` draws the same from mu and sigma alone, without other state such as a covariance."""
     bare = replace(fresh, mu=last.mu, sigma=last.sigma, generation=last.generation)
     with_all, without = (algorithm.ask(state, streams.exploration(0, 0)) for state in (last, bare))
     return with_all.tobytes() == without.tobytes()
 
 
 def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[SearchState, FloatArray]:
-    """The run once more in this process, up to so many updates: slow, but of any algorithm, and to the same bits."""
+    """Learn the run again in this process up to this update: slow, but for any algorithm, and to the same bits."""
     config = folder.read_config()
     algorithm: Any = config.algorithm_config
     first = start(config, folder.name)[1]
@@ -168,7 +168,9 @@ def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[Search
     pairs = 0
     if until:
         log.warning(
-            "what %s knew before generation %d is not stored: learning up to there", config.algorithm, until + 1
+            "the state of %s before generation %d is not stored: learning the run again up to there",
+            config.algorithm,
+            until + 1,
         )
     problem = restored(folder, at)
     runner = problem.runner()
@@ -183,14 +185,14 @@ def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[Search
 
 
 def _compare(folder: RunFolder, found: Rewound) -> None:
-    """Say so where the returns are not the run's: its line of progress.jsonl knows their mean, extremes and spread."""
+    """Warn if the returns are not the run's: progress.jsonl has their mean, extremes and spread."""
     values = found.returns
     for line in folder.progress():
         if line.generation == found.generation:
             stored = (line.return_mean, line.return_min, line.return_max, line.return_std)
             if stored != (float(values.mean()), float(values.min()), float(values.max()), float(values.std())):
                 log.warning(
-                    "%s: these are not the rollouts of generation %d to the last bit, whose mean return was %.6g and "
-                    "is %.6g here: its code or the run it began from has changed, or this processor rounds differently",
+                    "%s: these are not the rollouts of generation %d to the last bit: their mean return was %.6g and "
+                    "is %.6g here; code or --init-from run have changed, or this processor rounds differently",
                     folder.path, found.generation, line.return_mean, values.mean(),
                 )  # fmt: skip

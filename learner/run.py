@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm.commands.logs import Formatter
-from farm.errors import ConfigError, RunError
+from farm.errors import ConfigError, NameTakenError, RunError
 from farm.net import keys, session
 from farm.net.session import LISTEN, Session, free_endpoint
 from farm.net.tls import Bundle
@@ -49,18 +49,22 @@ _LOOK: Final = 0.3  # [s] between two looks at who else claims a run's name
 _TEND: Final = 0.5  # [s] between two looks at the worker processes
 
 
+MOST_WORKERS: Final = 1024
+"""Local worker processes of a run."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Placement:
     """Where a run is on the network and on this machine; no number depends on it."""
 
     workers: int = 0
-    """Local worker processes."""
+    """Number of local worker processes."""
     backend: str = "cpu"
-    """What they simulate with."""
+    """Their simulation backend."""
     listen: str = LISTEN
-    """Where workers dial."""
+    """Where the learner listens for workers."""
     connect: tuple[str, ...] = ()
-    """Routers to dial instead of listening."""
+    """Routers to connect to instead of listening."""
     farm: str = "farm"
     """Name of the farm."""
     tls: Bundle | None = None
@@ -76,7 +80,7 @@ class Placement:
     log: tuple[str, ...] = ()
     """Loggers, by name."""
     scheduler: SchedulerConfig = field(default_factory=SchedulerConfig)
-    """How jobs are cut into chunks, and when they are given out again."""
+    """How jobs are cut into chunks, and when they are reissued."""
 
 
 @dataclass
@@ -138,8 +142,9 @@ class Run:
         self.summary = self.learner.summary(state, workers, evaluation)
         log.info("%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s", self.summary)
         try:
-            self.loggers.end(self.summary)
             self.learner.folder.write_summary(self.summary)
+            self.learner.folder.settle()
+            self.loggers.end(self.summary)
         except OSError as error:
             if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
                 raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
@@ -157,9 +162,16 @@ def learn(
       ConfigError: the folder exists, or a setting makes no sense.
       RunError: the run failed.
     """
+    check_workers(workers)
     place = Placement(workers=workers, listen=free_endpoint(), record=record, log=tuple(log))
     with open_run(config, Path(folder), place) as run:
         yield from run.learn()
+
+
+def check_workers(workers: object) -> None:
+    """See that a number of local workers is one (a ConfigError otherwise)."""
+    if type(workers) is not int or not 1 <= workers <= MOST_WORKERS:
+        raise ConfigError(f"workers is {workers!r}; expected 1 to {MOST_WORKERS} processes on this machine")
 
 
 @contextmanager
@@ -171,7 +183,7 @@ def open_run(
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Run]:
-    """Everything a run needs, opened in an order that leaves nothing behind when a part fails."""
+    """Open everything that a run needs, in an order that leaves nothing behind if a part fails."""
     folder = RunFolder(path)
     keys.checked("run", folder.name)
     if place.record or place.serve:
@@ -248,7 +260,7 @@ def _same(source: bytes) -> bytes:
 
 
 class _Tending:
-    """Asked now and then whether to stop; looks after the local workers while at it."""
+    """Asked from time to time whether to stop; also looks after the local workers."""
 
     def __init__(self, stopped: Callable[[], bool]) -> None:
         self._stopped, self._next = stopped, 0.0
@@ -263,13 +275,13 @@ class _Tending:
 
 
 def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[], bool]) -> None:
-    """See that no other learner has a run of this name behind the same router: they would void each other's work.
+    """Check that no other learner has this run's name at the same router: they would void each other's work.
 
-    Of several that start together the first one stays: each claims the name, then looks who else does.
+    If several start together, the first one stays: each claims the name, then looks for other claims.
     """
     if not place.connect:
         return
-    taken = ConfigError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
+    taken = NameTakenError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
     until = time.monotonic() + _REMEMBERED
     while link.present(keys.learner_token(place.farm, run), 1.0):
         if time.monotonic() > until or stopped():
@@ -307,7 +319,7 @@ def how_to_join(place: Placement, problem: Problem) -> str:
 
 
 class _LogFile(logging.FileHandler):
-    """Leaves out what cannot be written: a full disk is told of elsewhere."""
+    """Leaves out lines that cannot be written; a full disk is reported elsewhere."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's name
         """Say nothing."""
@@ -342,6 +354,6 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
 
 
 def check_rerun() -> None:
-    """See that rerun-sdk is there, an extra that workers do without: a ConfigError says what to install."""
+    """Check that rerun-sdk, an extra that workers do not need, is installed; else a ConfigError."""
     if importlib.util.find_spec("rerun") is None:
-        raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or go without by --no-record")
+        raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or record nothing: --no-record")

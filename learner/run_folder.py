@@ -2,14 +2,14 @@
 
     config.json      the resolved configuration
     checkpoint       everything a resume needs, replaced after every generation
-    progress.jsonl   one line a generation
+    progress.jsonl   one line per generation
     parameters       mu and sigma of every generation
-    summary.json     what came out
+    summary.json     the results
     run.rrd          the recording;  replay.rrd  the best and the final rollout at physics rate
-    log.txt          what was said
+    log.txt          the messages
 
-docs/files.md describes them. The checkpoint is written last: what the other files hold beyond it
-is cut off when the run is resumed; damaged lines of progress.jsonl are left out then, and a copy is kept.
+docs/files.md describes them. The checkpoint is written last. When the run is resumed, everything newer in the other
+files is cut off, damaged lines of progress.jsonl are left out, and a copy of the damaged file is kept.
 """
 
 import fcntl
@@ -29,7 +29,7 @@ from typing import Any, Final
 import numpy as np
 
 from farm.arrays import FloatArray, IntArray
-from farm.errors import CheckpointError, ConfigError
+from farm.errors import CheckpointError, ConfigError, NameTakenError
 from farm.net.stats import GenerationStats
 from learner import checkpoint as checkpoints
 from learner import config as configs
@@ -86,7 +86,7 @@ class RunFolder:
             path.mkdir(parents=True)
         except OSError as error:
             if os.path.isdir(path):  # noqa: PTH112  never raises
-                raise ConfigError(
+                raise NameTakenError(
                     f"run folder {path} exists and is never overwritten: choose another --name, or --resume {path}"
                 ) from None
             raise ConfigError(f"cannot make the run folder {path}: {_in_the_way(path) or error.strerror}") from None
@@ -100,20 +100,22 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """An existing run's folder; a ConfigError where there is none."""
+        """An existing run's folder; a ConfigError if there is none."""
         if not (path / "config.json").is_file():
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         return cls(path)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep others (a ConfigError) from going on with the run; released when this process ends, however it ends."""
+        """Keep other processes (by a ConfigError) from working on the run, until this process ends."""
         folder = os.open(self.path, os.O_RDONLY)
         try:
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise ConfigError(f"another process is working on the run in {self.path}: let it end first") from None
+                raise ConfigError(
+                    f"another process is working on the run in {self.path}: wait until it has ended"
+                ) from None
             yield
         finally:
             os.close(folder)
@@ -222,9 +224,33 @@ class RunFolder:
         row = rows[found[0]]
         return row["mu"], row["normaliser"] if "normaliser" in row.dtype.names else _NONE
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Replace the checkpoint."""
-        checkpoints.save(self.checkpoint, checkpoint)
+    def average(self, generation: int, mu: FloatArray, count: int) -> FloatArray:
+        """The average of mu, the mean after a generation, and of those stored of the `count` - 1 before it, (P,)."""
+        first = max(1, generation - count + 1)
+        if first >= generation:
+            return mu
+        step = self.every(mu.size, generation)
+        wanted = [each for each in range(first, generation) if each % step == 0]
+        rows = self.parameters() if (self.path / "parameters").exists() else np.empty(0, _row_type(mu.size, 0))
+        before = rows[np.isin(rows["generation"], wanted)]
+        if len(before) < len(wanted):
+            log.warning(
+                "%s lacks means of generations %d to %d: the average is of %d instead of %d",
+                self.path / "parameters", first, generation - 1, len(before) + 1, len(wanted) + 1,
+            )  # fmt: skip
+        return np.asarray(np.mean([*before["mu"], mu], axis=0))
+
+    def save(self, checkpoint: Checkpoint, *, durable: bool = True) -> None:
+        """Replace the checkpoint; durable: so that a power failure, too, leaves one."""
+        if durable:  # first what it relies on
+            for name in ("config.json", "progress.jsonl", "parameters"):
+                with suppress(FileNotFoundError), (self.path / name).open("rb") as file:
+                    os.fsync(file.fileno())
+        checkpoints.save(self.checkpoint, checkpoint, durable=durable)
+
+    def settle(self) -> None:
+        """End with one checkpoint that is on the disk."""
+        checkpoints.settle(self.checkpoint)
 
     def rewind(self, checkpoint: Checkpoint) -> None:
         """Cut the other files back to a checkpoint.
@@ -243,7 +269,7 @@ class RunFolder:
                 file.truncate(whole)
 
     def _parameters_until(self, generation: int, size: int) -> int | None:
-        """The bytes of `parameters` up to a generation; None where there is none."""
+        """The bytes of `parameters` up to a generation; None if there are none."""
         path = self.path / "parameters"
         if not path.exists():
             return None
@@ -252,7 +278,13 @@ class RunFolder:
             raise CheckpointError(f"{path} is of {head['parameters']} parameters, the checkpoint of {size}: {_ASIDE}")
         if not len(rows) and generation >= head["every"] and path.stat().st_size > offset:
             raise CheckpointError(f"{path} is damaged: it holds no row as its first line describes them; {_ASIDE}")
-        return offset + int((rows["generation"] <= generation).sum()) * rows.itemsize
+        kept = rows["generation"][rows["generation"] <= generation]
+        if len(kept) and kept[-1] + head["every"] <= generation:
+            raise CheckpointError(
+                f"{path} ends with generation {kept[-1]}, the checkpoint is of {generation}; if there is a "
+                f"{self.checkpoint.name}.safe, put it in the checkpoint's place, or move {path.name} elsewhere"
+            )
+        return offset + len(kept) * rows.itemsize
 
     def _rewind_progress(self, generation: int) -> None:
         path = self.path / "progress.jsonl"
@@ -280,7 +312,7 @@ def every(parameters: int, generations: int, observation: int = 0) -> int:
 
 
 def _in_the_way(path: Path) -> str:
-    """What is where a folder or one above it should be; empty where nothing is."""
+    """What is in the place of a folder or of one above it; empty if nothing is."""
     for part in (*reversed(path.parents), path):
         if part.is_symlink() and not os.path.isdir(part):  # noqa: PTH112
             return f"{part} is a link to {part.readlink()}, which is no folder"
@@ -290,13 +322,13 @@ def _in_the_way(path: Path) -> str:
 
 
 def _makes_sense(summary: dict[str, Any]) -> bool:
-    """Whether what is shown of a summary is of its type, where it is there."""
+    """Whether the shown values of a summary have the right types."""
     known = [(summary[name], kinds) for name, kinds in _SUMMARY.items() if name in summary]
     return all(type(value) in kinds and (type(value) is not int or abs(value) < 2**63) for value, kinds in known)
 
 
 def _rising(numbers: list[int]) -> list[int]:
-    """Positions of a longest rising subsequence: a wrong number among them costs none of the others."""
+    """Positions of a longest rising subsequence, so that a wrong number does not discard the others."""
     ends: list[int] = []  # of the subsequences of each length, the one that ends lowest
     before: list[int | None] = []
     for i, number in enumerate(numbers):
@@ -311,7 +343,7 @@ def _rising(numbers: list[int]) -> list[int]:
 
 
 def _copy(path: Path) -> Path:
-    """Copy a damaged file beside it, where no older copy is."""
+    """Copy a damaged file beside it; older copies are kept."""
     copies = (path.with_name(f"{path.name}.damaged{n if n > 1 else ''}") for n in itertools.count(1))
     copy = next(each for each in copies if not os.path.lexists(each))
     try:

@@ -1,4 +1,4 @@
-"""How a run begins: task and policy from its configuration, its first state, and what its workers are told."""
+"""How a run begins: task and policy from its configuration, its first state, and its workers' specification."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from learner.config import RunConfig
 from learner.run_folder import RunFolder
 
 MESSAGE_LIMIT: Final = 32 << 20
-"""What a mean may take in a message [bytes]; a chunk holds it and eps besides."""
+"""Largest size of a mean in a message [bytes]; a chunk also holds eps."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Problem:
         return Scene(self.task.model)
 
     def specification(self, run: str) -> Spec:
-        """What workers are told."""
+        """The specification for workers."""
         config = self.config
         task, policy = self._plugins.values()
         return Spec(
@@ -55,7 +55,7 @@ class Problem:
         )  # fmt: skip
 
     def runner(self) -> Runner:
-        """Simulate in this process; a ConfigError where the task cannot be begun."""
+        """Prepare simulation in this process; a ConfigError if the task cannot start."""
         return Runner(self.task, self.policy)
 
     @property
@@ -93,7 +93,7 @@ class Problem:
 def problem(
     config: RunConfig, constants: Mapping[str, FloatArray] | None = None, files: Mapping[str, str] | None = None
 ) -> Problem:
-    """What a configuration says, with the constants and texts that a run carries; without: drawn and read now.
+    """Task and policy of a configuration, with a run's constants and texts; by default new ones are drawn and read.
 
     Raises:
       ConfigError: the task is not to be had here, or the policy is larger than a message.
@@ -114,7 +114,7 @@ def problem(
 
 
 def _check_size(found: Problem) -> None:
-    """See that a mean fits into a message.
+    """Check that a mean fits into a message.
 
     Raises:
       ConfigError: it does not; says the largest size that does.
@@ -148,7 +148,9 @@ def fitted(config: RunConfig) -> RunConfig:
     if not issubclass(kind, Kernel | Projected):
         raise ConfigError(f"--start fitted is for the policies kernel and projected, not {config.policy}")
     if not (hasattr(algorithm, "initial_mu") and hasattr(algorithm, "initial_sigma")):
-        raise ConfigError(f"--start fitted needs --initial-mu and --initial-sigma, which {config.algorithm} has not")
+        raise ConfigError(
+            f"--start fitted needs --initial-mu and --initial-sigma, which {config.algorithm} does not have"
+        )
     if config.init_from is not None:
         raise ConfigError("--start fitted and --init-from exclude each other: both say where the search begins")
     if policy.normalise:
@@ -187,7 +189,7 @@ def start(config: RunConfig, run: str) -> tuple[Problem, Checkpoint]:
 
 
 def resumed(folder: RunFolder, config: RunConfig, *, mixed: bool = False) -> tuple[Problem, Checkpoint]:
-    """A run as its checkpoint left it.
+    """A run as its checkpoint saved it.
 
     Raises:
       CheckpointError: it cannot be used, belongs to another configuration, or the code that decides the run's numbers
@@ -205,7 +207,7 @@ def resumed(folder: RunFolder, config: RunConfig, *, mixed: bool = False) -> tup
     if changed and not mixed:
         raise CheckpointError(
             f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back, "
-            "begin a new run with --init-from, or go on with --mixed and do without repeatable numbers"
+            "begin a new run with --init-from, or continue with --mixed (then the run is not reproducible)"
         )
     return found, at
 

@@ -1,11 +1,11 @@
 """Runs side by side: several learners share one set of workers, so that a pool of any size is kept busy.
 
-A generation of 15 pairs cannot keep many workers busy, four learners' generations can. Each learner is a process
-of its own, `farm learner` as a person would start it, at one router; their numbers are those of runs one after
-another, because a run's numbers depend on nobody else.
+A generation of 15 pairs cannot keep many workers busy, but the generations of four learners can. Each learner is a
+separate process, `farm learner`, and all are connected to one router. Their numbers are those of runs one after
+another, because a run's numbers depend on no other run.
 
-`run` takes run folders and their configurations, wherever they come from: settings x seeds (`learner.grid`), or an
-experiment. Runs that have ended are not repeated, others go on from their checkpoints.
+`run` takes run folders and their configurations, from any source: settings x seeds (`learner.grid`), or an
+experiment. Finished runs are not repeated; other runs continue from their checkpoints.
 """
 
 import json
@@ -51,7 +51,7 @@ class Sharing(Settings):
     parallel: int = setting(4, least=1, most=256)
     """Learners at a time."""
     workers: int | None = setting(None, least=0, most=1024)
-    """Local worker processes; None: one per core, with --connect none."""
+    """Local worker processes; by default one per core, with --connect none."""
     backend: str = "cpu"
     """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
     connect: tuple[str, ...] = ()
@@ -70,7 +70,7 @@ class Sharing(Settings):
         if self.tls is not None and self.workers:
             raise ConfigError("--workers with --tls: a farm's workers have certificates of their own; see farm worker")
         if self.workers == 0 and not self.connect:
-            raise ConfigError("--workers 0 without --connect: nobody would simulate")
+            raise ConfigError("--workers 0 without --connect: there would be no workers")
         rollouts.backend(self.backend)
         keys.checked("farm", self.farm)
         for endpoint in self.connect:
@@ -136,7 +136,7 @@ def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: "Runs", stopped
 
 
 def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
-    """Flags by which learners and workers find each other; a router of our own where none is given."""
+    """Flags that connect learners and workers; without a given router one is started."""
     endpoints = sharing.connect
     if not endpoints:
         endpoints = (free_endpoint(),)

@@ -1,5 +1,6 @@
 """Documents that quote the program quote what it says."""
 
+import ast
 import os
 import re
 import shutil
@@ -28,21 +29,68 @@ def test_messages_that_are_explained_exist(message: str) -> None:
 
 
 def test_links_lead_somewhere() -> None:
-    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]:
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text("utf-8")):
             assert (path.parent / target).exists(), f"{path.name}: {target}"
 
 
+SCRIPTS = "\n".join(path.read_text("utf-8") for name in ("benchmarks", "docs") for path in (ROOT / name).rglob("*.py"))
+FLAGS = {name.replace("_", "-") for name in re.findall(r"^    (\w+): .*$", SOURCE, re.M)}
+FLAGS |= set(re.findall(r'"--([a-z-]+)"', SCRIPTS)) | {"help", "version", "measurements"}
+FLAGS |= {"dropped", "ended", "fell", "torque", "goals", "elite"}
+"""Of commands, of scripts and tests, and those that tasks and algorithms of the pages bring."""
+
+PAGES = [page for folder in (".", "docs", "examples") for page in (ROOT / folder).glob("*.md")]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
+def test_flags_that_pages_name_exist(page: Path) -> None:
+    """Those in commands `farm ...`, in lines of code or in the text, and those that the text names alone."""
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.S | re.M)
+    said = re.findall(r"`((?:farm |--)[^`]*)`", text) + re.findall(r"^    (?:\S*/)?(farm .*)$", text, re.M)
+    named = {flag for part in said for flag in re.findall(r"(?<![\w-])--([a-z][a-z-]*)", part)}
+    assert {flag for flag in named if flag.removeprefix("no-") not in FLAGS} == set()
+
+
+def test_the_task_in_the_readme_is_the_one_that_new_task_writes() -> None:
+    [shown] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+    assert parts(shown) == parts((ROOT / "learner/commands/task_template.py.txt").read_text("utf-8"))
+
+
+def parts(source: str) -> list[str]:
+    """The statements of a task's class, without its docstring, comments, or spaces between XML elements."""
+    [task] = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
+    body = [node for node in task.body if not isinstance(node, ast.Expr)]
+    return [re.sub(r">(\\n|\s)*<", "><", ast.dump(node)) for node in body]
+
+
+def _made(docs: Path) -> list[Path]:
+    """The index of the results and its pages."""
+    return [docs / "results.md", *(page for page in (docs / "results").glob("*.md") if page.name != "notes.md")]
+
+
+def test_the_results_anchors_exist() -> None:
+    """Each link from the index or a page of results leads to a heading."""
+    for path in _made(ROOT / "docs"):
+        for target, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", path.read_text("utf-8")):
+            text = (path.parent / target if target else path).read_text("utf-8")
+            headings = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")]
+            assert anchor in {re.sub(r"[^a-z0-9 -]", "", each.lower()).replace(" ", "-") for each in headings}, anchor
+
+
 @pytest.mark.slow
-def test_the_page_of_results_is_what_the_recorded_data_says(tmp_path: Path) -> None:
-    """Made again from a copy of docs/results, it is the page that stands there, figures and all."""
+def test_the_pages_of_results_are_what_the_recorded_data_says(tmp_path: Path) -> None:
+    """Made again from a copy of docs/results, pages and figures are those of the project."""
     pytest.importorskip("matplotlib")
     docs = ROOT / "docs"
     shutil.copytree(docs / "results", tmp_path / "results")
     shutil.copy(docs / "results.py", tmp_path)
-    for figure in (tmp_path / "results").glob("*.svg"):
-        figure.unlink()
+    for made in (*(tmp_path / "results").glob("*.svg"), *_made(tmp_path)):
+        made.unlink(missing_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}  # benchmarks/ is in the checkout alone
     subprocess.run([sys.executable, tmp_path / "results.py", tmp_path / "results"], env=environment, check=True)
-    assert (tmp_path / "results.md").read_text("utf-8") == (docs / "results.md").read_text("utf-8")
+    for page in _made(docs):
+        assert (tmp_path / page.relative_to(docs)).read_text("utf-8") == page.read_text("utf-8"), page.name
+    assert {page.name for page in _made(tmp_path)} == {page.name for page in _made(docs)}
+    assert len((docs / "results.md").read_text("utf-8").splitlines()) <= 120
     assert {f.name for f in (tmp_path / "results").glob("*.svg")} == {f.name for f in (docs / "results").glob("*.svg")}

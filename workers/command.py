@@ -20,7 +20,7 @@ class WorkerCommand(Settings):
     worker: WorkerConfig = field(default_factory=WorkerConfig)
     """Where they work."""
     processes: int | None = setting(None, least=1, most=4096)
-    """Worker processes; None: one per core."""
+    """Worker processes; by default one per core."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 

@@ -63,9 +63,9 @@ class WorkerConfig(Settings):
     name: str = ""
     """Name of this worker; without one: the host's, with --tls the certificate's."""
     tls: Path | None = None
-    """Folder with certificates (farm certificates makes it); needed to dial tls/HOST:PORT."""
+    """Folder with certificates (farm certificates makes it); needed to connect to tls/HOST:PORT."""
     timeout: float | None = setting(None, least=0.0)
-    """Give up when nobody answers for so long at the start [s]; None: keep trying."""
+    """Give up when nobody answers for so long at the start [s]; by default keep trying."""
     backend: str = "cpu"
     """What simulates: a name, or FILE.py:CLASS."""
     allow_file: tuple[Path, ...] = ()
@@ -161,7 +161,8 @@ class Worker:
         farm = self._config.farm
         if self._config.accept_code:
             self._spare = RunnerProcess(self._sources.empty)
-        self._session.subscribe("generation", keys.generation(farm, "*"))
+        # A header needs nothing done until its jobs are here, a moment later: one wake-up instead of two.
+        self._session.subscribe("generation", keys.generation(farm, "*"), wake=False)
         self._session.subscribe("inbox", keys.inbox(farm, self.id))
         self._session.subscribe("refused", keys.refused(farm, self.id))
         self._session.watch("learner", keys.learner_token(farm, "*"))
@@ -387,13 +388,17 @@ class Worker:
                 if not isinstance(error, FarmError):
                     return error  # short of memory, say: another time it may go
                 self._runners[header.spec] = error
+            self._let_go()
         self._runners.move_to_end(header.spec)
+        return self._runners[header.spec]
+
+    def _let_go(self) -> None:
+        """Keep the newest tasks only, and fewer of those that are processes."""
         processes = [digest for digest, each in self._runners.items() if isinstance(each, SubprocessRunner)]
         for digest in {*processes[:-_PROCESSES], *list(self._runners)[:-_KEEP]}:
             oldest = self._runners.pop(digest)
             if not isinstance(oldest, Exception):
                 oldest.close()
-        return self._runners[header.spec]
 
     def _made(self, run: str, spec: Spec) -> Runner | SubprocessRunner | None:
         """What runs a run's jobs; None if a source of it is not to be had."""

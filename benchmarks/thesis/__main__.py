@@ -36,7 +36,7 @@ PROGRAM: Final = "python -m benchmarks.thesis"
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentCommand:
-    """An experiment's runs side by side, then its figure; given again, it goes on where it stopped.
+    """An experiment's runs side by side, then its figure; run it again to continue.
 
     `plot FOLDER` instead of a name draws the figures of such a folder again, from its recorded data.
     """
@@ -92,7 +92,7 @@ def main(words: Sequence[str]) -> int:
             complete = sweep.run(folder.runs, command.sharing, shown, stop.is_set)
         folder.gather()
         if stop.is_set():
-            sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command goes on with them\n")
+            sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command continues with them\n")
             return INTERRUPTED
     draw(folder)
     return 0 if complete else 1

@@ -16,7 +16,7 @@ from learner.config import RunConfig, configure
 from learner.setup import fitted
 
 TRIALS: Final = 5
-"""Trials of a set-up unless told otherwise; the thesis has three."""
+"""Default number of trials of a set-up; the thesis has three."""
 
 OBJECTS: Final = ("bar", "thin-bar", "thick-bar", "cylinder", "bolt")
 
@@ -190,7 +190,7 @@ _CLAIMS: Final = [
     ),
     Experiment(
         name="fig-4.5",
-        title="Pairs a generation",
+        title="Pairs per generation",
         question="Few pairs and many updates, or many pairs and few updates?",
         claim="N 50 rises at generation 30 to 40, drops and recovers; N 15 rises at 90, smoother and nearly as high "
         "(4.2.4).",
@@ -234,7 +234,7 @@ _CLAIMS: Final = [
     ),
     Experiment(
         name="text-4.1.2",
-        title="Direct learning: histories a generation",
+        title="Direct learning: histories per generation",
         question="Does N matter to direct learning, over 2000 histories?",
         claim="No difference within 2000 histories, all of them in the flat part (4.1.2).",
         curves={
@@ -348,7 +348,7 @@ _QUESTIONS: Final = [
     Experiment(
         name="direct-few",
         title="Direct learning with few rollouts",
-        question="Thesis 5: does direct learning work on joint positions alone, with few histories a generation?",
+        question="Thesis 5: does direct learning work on joint positions alone, with few histories per generation?",
         curves={
             "N 5": "direct-joints-N5",
             "N 15": "direct-joints-N15",
@@ -518,7 +518,7 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 """By name, the thesis' own first."""
 
 RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}
-"""Rollouts a second of two cores, of the projected policy times its features; for estimates alone."""
+"""Rollouts per second of two cores, of the projected policy times its features; used only for estimates."""
 
 
 def _cheap(name: str) -> RunConfig:

@@ -168,7 +168,7 @@ def remedies(data: Data) -> list[Finding]:
 
 
 def no_difference(data: Data) -> list[Finding]:
-    """4.1.2: over 2000 histories the number a generation makes no difference."""
+    """4.1.2: over 2000 histories the number per generation makes no difference."""
     if min(series.trials for series in data.series.values()) < 2:
         return []
     ends = {}
@@ -224,7 +224,7 @@ def scale_free(data: Data) -> list[Finding]:
 
 
 def learning(data: Data) -> list[Finding]:
-    """Which of the set-ups learn: for questions of ours, where there is nothing to reproduce."""
+    """Which of the set-ups learn: for additional questions, where there is nothing to reproduce."""
     out = []
     for label, series in data.series.items():
         said = f"{counted(series)}; mean policy at the end {spread(series.final)}"

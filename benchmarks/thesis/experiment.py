@@ -89,7 +89,7 @@ class Experiment:
     title: str
     question: str
     claim: str = ""
-    """What Plage 2016 reports, and where; empty for questions of ours."""
+    """What Plage 2016 reports, and where; empty for additional questions."""
     curves: Mapping[str, str] = field(default_factory=dict)
     """What a legend says -> name of the set-up (catalogue.SETUPS)."""
     figure: Figure = field(default_factory=Curves)

@@ -1,4 +1,4 @@
-"""The figures of experiments; the only door to matplotlib."""
+"""The figures of experiments; the only module of the benchmarks that imports matplotlib."""
 
 import textwrap
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ _STYLE: Final = {
 }  # fmt: skip
 
 _COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#888888")
-"""Okabe and Ito's and a grey, told apart by the colour-blind; dashes and markers tell them apart in black and white."""
+"""Colours of Okabe and Ito, and a grey, for the colour-blind; dashes and markers differ in black and white."""
 
 _DASHES: Final = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)), (0, (3, 3)))
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -130,7 +130,7 @@ def _curves(experiment: Experiment, data: Data) -> Canvas:
 
 
 def _run_away(figure: Curves, data: Data) -> bool:
-    """Whether a trial's returns fell so far that a mean would say nothing of the others."""
+    """Whether a trial's returns fell so far that a mean would hide the other trials."""
     drawn = (series for series in data.series.values() if not series.empty)
     return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in drawn)
 

@@ -61,7 +61,7 @@ class ExperimentFolder:
 
     @classmethod
     def prepare(cls, path: Path, names: Sequence[str], trials: int, generations: int | None) -> "ExperimentFolder":
-        """A new one, or an existing one to go on with; trials may be added.
+        """A new folder, or an existing one to continue; trials may be added.
 
         Raises:
           ConfigError: the folder is another experiment's, or something else's.
@@ -110,7 +110,7 @@ class ExperimentFolder:
         return {self.run(*pair).path: self.config(*pair) for pair in pairs}
 
     def check_runs(self, *, go_on: bool = False) -> None:
-        """See that the runs that are there are the set-ups', and that none is gone whose data is kept.
+        """Check that the runs in the folder belong to the set-ups, and that none is missing whose data is kept.
 
         To go on with the runs each has to be there; for data alone, all of a set-up may be gone.
 

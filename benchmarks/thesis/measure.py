@@ -71,7 +71,7 @@ def _measuring(experiment: Experiment) -> Measuring | None:
 
 
 def _trials(folder: ExperimentFolder, setup: str) -> list[RunFolder | None]:
-    """A set-up's runs, None where there is no learnt policy."""
+    """A set-up's runs, None if there is no learnt policy."""
     runs = [folder.run(setup, number) for number in range(folder.trials)]
     return [run if run.checkpoint.exists() else None for run in runs]
 

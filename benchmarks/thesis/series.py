@@ -37,21 +37,21 @@ class Series:
     """The trials of a set-up."""
 
     columns: Mapping[str, FloatArray]
-    """COLUMNS by name, (trials, generations); nan behind a trial's end."""
+    """COLUMNS by name, (trials, generations); nan after a trial's end."""
     states: tuple[str, ...]
     """How each trial ended: finished, diverged, failed, interrupted; unfinished, missing."""
     robust: FloatArray
-    """(trials,) robust success of the final mean policy, nan where it was not evaluated."""
+    """(trials,) robust success of the final mean policy, nan if it was not evaluated."""
     succeeded: BoolArray
     """(trials,) whether the final mean policy succeeded on the nominal start."""
     final: FloatArray
-    """(trials,) return of the final mean policy, nan where it was not evaluated."""
+    """(trials,) return of the final mean policy, nan if it was not evaluated."""
     rollouts: int
-    """Exploring rollouts a generation."""
+    """Exploring rollouts per generation."""
     seconds: FloatArray
     """(trials,) wall time of each run [s]."""
     hashes: tuple[str, ...]
-    """parameters_sha256 of each trial, empty where there is none."""
+    """parameters_sha256 of each trial, empty if there is none."""
 
     @property
     def trials(self) -> int:
@@ -70,7 +70,7 @@ class Series:
 
     @property
     def since(self) -> FloatArray:
-        """(trials,) the generation from which every mean policy succeeds to the end, nan where none."""
+        """(trials,) the generation from which every mean policy succeeds to the end, nan if there is none."""
         good = np.nan_to_num(self.columns["mean_policy_success"]) > 0
         ran = ~np.isnan(self.columns["return_mean"])
         out = np.full(self.trials, np.nan)
@@ -95,7 +95,7 @@ class Series:
 
 
 def known_mean(values: FloatArray, axis: int) -> FloatArray:
-    """Mean over an axis of what is not nan; nan where nothing is."""
+    """Mean over an axis of what is not nan; nan if there is nothing else."""
     count = (~np.isnan(values)).sum(axis=axis)
     return np.where(count > 0, np.nansum(values, axis=axis) / np.maximum(count, 1), np.nan)
 
@@ -181,7 +181,7 @@ def read_arrays(path: Path) -> dict[str, "np.ndarray[Any, Any]"]:
 
 
 def _run(folder: RunFolder) -> tuple[dict[str, FloatArray], dict[str, Any], int]:
-    """Columns and summary of one run, and its rollouts a generation."""
+    """Columns and summary of one run, and its rollouts per generation."""
     progress = folder.progress()
     columns = {
         name: np.array([np.nan if (v := getattr(p, name)) is None else v for p in progress], dtype=float)

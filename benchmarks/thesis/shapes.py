@@ -16,7 +16,7 @@ def about(values: FloatArray, low: float, high: float) -> bool:
 
 
 def _smoothed(row: FloatArray) -> FloatArray:
-    """Mean over five generations; nan where there are not five around."""
+    """Mean over five generations; nan near the ends."""
     out = np.full(len(row), np.nan)
     kept = row[~np.isnan(row)]
     if len(kept) < 5:

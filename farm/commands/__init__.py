@@ -1,1 +1,1 @@
-"""The commands of the front door, a module each; they alone know learner and workers."""
+"""Commands that belong neither to the learner nor to workers: status, router, certificates."""

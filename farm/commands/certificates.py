@@ -1,4 +1,4 @@
-"""`farm certificates`: a small certificate authority for a lab; the only door to cryptography."""
+"""`farm certificates`: a small certificate authority for a lab; the only module that imports cryptography."""
 
 import datetime
 import importlib.util
@@ -39,19 +39,19 @@ _LABEL: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
 
 @dataclass(frozen=True, kw_only=True)
 class CertificatesCommand(Settings):
-    """A small certificate authority for a lab: makes one folder for each machine to copy there."""
+    """A small certificate authority for a lab: makes one folder per machine, to be copied there."""
 
     action: tyro.conf.Positional[Literal["new", "add", "renew"]]
-    """new: an authority and its first certificates; add: more workers or viewers; renew: those named once more, or the
-    learner's where none is."""
+    """new: an authority and its first certificates; add: certificates of more workers or viewers; renew: new
+    certificates for the given names, or for the learner if no name is given."""
     dir: tyro.conf.Positional[Path]
     """Folder of the authority; keep it on one machine."""
     learner: tuple[str, ...] = ()
-    """Host name or address at which workers dial the learner or router, repeatable."""
+    """Host name or address at which workers reach the learner or router, repeatable."""
     worker: tuple[str, ...] = ()
     """Name of a worker's host, repeatable; all processes of that host share its certificate."""
     viewer: tuple[str, ...] = ()
-    """Name of somebody who may look but not work, repeatable."""
+    """Name of a viewer, which may watch and record only, repeatable."""
     days: int = setting(825, least=1, most=3650)
     """Validity of the certificates [days]; the authority's own is ten years."""
 
@@ -59,7 +59,9 @@ class CertificatesCommand(Settings):
         super().__post_init__()
         for role, name in self.others:
             if len(keys.checked(role, name)) > _COMMON_NAME:
-                raise ConfigError(f"{role} {name} has {len(name)} characters; a certificate takes {_COMMON_NAME}")
+                raise ConfigError(
+                    f"{role} {name} has {len(name)} characters; a certificate can have at most {_COMMON_NAME}"
+                )
         for host in self.learner:
             _check_host(host)
         names = [LEARNER, *self.worker, *self.viewer]
@@ -87,14 +89,14 @@ def _new(command: CertificatesCommand) -> None:
     if command.dir.exists() and any(command.dir.iterdir()):
         raise ConfigError(f"{command.dir} is not empty: take another folder, or farm certificates add {command.dir}")
     if not command.learner:
-        raise ConfigError("--learner HOST is missing: the name or address at which workers dial the learner")
+        raise ConfigError("--learner HOST is missing: the name or address at which workers reach the learner")
     with _all_or_nothing(command.dir):
         authority = _Authority.create(command.dir / "ca")
         _issue(command, authority, [("learner", LEARNER), *command.others], {"learners": [LEARNER]})
     sys.stdout.write(
         f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {command.dir / LEARNER}\n"
         f"workers: farm worker --connect tls/{command.learner[0]}:7447 --tls worker-NAME\n"
-        f"{command.dir / 'ca'} makes more of them: keep it where you are, and to yourself\n"
+        f"{command.dir / 'ca'} holds the authority's key: keep it secret, and do not copy it\n"
     )
 
 
@@ -106,7 +108,7 @@ def _add(command: CertificatesCommand) -> None:
     authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
     known = {name for names in roster.values() for name in names}
     if twice := sorted({name for _, name in command.others if name in known or _folder(command, name)}):
-        raise ConfigError(f"{', '.join(twice)} has a certificate already: farm certificates renew makes it anew")
+        raise ConfigError(f"{', '.join(twice)} has a certificate already: farm certificates renew replaces it")
     _issue(command, authority, command.others, roster)
     sys.stdout.write(f"copy {command.dir}/ca/roster.json to the learner's bundle (or the router's) and restart it\n")
 
@@ -119,7 +121,7 @@ def _renew(command: CertificatesCommand) -> None:
     learner: list[tuple[Role, str]] = [("learner", LEARNER)] if command.learner or not command.others else []
     hosts = command.learner or (_hosts(command.dir / LEARNER) if learner else ())
     _issue(command, authority, [*learner, *command.others], roster, hosts)
-    sys.stdout.write("restart who uses them; those they replace stay valid until their own end\n")
+    sys.stdout.write("restart the programs that use them; the old certificates stay valid until they expire\n")
 
 
 def _issue(
@@ -129,7 +131,7 @@ def _issue(
     roster: dict[str, list[str]],
     hosts: tuple[str, ...] | None = None,
 ) -> None:
-    """Make bundles, all or none, list who may take part, and say what was made."""
+    """Make bundles, all or none, update the list of admitted names, and say what was made."""
     with ExitStack() as undo:
         made = []
         for role, name in wanted:
@@ -153,7 +155,7 @@ def _issue(
 
 
 def _roster(folder: Path) -> dict[str, list[str]]:
-    """Who may take part, by role: the authority's own list, wherever bundles were moved to."""
+    """The admitted names by role: the authority's own list, wherever bundles were moved."""
     for path in (folder / "ca" / "roster.json", folder / LEARNER / "roster.json"):
         if path.exists():
             try:
@@ -173,7 +175,7 @@ def _folder(command: CertificatesCommand, name: str) -> bool:
 
 
 def _hosts(folder: Path) -> tuple[str, ...]:
-    """The names in the learner's present certificate."""
+    """The host names in the learner's present certificate."""
     try:
         present = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
         names = present.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -184,7 +186,7 @@ def _hosts(folder: Path) -> tuple[str, ...]:
 
 @contextmanager
 def _all_or_nothing(folder: Path) -> Iterator[None]:
-    """Have a folder that could not be filled be as it was: not there, or empty."""
+    """Remove everything from a folder that could not be filled completely."""
     there = folder.exists()
     try:
         yield
@@ -197,7 +199,7 @@ def _all_or_nothing(folder: Path) -> Iterator[None]:
 
 
 def _check_host(host: str) -> None:
-    """See that a certificate can be for a host; else a ConfigError."""
+    """Check that a certificate can be made for a host; else a ConfigError."""
     if _is_address(host):
         return
     labels = host.split(".")

@@ -10,7 +10,7 @@ LEVELS: Final = ("DEBUG", "INFO", "WARNING", "ERROR")
 
 
 class Formatter(logging.Formatter):
-    """Messages of one line in which nothing moves a terminal's cursor, whoever sent what they tell of."""
+    """Messages of one line; control characters from the network are escaped."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  logging's name
         """The line; a traceback below it keeps its lines."""
@@ -23,7 +23,7 @@ class Formatter(logging.Formatter):
 
 
 def set_up(level: str) -> None:
-    """Messages of that level and above to standard error; a ConfigError where there is no such level."""
+    """Print messages of that level and above to standard error; a ConfigError if there is no such level."""
     if level.upper() not in LEVELS:
         raise ConfigError(f"unknown log level {level!r}; known are {', '.join(LEVELS)}")
     handler = logging.StreamHandler(sys.stderr)
@@ -33,6 +33,6 @@ def set_up(level: str) -> None:
 
 
 def say(*lines: str) -> None:
-    """Write lines to standard output, at once also where that is a pipe."""
+    """Write lines to standard output, at once even if it is a pipe."""
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()

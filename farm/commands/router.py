@@ -1,4 +1,4 @@
-"""`farm router`: a standing rendezvous that outlives learners."""
+"""`farm router`: a permanent router that outlives learners."""
 
 import json
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from farm.net.tls import find
 
 @dataclass(frozen=True, kw_only=True)
 class RouterCommand:
-    """A standing rendezvous: learners, workers and viewers dial it; access control lives here."""
+    """A permanent router that learners, workers and viewers connect to; it applies access control."""
 
     listen: str | None = None
-    """Where it can be reached; None: tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447."""
+    """Where it listens; by default tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447."""
     connect: tuple[str, ...] = ()
     """Join another router, repeatable: for a site with a router of its own."""
     tls: Path | None = None
-    """Folder with certificates (farm certificates makes it): the learner's bundle serves the router."""
+    """Folder with certificates (farm certificates makes it): the router uses the learner's bundle."""
     trust_network: bool = False
     """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
     farm: str = "farm"
@@ -43,13 +43,13 @@ def main(words: Sequence[str]) -> int:
     logs.set_up(command.log_level)
     bundle = None if command.tls is None else find(command.tls.absolute(), "learner")
     endpoint = command.listen or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"))
-    trusted, dial = command.trust_network, command.connect
+    trusted, routers = command.trust_network, command.connect
     if command.print_config:
-        settings = router_settings(endpoint, command.farm, bundle, trusted=trusted, dial=dial)
+        settings = router_settings(endpoint, command.farm, bundle, trusted=trusted, routers=routers)
         logs.say(json.dumps(_nested(settings), indent=2))
         return 0
-    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, dial=dial):
-        logs.say(f"router at {endpoint}; learners and workers dial it with --connect")
+    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, routers=routers):
+        logs.say(f"router at {endpoint}; learners and workers connect to it with --connect")
         stop.wait()
     return 0
 

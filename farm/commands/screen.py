@@ -23,7 +23,7 @@ def display() -> bool:
 
 
 def draw_offscreen() -> None:
-    """Have MuJoCo draw without a window where there is no screen; a MUJOCO_GL of the user's stays as it is."""
+    """Let MuJoCo draw without a window if there is no screen; the user's own MUJOCO_GL is kept."""
     if not display():
         os.environ.setdefault("MUJOCO_GL", "osmesa" if ctypes.util.find_library("OSMesa") else "egl")
 
@@ -34,7 +34,7 @@ def compact(title: str | None = None) -> Table:
 
 
 def plain(text: object) -> Text:
-    """Text as it is, whoever wrote it: a name in brackets is no style, and a control character moves no cursor."""
+    """Text as it is: a name in brackets is not a style, and control characters do not move the cursor."""
     return Text(printable(str(text)))
 
 
@@ -46,5 +46,5 @@ def wide() -> Console:
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Leave it to the front door, which knows how to end then."""
+        """Leave the error to the command line, which ends the program."""
         raise BrokenPipeError

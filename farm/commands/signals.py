@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a flag that long work looks at."""
+"""Ctrl-C and SIGTERM as a flag that long work checks."""
 
 import logging
 import signal
@@ -15,7 +15,7 @@ INTERRUPTED: Final = 130
 
 @contextmanager
 def stop_flag(doing: str = "ending") -> Iterator[threading.Event]:
-    """Set by the first Ctrl-C or SIGTERM, which says what is done now; a second Ctrl-C ends the program at once."""
+    """Set by the first Ctrl-C or SIGTERM, with a message; a second Ctrl-C ends the program at once."""
     flag = threading.Event()
     said = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 

@@ -1,4 +1,4 @@
-"""`farm status`: which runs and workers a farm has, and how they are doing."""
+"""`farm status`: shows the runs and workers of a farm, and how they are doing."""
 
 import dataclasses
 import json
@@ -26,7 +26,7 @@ _ANSWER = 1.0  # [s] that learners have to answer
 
 @dataclass(frozen=True, kw_only=True)
 class StatusCommand:
-    """Which runs and workers a farm has, and how they are doing; refreshed until Ctrl-C on a terminal."""
+    """Shows the runs and workers of a farm, and how they are doing; on a terminal refreshed until Ctrl-C."""
 
     connect: tuple[str, ...] = ()
     """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
@@ -35,15 +35,15 @@ class StatusCommand:
     tls: Path | None = None
     """Folder with certificates: a viewer's bundle."""
     name: str = ""
-    """Which viewer's, where the folder holds several."""
+    """Which viewer's certificate to use, if the folder holds several."""
     run: str = ""
-    """Only this run; exit status 1 if its learner does not answer."""
+    """Show only this run; exit status 1 if its learner does not answer."""
     worker: str = ""
-    """Exit status 1 if no worker of this name is there."""
+    """Exit status 1 if there is no worker with this name."""
     json: bool = False
     """Print JSON once instead of a table."""
     timeout: float = 5.0
-    """Give up when nobody answers for so long [s]."""
+    """Give up if nothing has answered after this time [s]."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -73,7 +73,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> None:
-    """See that the named run and worker are there: a FarmError says which is not. For health checks."""
+    """Check that the named run and worker are there, for health checks; a FarmError names the missing one."""
     if command.run and not runs:
         raise FarmError(f"no learner of run {command.run} answers on farm {command.farm}")
     token = keys.worker_token(command.farm, f"{command.worker}/*")
@@ -99,7 +99,7 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
     if not runs:
         return Group(*shown, "no runs: no learner answers")
     table = compact(time.strftime("runs at %H:%M:%S"))
-    for name in ("run", "generation", "return", "mean policy", "open", "re-issued", "refused", "ignored"):
+    for name in ("run", "generation", "return", "mean policy", "open", "reissued", "refused", "ignored"):
         table.add_column(name, justify="left" if name in ("run", "ignored") else "right", overflow="fold")
     workers = compact("workers")
     for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "1/s", "seen", "ignored"):

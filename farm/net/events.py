@@ -35,7 +35,7 @@ class Events:
         self._came = threading.Condition()
         self._bytes = self.dropped = 0
 
-    def put(self, event: Event) -> None:
+    def put(self, event: Event, *, wake: bool = True) -> None:
         """Append an event, unless those that wait take up too much.
 
         There is twice the room for who comes and goes: nobody would say that again.
@@ -47,7 +47,8 @@ class Events:
                 return
             self._bytes += size
             self._events.append(event)
-            self._came.notify()
+            if wake:
+                self._came.notify()
 
     def get(self, timeout: float = 0.0) -> Event:
         """The next event.

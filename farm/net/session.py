@@ -113,9 +113,12 @@ class Session:
             priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
         )
 
-    def subscribe(self, topic: str, key: str) -> None:
-        """Everything published on the key goes into `events` under the topic's name."""
-        self._declared.append(self._session.declare_subscriber(key, self._callback(self._put(topic))))
+    def subscribe(self, topic: str, key: str, *, wake: bool = True) -> None:
+        """Everything published on the key goes into `events` under the topic's name.
+
+        Without `wake`, a thread that waits for events goes on waiting, and finds it with the next one that wakes it.
+        """
+        self._declared.append(self._session.declare_subscriber(key, self._callback(self._put(topic, wake=wake))))
 
     def watch(self, topic: str, key: str) -> None:
         """Liveliness tokens that are there, come or go, into `events`."""
@@ -176,10 +179,10 @@ class Session:
         for over in self._over:
             over.wait(_JOIN_S)
 
-    def _put(self, topic: str) -> Callable[[zenoh.Sample], None]:
+    def _put(self, topic: str, *, wake: bool = True) -> Callable[[zenoh.Sample], None]:
         def put(sample: zenoh.Sample) -> None:
             alive = sample.kind == zenoh.SampleKind.PUT
-            self.events.put(Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive))
+            self.events.put(Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive), wake=wake)
 
         return put
 
@@ -208,21 +211,21 @@ class Outlet:
 
 
 def router_settings(
-    endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False, dial: tuple[str, ...] = ()
+    endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False, routers: tuple[str, ...] = ()
 ) -> dict[str, object]:
-    """Zenoh's settings for a session that others dial, by the paths of its configuration.
+    """Zenoh's settings for a session that others connect to, by the paths of its configuration.
 
     Args:
       endpoint: where it listens.
       farm: name of the farm, for access control.
       bundle: the learner's certificates; with them only those on its roster get in.
       trusted: listen to other machines without certificates.
-      dial: other routers that it joins, as soon and as often as they are there.
+      routers: other ones that it joins, as soon and as often as they are there.
 
     Raises:
       ConfigError: an endpoint is malformed, or open to other machines without certificates.
     """
-    host, *_ = (check_endpoint(each, encrypted=bundle is not None) for each in (endpoint, *dial))
+    host, *_ = (check_endpoint(each, encrypted=bundle is not None) for each in (endpoint, *routers))
     if bundle is None and _reachable(host) and not trusted:
         raise ConfigError(
             f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
@@ -230,21 +233,21 @@ def router_settings(
         )
     secured = {} if bundle is None else {**bundle.listening(), "access_control": access_control(farm, bundle.roster())}
     settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
-    if dial:
-        settings |= {"connect/endpoints": list(dial), **_RETRY, **({} if bundle is None else bundle.dialling())}
+    if routers:
+        settings |= {"connect/endpoints": list(routers), **_RETRY, **({} if bundle is None else bundle.connecting())}
     return settings
 
 
 @contextmanager
 def listen(
-    endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, dial: tuple[str, ...] = ()
+    endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = ()
 ) -> Iterator[Session]:
     """A session that is the farm's rendezvous itself; for the arguments see `router_settings`.
 
     Raises:
       ConfigError: an endpoint is malformed, open to other machines without certificates, or its port in use.
     """
-    settings = router_settings(endpoint, farm, bundle, trusted=trusted, dial=dial)
+    settings = router_settings(endpoint, farm, bundle, trusted=trusted, routers=routers)
     try:
         session = _open(settings)
     except zenoh.ZError as error:
@@ -274,10 +277,10 @@ def _raise_descriptors() -> None:
 def connect(
     endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None
 ) -> Iterator[Session]:
-    """A session that dials a learner or a router, and keeps trying.
+    """A session that connects a learner or a router, and keeps trying.
 
     Args:
-      endpoints: where to dial; any one that answers will do.
+      endpoints: where to connect; any one that answers will do.
       bundle: our certificates, for tls endpoints.
       timeout: give up after [s]; None for never.
       stopped: asked between tries, true ends them.
@@ -289,12 +292,12 @@ def connect(
         check_endpoint(endpoint, encrypted=bundle is not None)
     settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
     if bundle is not None:
-        settings |= bundle.dialling()
-    with _closing(_dial(settings, ", ".join(endpoints), timeout, stopped)) as opened:
+        settings |= bundle.connecting()
+    with _closing(_try(settings, ", ".join(endpoints), timeout, stopped)) as opened:
         yield opened
 
 
-def _dial(
+def _try(
     settings: Mapping[str, object], where: str, timeout: float | None, stopped: Callable[[], bool]
 ) -> zenoh.Session:
     # A refused handshake looks like nobody: Zenoh does not say why.

@@ -1,6 +1,6 @@
 """What is known of a generation that is over; one line of progress.jsonl. Pure."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, Final, cast
 
 VERSION: Final = 2
@@ -56,7 +56,7 @@ class GenerationStats:
 
     def to_dict(self) -> dict[str, Any]:
         """As it stands in progress.jsonl."""
-        return {"version": VERSION, **asdict(self)}
+        return {"version": VERSION, **vars(self)}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "GenerationStats":

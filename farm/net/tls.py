@@ -47,7 +47,7 @@ class Bundle:
     """Names and addresses that the learner's certificate is for; empty where the bundle does not tell."""
 
     def listening(self) -> dict[str, object]:
-        """Zenoh's settings for a session that is dialled."""
+        """Zenoh's settings for a session that listens."""
         return {
             "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
             "transport/link/tls/listen_certificate": str(self.folder / "cert.pem"),
@@ -56,8 +56,8 @@ class Bundle:
             "transport/link/tls/close_link_on_expiration": True,
         }
 
-    def dialling(self) -> dict[str, object]:
-        """Zenoh's settings for a session that dials."""
+    def connecting(self) -> dict[str, object]:
+        """Zenoh's settings for a session that connects."""
         return {
             "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
             "transport/link/tls/connect_certificate": str(self.folder / "cert.pem"),
@@ -137,7 +137,7 @@ def private(key: Path) -> None:
 
 
 def access_control(farm: str, roster: Roster) -> dict[str, Any]:
-    """Zenoh's access control for the session that others dial: all is denied that is not said here."""
+    """Zenoh's access control for the session that others connect to: all is denied that is not said here."""
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []

@@ -115,7 +115,7 @@ class Jobs:
         """Which jobs are around the mean, (J,)."""
         return self.table[:, _AROUND] != 0
 
-    @property
+    @cached_property
     def rollouts(self) -> IntArray:
         """How many each job has, (J,)."""
         return np.count_nonzero(self.table[:, _SIGN], axis=1)
@@ -139,9 +139,13 @@ class Jobs:
         """Parameters of each rollout around a mean (P,): origin + sign * eps, (S, P)."""
         origin = np.where(self.table[:, _AROUND, None] != 0, mu, 0.0)
         rows = np.repeat(np.arange(len(self)), self.rollouts)
-        signs = self.table[:, _SIGN][self.table[:, _SIGN] != 0]
+        signs = self.table[:, _SIGN]
+        signs = signs[signs != 0]
         out = origin[rows]
         explores = self.table[rows, _EXPLORES] != 0
+        if explores.all():  # as they do in most chunks
+            out += signs[:, None] * self.eps[rows]
+            return out
         if not explores.any():  # eps may have no columns then
             return out
         at = np.cumsum(self.table[:, _EXPLORES]) - 1  # of each job's eps

@@ -40,7 +40,7 @@ class Policy:
 
     @classmethod
     def draw(cls, config: PolicyConfig, spec: TaskSpec, rng: np.random.Generator) -> dict[str, FloatArray]:  # noqa: ARG003
-        """Constants of a run, by name: drawn once, and carried with the run and its messages."""
+        """Constants of a run, by name: drawn once, then stored and sent with the run."""
         return {}
 
     @property
@@ -49,7 +49,7 @@ class Policy:
         raise NotImplementedError
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """What of the parameters (B, P) does not change during a rollout, (B, ...)."""
+        """Compute what does not change during a rollout from parameters (B, P); (B, ...)."""
         return theta
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -66,7 +66,7 @@ class Policy:
 
 
 def check_constants(constants: Mapping[str, FloatArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """See that a run's constants fit its task.
+    """Check that a run's constants fit its task.
 
     Raises:
       UnservedError: one is missing or has another shape.

@@ -2,10 +2,10 @@
 
 One action a_i for each of A controlled joints or actuators:
 
-    direct     a_i = theta_i . z(x)                      D parameters an action (thesis 3.7)
-    projected  a_i = z(theta_i) . z(x)                   d parameters an action (thesis 3.8)
-    kernel     a_i = exp(-|theta_i - x|^2 / (2 h^2))     d parameters an action: the limit D -> infinity of `projected`
-    cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters an action (thesis 5.2, future work)
+    direct     a_i = theta_i . z(x)                      D parameters per action (thesis 3.7)
+    projected  a_i = z(theta_i) . z(x)                   d parameters per action (thesis 3.8)
+    kernel     a_i = exp(-|theta_i - x|^2 / (2 h^2))     d parameters per action: the limit D -> infinity of `projected`
+    cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters per action (thesis 5.2, future work)
 
     z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
 

@@ -52,7 +52,7 @@ class Linear(Policy):
 
     @property
     def _sizes(self) -> tuple[int, ...]:
-        """Numbers that each layer takes, and those that the last gives."""
+        """Number of inputs of each layer, and of outputs of the last."""
         return self.spec.observation, self.spec.action
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -77,7 +77,7 @@ class Linear(Policy):
 
 
 class Constant(Linear):
-    """The same action always, whatever is seen: what a controller with senses has to beat."""
+    """The same action always, whatever is observed; a controller that sees the state should beat it."""
 
     @property
     def _sizes(self) -> tuple[int, ...]:

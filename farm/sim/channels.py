@@ -1,6 +1,8 @@
-"""What a rollout shows besides its bodies, and where it is seen from. Pure."""
+"""What a rollout shows in addition to its bodies, and where it is seen from. Pure."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from farm.arrays import FloatArray
@@ -11,7 +13,7 @@ Kind = Literal["scalars", "flags", "images", "arrows", "points"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channel:
-    """Something that a rollout shows besides its bodies: n curves, pictures, arrows or points in each frame."""
+    """Something that a rollout shows in addition to its bodies: n curves, pictures, arrows or points in each frame."""
 
     name: str
     """Its place in recordings, for example `contacts/force`."""
@@ -43,8 +45,10 @@ class Channel:
     """Longer arrows are cut here [m]."""
     geoms: tuple[str, ...] = ()
     """Geometries that a video paints by these n scalars: white at 0, their colour from `top` on."""
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Least and greatest value that is allowed, by label: constant lines beside those scalars [unit]."""
     trace: bool = False
-    """Whether it travels with results: of the best and the worst rollout of a generation, or of all."""
+    """Whether its values are sent with results: of the best and the worst rollout of a generation, or of all."""
 
     def __post_init__(self) -> None:
         sizes = {"scalars": 1, "flags": 1, "images": 3, "arrows": 2, "points": 2}
@@ -56,6 +60,22 @@ class Channel:
         for what in ("labels", "colours", "bodies", "geoms"):
             if len(getattr(self, what)) not in (0, self.shape[0]):
                 raise ConfigError(f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}")
+
+        for label, limits in self.limits.items():
+            two = (
+                isinstance(limits, (tuple, list))
+                and len(limits) == 2
+                and all(isinstance(each, (int, float)) for each in limits)
+            )
+            if (
+                self.kind != "scalars"
+                or label not in self.names
+                or not (two and -math.inf < limits[0] < limits[1] < math.inf)
+            ):
+                raise ConfigError(
+                    f"channel {self.name}: limits {limits!r} of {label!r}; expected two rising finite numbers for "
+                    f"scalars, by label: {', '.join(self.names)}"
+                )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -59,7 +59,7 @@ class BatchEngine:
 
     @contextmanager
     def _surviving(self) -> Iterator[None]:
-        """Rows in which MuJoCo itself raised count as blown up, the others go on."""
+        """Rows in which MuJoCo itself raised an error count as blown up; the other rows continue."""
         try:
             yield
         except mujoco.batch.SimulationError as error:
@@ -92,7 +92,7 @@ class BatchEngine:
         return self._batch.expand(name)
 
     def set_const(self, ids: IntArray) -> None:
-        """Have derived constants follow."""
+        """Update derived constants."""
         self._batch.set_const(ids)
 
     def close(self) -> None:
@@ -100,7 +100,7 @@ class BatchEngine:
 
 
 class DataEngine:
-    """One simulation in an MjData, stepped by whoever shows it."""
+    """One simulation in an MjData, for viewers."""
 
     size = 1
 
@@ -108,7 +108,7 @@ class DataEngine:
         self.model = model
         self.data = mujoco.MjData(model)
         self.pace: Callable[[], bool] | None = None
-        """Advances it by a physics step, and says whether to go on; without: `mj_step`."""
+        """Advances it by a physics step, and says whether to continue; without it: `mj_step`."""
         self.over = False
         """Whether `pace` said that it is enough."""
 
@@ -162,7 +162,7 @@ class DataEngine:
         return np.asarray(own_value(self.model, name))[None]
 
     def set_const(self, ids: IntArray) -> None:  # noqa: ARG002
-        """Have derived constants follow."""
+        """Update derived constants."""
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 
     def close(self) -> None:

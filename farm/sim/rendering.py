@@ -70,7 +70,7 @@ def pictures(
 
 
 def beside(scene: Scene) -> Camera:
-    """Camera of a scene that has none of its own: beside what moves, or the middle of a scene where nothing does."""
+    """The camera of a scene without one: beside what moves, or at the middle of the scene if nothing does."""
     x, y, z = scene.model.stat.center.tolist() if scene.mover is None else scene.mover.centre
     return Camera(lookat=(x, y, z), distance=AWAY * scene.radius, azimuth=BESIDE[0], elevation=BESIDE[1])
 
@@ -114,7 +114,7 @@ def aimed(view: mujoco.MjvCamera, camera: Camera) -> mujoco.MjvCamera:
 
 
 def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
-    """Put a wall in complete fog behind the scene: a compiled model takes no new sky, and without one it is black."""
+    """Put a wall in complete fog behind the scene: a compiled model takes no new sky, and without a sky it is black."""
     for flag, on in (("FOG", 1), ("SKYBOX", 0), ("HAZE", 0), ("REFLECTION", 0)):  # a floor would mirror the wall
         scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = on
     view = scene.camera[0]

@@ -1,14 +1,14 @@
-"""A compiled MuJoCo model, and what of it is drawn; a door to mujoco."""
+"""A compiled MuJoCo model, and the parts of it that are drawn."""
 
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray
+from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, brief
 
 BESIDE: Final = (106.0, -25.0)
@@ -24,16 +24,18 @@ _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
+_GROUPS: Final = 3  # MuJoCo's viewers hide the groups from this one on: mostly what only collides
 _UNPAINTED: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geometry that was given none
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """One primitive to draw, fixed to a body.
+    """One primitive or mesh to draw, fixed to a body.
 
     Sizes are MuJoCo's: sphere (r), capsule and cylinder (r, half length along z), box and ellipsoid (half sizes),
-    plane (half sizes along x and y, 0 for endless) [m].
+    plane (half sizes along x and y, 0 for endless), mesh (half sizes of the box around it) [m].
     """
 
     name: str
@@ -45,6 +47,10 @@ class Geometry:
     """Orientation in the body, wxyz."""
     colour: tuple[float, ...]
     """RGBA in [0, 1]."""
+    vertices: FloatArray | None = None
+    """Of a mesh, before it is turned and placed [m], (V, 3)."""
+    faces: IntArray | None = None
+    """Its triangles, rows of `vertices`, (F, 3)."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,7 @@ class Scene:
 
     @cached_property
     def mover(self) -> Mover | None:
-        """What moves; None where nothing does."""
+        """The moving bodies; None if nothing moves."""
         model, data = self.model, mujoco.MjData(self.model)
         mujoco.mj_kinematics(model, data)
         geoms = np.flatnonzero(self._moving[model.geom_bodyid])
@@ -92,23 +98,23 @@ class Scene:
 
     @property
     def radius(self) -> float:
-        """Radius of what moves, or of the scene where nothing does [m]."""
+        """Radius of what moves, or of the whole scene if nothing does [m]."""
         return float(self.model.stat.extent) if self.mover is None else self.mover.radius
 
     @cached_property
     def free(self) -> str | None:
-        """The first drawn body that hangs on nothing, an object say; None where there is none."""
+        """The first drawn body without a parent, such as an object; None if there is none."""
         joints = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         bodies = [int(body) for body in self.model.jnt_bodyid[joints] if body in self._drawn]
         return self.bodies[self._drawn.index(bodies[0])] if bodies else None
 
     @property
     def left_out(self) -> int:
-        """Number of geometries that are not drawn: meshes and height fields."""
+        """Number of geometries that cannot be drawn: height fields and signed distance fields."""
         return sum(int(kind) not in _SHAPES for kind in self.model.geom_type)
 
     def index(self, body: str) -> int:
-        """Index among `bodies` of the body with this name in the model; a ConfigError where it has no geometry."""
+        """Index among `bodies` of the body with this name in the model; a ConfigError if it has no geometry."""
         name = _name(body, body)
         if name not in self.bodies:
             raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
@@ -132,9 +138,12 @@ class Scene:
         return out
 
     def geometries(self) -> list[Geometry]:
-        """Every primitive to draw; meshes and height fields are left out."""
+        """Everything to draw: primitives and meshes of the groups that MuJoCo's viewers show."""
         bodies = dict(zip(self._drawn, self.bodies, strict=True))
-        geoms = [self.model.geom(i) for i in range(self.model.ngeom) if int(self.model.geom_type[i]) in _SHAPES]
+        model = self.model
+        known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
+        shown = [i for i in known if model.geom_group[i] < _GROUPS] or known  # rather the hidden ones than nothing
+        geoms = [model.geom(i) for i in shown]
         return [
             Geometry(
                 name=_name(geom.name, f"geom_{geom.id}"),
@@ -144,9 +153,21 @@ class Scene:
                 position=tuple(geom.pos.tolist()),
                 quaternion=tuple(geom.quat.tolist()),
                 colour=tuple(self._colour(geom.id).tolist()),
+                **self._mesh(geom.id),
             )
             for geom in geoms
         ]
+
+    def _mesh(self, i: int) -> dict[str, Any]:
+        """A geometry's vertices and faces, if it is a mesh."""
+        model, mesh = self.model, int(self.model.geom_dataid[i])
+        if model.geom_type[i] != mujoco.mjtGeom.mjGEOM_MESH:
+            return {}
+        vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+        return {
+            "vertices": model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])].astype(float),
+            "faces": model.mesh_face[face : face + int(model.mesh_facenum[mesh])].astype(int),
+        }
 
     def _colour(self, i: int) -> FloatArray:
         """A geometry's own colour, else its material's, as MuJoCo's renderer has it (4,)."""
@@ -191,5 +212,5 @@ def quiet() -> None:
 
 
 def _name(given: str, fallback: str) -> str:
-    """A name that can stand in a path: models name things as they like, or not at all."""
+    """A name that can be part of a path; models may use any name, or none."""
     return re.sub(r"[^\w.-]", "_", given, flags=re.ASCII) or fallback

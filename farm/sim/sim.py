@@ -63,7 +63,7 @@ class Engine(Protocol):
         """A field of the model with values for each row, live, (size, ...)."""
 
     def set_const(self, ids: IntArray) -> None:
-        """Have derived constants follow what was written into expanded fields."""
+        """Update derived constants after writes to expanded fields."""
 
     def close(self) -> None:
         """Give back what it holds."""
@@ -91,7 +91,7 @@ class Sim:
         """Take an engine; `begin` comes next."""
         self.engine = engine
         self.own: dict[str, AnyArray] = {}
-        """What the task remembers of each rollout, (B, ...); follows them as others end."""
+        """What the task remembers of each rollout, (B, ...); rows stay with their rollouts when other rollouts end."""
         self.t = 0
         """Control steps done."""
         self._ids: IntArray = np.arange(0)
@@ -233,7 +233,7 @@ class Sim:
         self._now, self._source, self._stepped = {}, None, True
 
     def _constants(self) -> None:
-        """Have derived constants follow, if somebody may have written what they depend on."""
+        """Update derived constants if what they depend on may have been written."""
         if self._dirty:
             self.engine.set_const(self._ids)
             self._dirty = False

@@ -30,7 +30,7 @@ class Trajectory:
     value: float
     """The rollout's return"""
     success: bool | None
-    """Whether it succeeded; None where the task knows no success"""
+    """Whether it succeeded; None if the task does not define success"""
 
     def arrays(self) -> dict[str, FloatArray]:
         """Every array over the frames but the times: bodies, actions, terms, then `channels/NAME`."""

@@ -1,4 +1,4 @@
-"""Pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg; an extra, and the only door to both."""
+"""Writes pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg; the only module that imports these."""
 
 import importlib.util
 import math
@@ -56,7 +56,7 @@ def tiled(pictures: Sequence[Picture]) -> Picture:
 
 
 def write(path: Path, pictures: Iterable[Picture]) -> None:
-    """Write a video; the suffix says of which kind. A file that is there is replaced.
+    """Write a video; the suffix chooses its kind. An existing file is replaced.
 
     Raises:
       RunError: the file cannot be written.

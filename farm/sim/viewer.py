@@ -1,4 +1,4 @@
-"""A task in MuJoCo's interactive viewer, in real time; a door to mujoco."""
+"""A task in MuJoCo's interactive viewer, in real time."""
 
 import threading
 import time

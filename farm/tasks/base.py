@@ -29,9 +29,9 @@ class TaskConfig(Settings):
     gamma: float = setting(1.0, above=0.0, most=1.0)
     """Discount factor of the return, per control step."""
     perturb: bool = True
-    """Train on random starts and conditions (both rollouts of a pair alike)."""
+    """Train with random starts and conditions (the same for both rollouts of a pair)."""
     reward_offset: float = setting(0.0, least=-1e6, most=1e6)
-    """Added to the reward of every control step that is learnt from: -1 takes off a bonus of 1 for not falling."""
+    """Added to the reward of every control step, for learning only: -1 removes a bonus of 1 for not falling."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,7 +49,7 @@ class TaskSpec:
     terms: tuple[str, ...] = ("reward",)
     """What a reward is made of."""
     success: bool = False
-    """Whether a rollout succeeds or does not; else there are returns alone."""
+    """Whether a rollout can succeed; otherwise there are only returns."""
     channels: tuple[Channel, ...] = ()
     """What a rollout shows."""
     release: str = ""
@@ -62,12 +62,12 @@ class TaskSpec:
 
     @property
     def traced(self) -> tuple[Channel, ...]:
-        """The channels that travel with results."""
+        """The channels whose values are sent with results."""
         return tuple(channel for channel in self.channels if channel.trace)
 
     @property
     def trace(self) -> tuple[int, int]:
-        """Shape of a rollout's trace: control steps, and numbers of each (0 where nothing travels)."""
+        """Shape of a rollout's trace: control steps, and numbers per step (0 if there are no traced channels)."""
         return self.steps, sum(int(np.prod(channel.shape)) for channel in self.traced)
 
 
@@ -94,16 +94,16 @@ class Score:
     terms: FloatArray
     """Reward terms, zero after the end, (B, T, K)"""
     success: BoolArray | None = None
-    """(B,), None where the task knows no success"""
+    """(B,), None if the task does not define success"""
 
 
 class Task:
-    """A task: what is simulated, what a policy sees and does, and what that is worth.
+    """A task: what is simulated, what a policy sees and does, and its reward.
 
-    A subclass says as little as it needs: `xml` and `reward` are enough. Everything is batched: B rollouts at a time,
-    whose numbers must not depend on each other. `sim` is the batch as named live arrays (`farm.sim.sim.Sim`): a task
-    sees nothing else of a simulator. The object holds no state of a rollout; what must be remembered lives in
-    `sim.own`, arrays (B, ...) that follow the rollouts as others end.
+    `xml` and `reward` are enough for a subclass. Everything is batched: B rollouts at a time, whose numbers must not
+    depend on each other. `sim` is the batch as named live arrays (`farm.sim.sim.Sim`); a task sees nothing else of a
+    simulator. The object holds no state of a rollout. What must be remembered is kept in `sim.own`, arrays (B, ...)
+    whose rows stay with their rollouts when other rollouts end.
     """
 
     Config: ClassVar[type[TaskConfig]] = TaskConfig
@@ -115,11 +115,11 @@ class Task:
     substeps: int = 1
     """Physics steps in each."""
     channels: tuple[Channel, ...] = ()
-    """What a rollout shows besides bodies, actions and reward terms."""
+    """What a rollout shows in addition to bodies, actions and reward terms."""
     camera: Camera | None = None
     """Where pictures are taken from; without: from beside what moves."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"default": {}}
-    """Settings that runs begin with, by preset and flag; the first is the one that is taken unless told otherwise."""
+    """Settings that runs start from, by preset and flag; the first preset is the default."""
     return_scale: float = 1.0
     """Factor of the return."""
     parts: tuple[int, ...] = ()
@@ -127,14 +127,14 @@ class Task:
     ends: tuple[str, str] | None = None
     """Names of where rollouts begin and of where they should end; with `reached` and `lost` they can be chained."""
     ending: ClassVar[str] = "ended"
-    """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` where it is "dropped"."""
+    """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` if it is "dropped"."""
     takes: ClassVar[str] = ""
-    """What stands behind a colon in the task's name, for tasks that are many: `--task gym:NAME`."""
+    """What the part after the colon in the task's name means, for tasks with variants: `--task gym:NAME`."""
 
     def __init__(
         self, config: TaskConfig | None = None, variant: str = "", files: Mapping[str, str] | None = None
     ) -> None:
-        """Take settings, the name behind the colon, and the texts that a run carries (without: this machine's)."""
+        """Take settings, the name after the colon, and the run's texts (by default this machine's)."""
         self.config: Any = self.Config() if config is None else config
         self.variant = variant
         if self.config.steps:
@@ -145,7 +145,7 @@ class Task:
     # What is simulated
 
     def files(self) -> dict[str, str]:
-        """Texts that decide numbers and travel with a run, by name."""
+        """Texts that decide numbers and are sent with a run, by name."""
         return {"model.xml": self.xml} if self.xml else {}
 
     @property
@@ -202,7 +202,7 @@ class Task:
         return None
 
     def success(self, sim: "Sim") -> BoolArray | None:  # noqa: ARG002
-        """Which rollouts, ending here, succeeded, (B,); None where there is no success."""
+        """Which of the rollouts that end here succeeded, (B,); None if success is not defined."""
         return None
 
     def reached(self, sim: "Sim") -> BoolArray:
@@ -228,14 +228,14 @@ class Task:
         return {channel.name: frames[channel.name] for channel in self.channels}
 
     def exported(self) -> dict[str, Any]:
-        """What an exported policy needs besides model, policy and start: arrays, numbers and texts, by name."""
+        """What an exported policy needs in addition to model, policy and start: arrays, numbers and texts, by name."""
         return {}
 
     # What others know of it
 
     @property
     def limits(self) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest control of each actuator, (nu,) each; -1 and 1 where it has no range."""
+        """Smallest and largest control of each actuator, (nu,) each; -1 and 1 if it has no range."""
         limited = self.model.actuator_ctrllimited.astype(bool)
         low, high = self.model.actuator_ctrlrange.T
         return np.where(limited, low, -1.0), np.where(limited, high, 1.0)

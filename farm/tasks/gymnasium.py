@@ -66,7 +66,7 @@ class EnvironmentConfig(TaskConfig):
 
 
 def _argument(said: object) -> tuple[str, Any]:
-    """Name and value of NAME=VALUE."""
+    """Name and value in NAME=VALUE."""
     name, equals, text = said.partition("=") if isinstance(said, str) else ("", "", "")
     if not (name.isidentifier() and equals):
         raise ConfigError(
@@ -96,7 +96,7 @@ class Environment(Task):
     }  # fmt: skip
 
     def __init__(self, config: Any = None, variant: str = "", files: Mapping[str, str] | None = None) -> None:  # noqa: ANN401
-        """Check the environment's name, and look at its spaces.
+        """Check the environment's name and its spaces.
 
         Raises:
           ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
@@ -137,7 +137,7 @@ class Environment(Task):
 
     @property
     def limits(self) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest action, (A,) each."""
+        """Smallest and largest action, (A,) each."""
         space: Any = self._first.action_space
         return space.low.astype(float), space.high.astype(float)
 
@@ -147,7 +147,7 @@ class Environment(Task):
         return float(self._first.unwrapped.dt)  # type: ignore[attr-defined]
 
     def spec(self) -> TaskSpec:
-        """What the environment's spaces say."""
+        """The sizes of the environment's spaces."""
         import gymnasium
 
         space: Any = self._first.observation_space
@@ -157,7 +157,7 @@ class Environment(Task):
         )  # fmt: skip
 
     def engine(self, backend: MakeEngine) -> Engine:
-        """The backend's, or environments that step themselves."""
+        """The backend's engine, or one of environments that step themselves."""
         if self.batched is not None:
             return backend(self.model)
         return EnvironmentEngine(self.variant, **self.config.arguments)
@@ -197,7 +197,7 @@ class Environment(Task):
 
 
 def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN401  whatever it takes
-    """The environment of that name, made with these arguments, without a time limit of its own.
+    """The environment of this name, made with these arguments, without its own time limit.
 
     Raises:
       ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
@@ -232,7 +232,7 @@ class EnvironmentEngine:
     """Environments side by side, one for each row; each steps its own simulation."""
 
     def __init__(self, name: str, **arguments: Any) -> None:  # noqa: ANN401  whatever an environment takes
-        """Make the first; others follow as they are needed."""
+        """Make the first environment; more are made as they are needed."""
         self.size = _ROWS
         self._name, self._arguments = name, arguments
         self._envs = [make(name, **arguments)]
@@ -280,11 +280,11 @@ class EnvironmentEngine:
         self._fields["reward"][row], self._fields["terminated"][row] = reward, terminated
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:
-        """Environments are stepped by actions alone."""
+        """Environments are stepped by actions only."""
         raise NotImplementedError
 
     def forward(self, ids: IntArray) -> None:
-        """An environment's outputs are there after each step."""
+        """An environment's outputs are available after each step."""
 
     def copy(self, sources: IntArray) -> None:
         """Reset row i with the seed of row sources[i]."""
@@ -307,7 +307,7 @@ class EnvironmentEngine:
         raise NotImplementedError(name)
 
     def set_const(self, ids: IntArray) -> None:
-        """There is nothing to follow."""
+        """There are no derived constants."""
 
     def close(self) -> None:
         """Close the environments."""
@@ -324,5 +324,5 @@ def reset_seed(rng: np.random.Generator | None) -> int:
 
 
 def blown_up(env: Any) -> bool:  # noqa: ANN401  an unwrapped environment
-    """Whether MuJoCo met numbers out of bounds since the last reset (it goes on from the start, as if nothing were)."""
+    """Whether MuJoCo met numbers out of bounds since the last reset (it then silently restarts from the start)."""
     return any(env.data.warning[kind].number for kind in _UNSTABLE)

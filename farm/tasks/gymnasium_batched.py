@@ -20,7 +20,7 @@ class Batched:
     """What an environment adds to its physics; B rollouts."""
 
     hidden = 0
-    """Positions that an observation leaves out, unless it is told not to."""
+    """Positions that an observation leaves out by default."""
     most = np.inf
     """Limit of the observed velocities."""
     normal = False
@@ -81,7 +81,7 @@ class Walker2d(Batched):
     hidden, most = 1, 10.0
 
     def healthy(self, sim: Sim) -> BoolArray:
-        """Where it stands, (B,)."""
+        """Which rollouts stand, (B,)."""
         return _within(sim.qpos[:, 1], self.env._healthy_z_range) & _within(
             sim.qpos[:, 2], self.env._healthy_angle_range
         )
@@ -101,7 +101,7 @@ class Hopper(Walker2d):
     """Hopper-v5."""
 
     def healthy(self, sim: Sim) -> BoolArray:
-        """Where it stands, and no other number is out of range."""
+        """Which rollouts stand with no other number out of range."""
         others = np.concatenate([sim.qpos, sim.qvel], axis=1)[:, 2:]
         return super().healthy(sim) & _within(others, self.env._healthy_state_range).all(axis=1)
 
@@ -141,7 +141,7 @@ class Ant(Batched):
         )
 
     def healthy(self, sim: Sim) -> BoolArray:
-        """Where it stands, and every number is finite."""
+        """Which rollouts stand with all numbers finite."""
         low, high = self.env._healthy_z_range
         finite = np.isfinite(sim.qpos).all(axis=1) & np.isfinite(sim.qvel).all(axis=1)
         return finite & (low <= sim.qpos[:, 2]) & (sim.qpos[:, 2] <= high)
@@ -195,7 +195,7 @@ class Humanoid(Ant):
         return gained - (env._ctrl_cost_weight * self.effort(sim) + touch)
 
     def healthy(self, sim: Sim) -> BoolArray:
-        """Where it stands."""
+        """Which rollouts stand."""
         return _within(sim.qpos[:, 2], self.env._healthy_z_range)
 
 
@@ -203,7 +203,7 @@ class InvertedPendulum(Batched):
     """InvertedPendulum-v5."""
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
-        """1 where it stands."""
+        """1 for rollouts that stand."""
         return (~self.ended(sim)).astype(float)
 
     def ended(self, sim: Sim) -> BoolArray:
@@ -338,7 +338,7 @@ _CLASSES: Final[Mapping[str, type[Batched]]] = {
 
 
 def batched(env: Any) -> Batched | None:  # noqa: ANN401  as gymnasium.make gives it
-    """What stands for an environment in a batch; None where nothing does."""
+    """The batched form of an environment; None if there is none."""
     own = type(env.unwrapped)
     made = _CLASSES.get(f"{own.__module__}.{own.__name__}".removeprefix("gymnasium.envs.mujoco."))
     return None if made is None or env.spec.additional_wrappers else made(env.unwrapped)

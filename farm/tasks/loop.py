@@ -1,4 +1,4 @@
-"""The closed loop: observe, act, step, reward. There is no other.
+"""The closed loop: observe, act, step, reward. All rollouts use it.
 
 A rollout's numbers depend on (task, policy parameters, seed) alone: not on the other rollouts of its batch, their
 order, or threads. They equal, bit for bit, those of one rollout at a time in a plain `mj_step` loop.
@@ -47,7 +47,7 @@ class Rollouts:
     returns: FloatArray
     """(B,)"""
     success: BoolArray
-    """(B,); false where the task knows no success"""
+    """(B,); false if the task does not define success"""
     ended: BoolArray
     """(B,) the task ended it before its last step."""
     failed: BoolArray
@@ -83,7 +83,7 @@ class Rollouts:
 
 
 class Batch:
-    """Rollouts of one task that are stepped together, whoever decides the actions."""
+    """Rollouts of one task that are stepped together, whatever decides the actions."""
 
     def __init__(self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0) -> None:
         """Bring them to their starts; rollouts of equal seeds share one.
@@ -323,7 +323,7 @@ def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
 
 
 def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> AnyArray:
-    """What travels of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
+    """The traces of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
     if not spec.traced or not len(rows):
         return np.zeros((len(rows), *spec.trace), dtype="<f4")
     values = flat(spec.traced, task.show({name: frames[rows] for name, frames in rollouts.frames.items()}))
@@ -332,7 +332,7 @@ def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> An
 
 
 def probe(task: Task) -> TaskSpec:
-    """What others must know of a task, found by one control step of one rollout.
+    """What both sides must know of a task, found by one control step of one rollout.
 
     Raises:
       ConfigError: the class cannot be a task.
@@ -403,7 +403,7 @@ def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
 
 
 def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa: ANN401  whatever a task gave
-    """The values, if they are an array of that shape.
+    """The values, if they are an array of this shape.
 
     Raises:
       TaskError: they are not; names the array, what came and what was expected.

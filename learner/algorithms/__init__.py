@@ -36,7 +36,7 @@ class Algorithm(Protocol[State]):
         ...
 
     def restore(self, values: Mapping[str, StateValue]) -> State:
-        """Return the state that its `to_dict` told; ValueError names a wrong key."""
+        """Return the state that its `to_dict` gave; a ValueError names a wrong key."""
         ...
 
     def ask(self, state: State, rng: np.random.Generator) -> FloatArray:

@@ -22,16 +22,16 @@ from learner.algorithms.state import SearchState, finite_rows, moved
 
 @dataclass(frozen=True, kw_only=True)
 class ARS(Mirrored):
-    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+    """Augmented random search: steps along the best of random directions (Mania 2018)."""
 
     pairs: int = setting(16, least=1)
-    """Directions a generation, N: a pair of rollouts each."""
+    """Directions per generation, N; each is a pair of rollouts."""
     top: int | None = setting(None, least=1)
-    """How many of them are used, b; None: half, rounded up."""
+    """Number of directions that are used, b; by default half of them, rounded up."""
     learning_rate_mu: float = setting(0.02, least=0.0)
     """Step size, alpha."""
     initial_sigma: float = setting(0.03, above=0.0)
-    """Standard deviation of the exploration, nu; it never changes."""
+    """Standard deviation of the exploration, nu; it stays constant."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -40,7 +40,7 @@ class ARS(Mirrored):
             raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")
 
     def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
-        """Return the state after one update; where all used returns are equal mu stays.
+        """Return the state after one update; if all used returns are equal, mu stays.
 
         Args:
           state: the state `eps` was drawn from.

@@ -46,10 +46,10 @@ class CMAState(SearchState):
 
 @dataclass(frozen=True, kw_only=True)
 class CMAES(Settings):
-    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+    """CMA-ES with a full covariance, by the library cmaes (Hansen 2016)."""
 
     population: int = setting(20, least=4)
-    """Rollouts a generation."""
+    """Rollouts per generation."""
     initial_mu: float = setting(0.0, least=-1e30, most=1e30)
     """First mean of every parameter."""
     initial_sigma: float = setting(1.0, above=0.0)
@@ -75,10 +75,10 @@ class CMAES(Settings):
         return CMAState(**self._read(begun))
 
     def restore(self, values: Mapping[str, StateValue]) -> CMAState:
-        """Return the state that `to_dict` told."""
+        """Return the state that `to_dict` gave."""
         state = CMAState.from_dict(values)
         if state.covariance.size != self._entries(state.mu.size):
-            raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self._name} has not")
+            raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self._name} does not have")
         return state
 
     def ask(self, state: CMAState, rng: np.random.Generator) -> FloatArray:
@@ -115,11 +115,11 @@ class CMAES(Settings):
         return "cma-es"
 
     def _sizes(self) -> tuple[int, int]:
-        """Least and greatest number of parameters."""
+        """Smallest and largest number of parameters."""
         return 1, _LARGEST
 
     def _entries(self, size: int) -> int:
-        """Numbers that the covariance of so many parameters is."""
+        """Number of values that store the covariance of this number of parameters."""
         return size * (size + 1) // 2
 
     def _library(self) -> Any:  # noqa: ANN401  a class of the library's

@@ -70,12 +70,12 @@ def plain_contrast(middle: FloatArray, baseline: float) -> FloatArray:
 
 
 def level(best: float, baseline: float) -> bool:
-    """Say whether m = b up to the rounding of b, beyond which (r - b) / (m - b) is but noise."""
+    """Whether m = b up to the rounding of b; then (r - b) / (m - b) would be only noise."""
     return abs(best - baseline) <= _ROUNDING * max(abs(best), abs(baseline))
 
 
 def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Divide; where either vanishes the result is 0."""
+    """Divide; the result is 0 if either vanishes."""
     wanted = (numerator != 0.0) & (denominator != 0.0)
     return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=wanted)
 

@@ -18,7 +18,7 @@ class Mirrored(Settings):
     """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns (a subclass's)."""
 
     pairs: int = setting(16, least=1)
-    """Pairs of rollouts a generation, N."""
+    """Pairs of rollouts per generation, N."""
     initial_mu: float = 0.0
     """First mean of every parameter."""
     initial_sigma: float = setting(1.0, above=0.0)
@@ -33,7 +33,7 @@ class Mirrored(Settings):
         return SearchState(mu=np.full(size, float(self.initial_mu)), sigma=np.full(size, float(self.initial_sigma)))
 
     def restore(self, values: Mapping[str, StateValue]) -> SearchState:
-        """Return the state that `to_dict` told."""
+        """Return the state that `to_dict` gave."""
         return SearchState.from_dict(values)
 
     def ask(self, state: SearchState, rng: np.random.Generator) -> FloatArray:

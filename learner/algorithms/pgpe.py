@@ -44,7 +44,7 @@ class PGPEState(SearchState):
     """The search distribution, and what the optimiser of mu remembers."""
 
     velocity: FloatArray = field(default_factory=_empty)
-    """ClipUp's velocity, (P,), or empty where it is not used."""
+    """ClipUp's velocity, (P,), or empty if it is not used."""
     first_moment: FloatArray = field(default_factory=_empty)
     """Adam's running mean of the gradient, (P,), or empty."""
     second_moment: FloatArray = field(default_factory=_empty)
@@ -53,10 +53,10 @@ class PGPEState(SearchState):
 
 @dataclass(frozen=True, kw_only=True)
 class PGPE(Settings):
-    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+    """Policy gradients with parameter-based exploration: rollouts of mu + eps and mu - eps (Sehnke 2010)."""
 
     pairs: int = setting(15, least=1)
-    """Pairs of rollouts a generation, N: 2N rollouts with either estimator."""
+    """Pairs of rollouts per generation, N: 2N rollouts with either estimator."""
     estimator: Literal["symmetric", "plain"] = "symmetric"
     """Pairs mu + eps and mu - eps, or 2N single rollouts mu + eps (Plage 2016, eq. 3.1)."""
     normaliser: Normaliser = "sehnke"
@@ -64,9 +64,10 @@ class PGPE(Settings):
     baseline: Literal["moving-average", "optimal", "none"] = "moving-average"
     """Return that counts as neither good nor bad: 0.9 b + 0.1 mean, least variance, or 0."""
     sigma_rule: SigmaRule = "positive"
-    """Sigma learns from better than the baseline only, from both but capped, or from both."""
+    """positive: only returns above the baseline move sigma; capped: both signs, at most sigma-cap x sigma per
+    generation; bare: both signs, unbounded."""
     shaping: Literal["raw", "ranks"] = "raw"
-    """Returns as they are and sums over the pairs, or centred ranks and means over the pairs."""
+    """Use returns as they are and sum over the pairs, or use centred ranks and average over the pairs."""
     optimiser: Literal["sgd", "clipup", "adam"] = "sgd"
     """How mu follows its gradient; sigma always takes a plain step."""
     learning_rate_mu: float = setting(0.1, least=0.0)
@@ -74,19 +75,19 @@ class PGPE(Settings):
     learning_rate_sigma: float = setting(0.2, least=0.0)
     """Step size of sigma, alpha_sigma."""
     momentum: float = setting(0.9, least=0.0, below=1.0)
-    """Part of the last step that is kept, of ClipUp and Adam (its first decay)."""
+    """Share of the last step that ClipUp and Adam keep (Adam's first decay)."""
     second_moment_decay: float = setting(0.999, least=0.0, below=1.0)
-    """Part of the mean squared gradient that Adam keeps."""
+    """Share of the mean squared gradient that Adam keeps."""
     max_speed: float = setting(0.2, above=0.0)
-    """Longest step of mu with ClipUp, a Euclidean norm in units of the parameters."""
+    """Longest step of mu with ClipUp: a Euclidean norm, in units of the parameters."""
     initial_mu: float = 1.0
     """First mean of every parameter."""
     initial_sigma: float = setting(2.0, above=0.0)
     """First standard deviation of every parameter."""
     sigma_floor: float = setting(1e-3, above=0.0)
-    """Least standard deviation, in units of the parameters."""
+    """Smallest standard deviation, in units of the parameters."""
     sigma_cap: float = setting(0.2, above=0.0, most=1.0)
-    """Largest relative change of a sigma in one generation, of the capped rule."""
+    """Largest relative change of a sigma per generation, with the capped rule."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -112,7 +113,7 @@ class PGPE(Settings):
         return PGPEState(mu=mu, sigma=sigma, baseline=None, best=None, generation=0, **memory)
 
     def restore(self, values: Mapping[str, StateValue]) -> PGPEState:
-        """Return the state that `to_dict` told, checked against this configuration."""
+        """Return the state that `to_dict` gave, checked against this configuration."""
         state = PGPEState.from_dict(values)
         self._check_memory(state)
         return state

@@ -26,16 +26,16 @@ from learner.algorithms.state import SearchState, finite_rows, moved
 
 @dataclass(frozen=True, kw_only=True)
 class SNES(Mirrored):
-    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns."""
+    """Separable natural evolution strategies, with mirrored samples and utilities by rank (Wierstra 2014)."""
 
     pairs: int = setting(10, least=1)
-    """Pairs of rollouts a generation, N."""
+    """Pairs of rollouts per generation, N."""
     learning_rate_mu: float = setting(1.0, least=0.0)
     """Step size of mu, eta_mu."""
     learning_rate_sigma: float | None = setting(None, least=0.0)
-    """Step size of sigma, eta_sigma; None: (3 + ln P) / (5 sqrt(P)) with P parameters."""
+    """Step size of sigma, eta_sigma; by default (3 + ln P) / (5 sqrt(P)) with P parameters."""
     sigma_floor: float = setting(1e-6, above=0.0)
-    """Least standard deviation, in units of the parameters."""
+    """Smallest standard deviation, in units of the parameters."""
 
     def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
         """Return the state after one update.
@@ -65,7 +65,7 @@ class SNES(Mirrored):
 
 
 def utilities(returns: FloatArray) -> FloatArray:
-    """What each return counts for by its rank, any shape; they add up to 0, and equal returns have equal ones."""
+    """The weight of each return by its rank, any shape; they add up to 0, and equal returns have equal ones."""
     flat = returns.ravel()
     count = flat.size
     logs = [max(0.0, math.log(count / 2.0 + 1.0) - math.log(rank)) for rank in range(1, count + 1)]

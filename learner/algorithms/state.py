@@ -1,4 +1,4 @@
-"""What an algorithm remembers between two generations: frozen, checked, told to a checkpoint as a dict.
+"""What an algorithm stores between two generations: frozen, checked, and given to a checkpoint as a dict.
 
 Shapes: P is the number of parameters. Every array is float64 and read-only, so a state that was
 handed to the algorithm, the recorder or a checkpoint is the same afterwards.
@@ -38,7 +38,7 @@ class SearchState:
     sigma: FloatArray
     """Standard deviation of each parameter, (P,), positive."""
     baseline: float | None = None
-    """Return that counts as neither good nor bad; None until a generation set it, or where there is none."""
+    """Return that counts as neither good nor bad; None until a generation has set it, or if there is none."""
     best: float | None = None
     """Best return so far over the whole run (m); None before the first generation."""
     generation: int = 0
@@ -79,7 +79,7 @@ class SearchState:
 
     @classmethod
     def from_dict(cls: type[S], values: Mapping[str, StateValue]) -> S:
-        """Build the state that `to_dict` told.
+        """Build the state that `to_dict` gave.
 
         Raises:
             ValueError: a key is missing or unknown, or its value has a wrong type, shape or range;
@@ -115,7 +115,7 @@ def _scalar(name: str, value: object) -> float | None:
 
 
 def moved(state: S, returns: FloatArray, **arrays: FloatArray) -> S:
-    """The state one generation on, with some of its arrays new, and the best of these returns noted.
+    """The next state: some of its arrays are new, and the best of these returns is noted.
 
     Raises:
       Diverged: an array is not finite, or a sigma is not positive.

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from farm import seeds, settings
+from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, writing
@@ -57,6 +58,7 @@ def main(words: Sequence[str]) -> int:
     from learner.chain import chain, check
     from learner.replay import loaded
 
+    logs.set_up("WARNING")
     policies = [loaded(RunFolder.open(path)) for path in command.runs]
     check(policies)
     check_lengths(policies, command)
@@ -84,7 +86,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def check_lengths(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
-    """See that the tasks take as many steps, before any work is done: a ConfigError names the flag."""
+    """Check that the tasks have equal control steps, before any work is done: a ConfigError names the flag."""
     for flag in ("steps", "shown"):
         for policy in policies:
             try:

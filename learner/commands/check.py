@@ -30,12 +30,12 @@ ROWS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class CheckCommand:
-    """Checks a task: sizes, bounds, same bits however batched, rollouts per second, a picture."""
+    """Checks a task: sizes, bounds, the same bits in any batch, rollouts per second, a picture."""
 
     name: tyro.conf.Positional[str]
     """The task: a name, gym:NAME, or FILE.py:CLASS."""
     picture: Path | None = None
-    """Picture of the start to write, NAME.png; None: the task's name."""
+    """Where to write the picture of the start, NAME.png; by default the task's name."""
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task."""
 

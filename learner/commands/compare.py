@@ -20,12 +20,12 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class CompareCommand:
-    """Several runs in one recording: curves over each other, final policies side by side, a table."""
+    """Puts several runs into one recording: their curves together, final policies side by side, a table."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of the runs, two to seven."""
     to: Path = Path("compare.rrd")
-    """Recording to write; what is there is replaced."""
+    """Recording to write; an existing file is replaced."""
     view: bool = False
     """Open it in the Rerun viewer."""
 
@@ -68,12 +68,12 @@ class Compared:
 
 
 def read(folders: Sequence[RunFolder]) -> list[Compared]:
-    """What the folders say; a ConfigError where one has no generation behind it."""
+    """The contents of the folders; a ConfigError if one has done no generation yet."""
     runs = []
     for name, folder in zip(names([folder.path for folder in folders]), folders, strict=True):
         progress = folder.progress()
         if not progress:
-            raise ConfigError(f"the run in {folder.path} has no generation behind it: nothing to compare")
+            raise ConfigError(f"the run in {folder.path} has done no generation yet: nothing to compare")
         runs.append(Compared(name, folder.read_config(), progress, folder.read_summary() or {}))
     return runs
 

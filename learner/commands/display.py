@@ -1,4 +1,4 @@
-"""How a run is going: a live screen on a terminal, a line a generation elsewhere; JSON or hardly anything if wanted."""
+"""Shows a run: a live screen on a terminal, else one line per generation; JSON or almost nothing on request."""
 
 import json
 import logging
@@ -150,7 +150,7 @@ class LiveDisplay(Display):
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:
-            lost = f"of the rollouts; {p.ended} ended early, {p.failed} failed"
+            lost = f"{p.ended} rollouts ended early, {p.failed} failed"
             table.add_row("success", f"{p.success_rate:.0%}", lost)
         table.add_row("sigma", f"{p.sigma_mean:.3f}", f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}")
         return table
@@ -158,12 +158,13 @@ class LiveDisplay(Display):
     def _farm(self, report: Report) -> Table:
         p, workers = report.progress, self._run.farm.census()
         table = _grid()
-        extra = f"; {p.reissued} jobs given out again" if p.reissued else ""
-        table.add_row("farm", f"{report.rate:.0f}", f"rollouts/s, {p.workers} workers{extra}")
-        for worker in workers[:_WORKERS]:
-            table.add_row("", f"{worker.rate:.0f}", plain(name(worker)))
+        extra = f"; {p.reissued} jobs reissued" if p.reissued else ""
+        rates = [round(worker.rate) for worker in workers]  # rounded first, so that they add up
+        table.add_row("farm", f"{sum(rates)}", f"rollouts/s, {p.workers} workers{extra}")
+        for worker, rate in zip(workers[:_WORKERS], rates, strict=False):
+            table.add_row("", f"{rate}", plain(name(worker)))
         if len(workers) > _WORKERS:
-            table.add_row("", f"{sum(w.rate for w in workers[_WORKERS:]):.0f}", f"{len(workers) - _WORKERS} more")
+            table.add_row("", f"{sum(rates[_WORKERS:])}", f"{len(workers) - _WORKERS} more")
         if self._run.recording is not None:
             dropped = self._run.recording.thread.dropped
             left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
@@ -174,7 +175,7 @@ class LiveDisplay(Display):
 
 
 def name(worker: WorkerStatus) -> str:
-    """A worker as people know it: its name and process, and its host where that is another name."""
+    """A worker's name for display: name and process, and its host if that has a different name."""
     short, _, instance = worker.worker.partition("/")
     process = instance.partition("-")[0]
     return f"{short}/{process}" + ("" if worker.host.startswith(short) else f" on {worker.host}")

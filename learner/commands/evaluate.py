@@ -21,14 +21,16 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateCommand(Settings):
-    """The learnt mean policy on perturbed starts and conditions, as its task draws them."""
+    """Tries the learnt mean policy on perturbed starts and conditions, as its task draws them."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     rollouts: int = setting(EVALUATION_ROLLOUTS, least=1, most=1_000_000)
-    """Perturbed rollouts."""
+    """Number of perturbed rollouts."""
     seed: int = setting(EVALUATION_SEED, least=0, most=SEEDS - 1)
     """Seed of the perturbations."""
+    average: int | None = setting(None, least=1)
+    """Average the means after so many last generations; by default as many as the run says."""
     json: bool = False
     """Print JSON instead of a table."""
 
@@ -36,7 +38,7 @@ class EvaluateCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(EvaluateCommand, words, "farm evaluate")
-    figures = evaluate(RunFolder.open(command.run), command.rollouts, command.seed)
+    figures = evaluate(RunFolder.open(command.run), command.rollouts, command.seed, command.average)
     if command.json:
         say(json.dumps(figures, indent=2))
         return 0
@@ -52,9 +54,9 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def evaluate(folder: RunFolder, rollouts: int, seed: int) -> dict[str, Any]:
+def evaluate(folder: RunFolder, rollouts: int, seed: int, average: int | None = None) -> dict[str, Any]:
     """The figures, as the JSON shows them."""
-    policy = loaded(folder)
+    policy = loaded(folder, average=average)
     spec = policy.problem.spec
     given = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
     figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}

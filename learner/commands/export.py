@@ -17,14 +17,14 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class ExportCommand(Settings):
-    """A learnt policy as a file, for MuJoCo and numpy or as an ONNX model; see docs/export.md."""
+    """Writes a learnt policy to a file, for MuJoCo and numpy or as an ONNX model; see docs/export.md."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: tyro.conf.Positional[Path]
-    """File to write: .npz, with the task, for MuJoCo and numpy; .onnx, the policy alone."""
+    """File to write: .npz (with the task, for MuJoCo and numpy) or .onnx (the policy alone)."""
     generation: int | None = setting(None, least=0)
-    """Generation whose mean policy is written, 0 for the first; None: the last."""
+    """Generation whose mean policy is written (0: before learning); by default the last."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,12 +1,14 @@
-"""`farm learner`: the learner alone; and what it has in common with `farm run`."""
+"""`farm learner`: the learner alone; and what it shares with `farm run`."""
 
 import gc
+import itertools
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
 from farm.commands import logs
 from farm.commands.signals import INTERRUPTED, stop_flag
-from farm.errors import ConfigError
+from farm.errors import ConfigError, NameTakenError
 from farm.net.session import LISTEN
 from farm.net.tls import find
 from learner.commands import display, options, recordings
@@ -20,10 +22,10 @@ from learner.setup import fitted
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerCommand:
-    """The learner alone; workers join it from this machine or others with `farm worker`."""
+    """The learner alone; workers join it with `farm worker`, from any machine."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
-    """Where the run comes from and where it goes."""
+    """Where the run starts from, where it is saved, and how it is reached."""
     run: RunConfig = field(default_factory=RunConfig)
     """The run."""
 
@@ -56,8 +58,18 @@ def learn(
     if resumed is not None:
         options.check_resume(begin, config, resumed)
     with stop_flag("saving and ending") as stop:
-        opened = open_run(config, path, place, resume=resumed is not None, stopped=stop.is_set)
-        with opened as run:
+        with ExitStack() as stack:
+            run, first = None, path.name
+            for number in itertools.count(2):
+                opened = open_run(config, path, place, resume=resumed is not None, stopped=stop.is_set)
+                try:
+                    run = stack.enter_context(opened)
+                    break
+                except NameTakenError:  # of a run of the same second
+                    if chosen.name or resumed is not None:
+                        raise
+                    path = path.with_name(f"{first}-{number}")
+            assert run is not None
             shown = display.display(run, _announcement(run, place), chosen.style)
             gc.freeze()  # what is there stays: looking through it for garbage took 20 ms a time
             with shown:
@@ -98,7 +110,7 @@ def _conclusion(run: Run, place: Placement) -> list[str]:
         lines.append(f"the mean policy returns {summary['mean_policy_return']:.3f}{said}")
     lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
     if summary["state"] == "interrupted":
-        lines.append(f"go on with: farm {'run' if place.workers else 'learner'} --resume {folder}")
+        lines.append(f"continue with: farm {'run' if place.workers else 'learner'} --resume {folder}")
     elif place.record:
         lines.append(f"look at it with: farm view {folder}")
     return lines

@@ -12,15 +12,15 @@ from farm.commands.logs import say
 from farm.errors import ConfigError, writing
 
 TEMPLATE = "task_template.py.txt"
-"""The file it writes, in this package; `Pendulum` stands for the name."""
+"""The template, in this package; `Pendulum` is replaced by the name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewTaskCommand:
-    """Writes NAME.py, a task of 30 lines that runs: change it into yours."""
+    """Writes NAME.py, a task of 31 lines that runs; change it into your own."""
 
     name: tyro.conf.Positional[str]
-    """Name of the task: letters, digits and _; the class is called after it."""
+    """Name of the task: letters, digits and _; its class gets this name, too."""
 
 
 def main(words: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""What a learner is told besides the run's configuration: nothing here changes a number."""
+"""Options of a learner besides the run's configuration: none of them changes a number."""
 
 import itertools
 import time
@@ -19,46 +19,46 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerOptions:
-    """Where a run comes from, where it goes, and who may watch."""
+    """Where a run starts from, where it is saved, and how it is reached."""
 
     preset: str | None = None
-    """Settings to begin with, by name (farm tasks NAME lists a task's); None: the task's first."""
+    """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
     config: Path | None = None
-    """Settings to begin with: a config.json (other flags override it)."""
+    """Settings to start from: a config.json (other flags override it)."""
     resume: Path | None = None
-    """Go on with the run in this folder; --generations may extend it."""
+    """Continue the run in this folder; --generations may extend it."""
     resume_existing: bool = False
-    """Go on with the run of that --name if there is one, begin it otherwise: for learners that others start again."""
+    """Continue the run of that --name if it exists, else begin it: for learners that a supervisor restarts."""
     out: Path = Path("runs")
-    """Folder that run folders are made in."""
+    """Folder in which run folders are made."""
     name: str = ""
     """Name of the run and its folder; without one: task-preset-sSEED-UTC time."""
     record: bool = True
     """Record the run with Rerun."""
     log: tuple[str, ...] = ()
-    """Log the run with tensorboard, wandb or a logger of your own (FILE.py:CLASS) as well, repeatable."""
+    """Also log the run with tensorboard, wandb or a logger of your own (FILE.py:CLASS), repeatable."""
     serve: str | None = None
-    """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
+    """Also stream the recording live, at [HOST:]PORT (host: 127.0.0.1)."""
     listen: str | None = None
-    """Where workers can reach the learner; None: tcp/127.0.0.1:7447, with farm run any free port."""
+    """Where the learner listens for workers; by default tcp/127.0.0.1:7447, with farm run any free port."""
     connect: tuple[str, ...] = ()
-    """Dial a router instead of listening, repeatable."""
+    """Connect to a router instead of listening, repeatable."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
     trust_network: bool = False
-    """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
+    """Listen to other machines without certificates: anybody there can read everything and pose as a worker."""
     mixed: bool = False
-    """Admit workers whose machines round differently, and resume although code has changed: not repeatable."""
+    """Admit workers whose machines round differently, and resume with changed code: the run is not reproducible."""
     audit: float = setting(0.02, least=0.0, most=1.0)
-    """Part of the jobs that a second host does as well, where there is one: hosts that lie are expelled; 0: none."""
+    """Share of the jobs that a second host repeats as a check; hosts with wrong answers are expelled; 0: no checks."""
     patience: float = setting(1.0, above=0.0)
-    """A job goes to a second worker no sooner than this [s]: more where slow devices take part."""
+    """Least time before a job also goes to a second worker [s]; increase it for slow devices."""
     farm: str = "farm"
-    """Name of the farm: learners and workers of one name work together."""
+    """Name of the farm: learners and workers with the same name work together."""
     quiet: bool = False
-    """Say only warnings and, in the end, what came out."""
+    """Print only warnings and the final result."""
     json: bool = False
-    """Write a JSON object a line: the run, each generation, the summary."""
+    """Print one JSON object per line: the run, each generation, the summary."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -73,11 +73,11 @@ class LearnerOptions:
         if self.name:
             keys.checked("run", self.name)
         elif self.resume_existing:
-            raise ConfigError("--resume-existing needs --name: the run that is begun once and gone on with later")
+            raise ConfigError("--resume-existing needs --name: the name of the run to begin or to continue")
         if self.quiet and self.json:
             raise ConfigError("--quiet and --json exclude each other")
         if self.listen is not None and self.connect:
-            raise ConfigError("--listen and --connect exclude each other: a learner listens, or dials a router")
+            raise ConfigError("--listen and --connect exclude each other: a learner listens, or connects to a router")
         for endpoint in (*self.connect, *([self.listen] if self.listen else [])):
             check_endpoint(endpoint, encrypted=self.tls is not None)
         if self.serve is not None:
@@ -85,7 +85,7 @@ class LearnerOptions:
 
 
 def address(serve: str) -> tuple[str, int]:
-    """Host and port of [HOST:]PORT; a ConfigError where it has another form."""
+    """Host and port of [HOST:]PORT; a ConfigError if it has a different form."""
     host, _, port = serve.rpartition(":")
     if not port.isdigit() or not 0 < int(port) < 65536:
         raise ConfigError(f"--serve {serve!r} is not of the form [HOST:]PORT, for example 9876")
@@ -103,7 +103,7 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     parts = {name: value for name, value in named.items() if value is not None}
     given = [f"--{name}" for name, value in chosen.items() if value is not None]
     if len(given) > 1:
-        raise ConfigError(f"{' and '.join(given)} exclude each other: each says what to begin with")
+        raise ConfigError(f"{' and '.join(given)} exclude each other: each says what to start from")
     if chosen["resume"] is not None:
         folder = RunFolder.open(Path(chosen["resume"]))
         return folder.read_config(), folder
@@ -125,13 +125,13 @@ def _value(words: Sequence[str], flag: str) -> str | None:
 
 
 def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
-    """Check that a run may go on with this configuration: only the number of generations may have grown."""
+    """Check that a run can continue with this configuration: only the number of generations may have grown."""
     if changed := list(configs.other(saved, wanted)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
         raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may grow")
     done = max((stats.generation for stats in folder.progress()), default=0)
     if wanted.generations < done:
-        raise ConfigError(f"--generations {wanted.generations}: the run has {done} behind it")
+        raise ConfigError(f"--generations {wanted.generations}: the run has already done {done}")
 
 
 def run_name(options: LearnerOptions, config: RunConfig) -> str:

@@ -25,18 +25,18 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class PlayCommand(Settings):
-    """The learnt policy in MuJoCo's interactive viewer, over and over; Ctrl+drag pushes."""
+    """Plays the learnt policy again and again in MuJoCo's interactive viewer; Ctrl+drag pushes objects."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     generation: int | None = setting(None, least=0)
-    """Generation whose mean policy is played, 0 for the first; None: the last."""
+    """Generation whose mean policy is played, 0 for the first; by default the last."""
     speed: float = setting(1.0, least=0.01, most=10)
-    """1 is real time."""
+    """Speed: 1 is real time."""
     hold: float = setting(2.0, least=0, most=3600)
-    """How long the scene rests before it begins again [s]."""
+    """Pause before the rollout is repeated [s]."""
     task: TaskConfig = field(default_factory=TaskConfig)
-    """Settings of the task, the run's own unless given."""
+    """Settings of the task; the default is the run's own."""
 
 
 def main(words: Sequence[str]) -> int:

@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordCommand:
-    """A run's recording made on any machine: the same as the learner's, all of it, whenever this begins."""
+    """Records a run on any machine, over the network: the whole run, even if it begins late."""
 
     connect: tuple[str, ...] = ()
     """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
     run: str = ""
-    """The run; without one the only run on the farm, or the first to appear."""
+    """Name of the run; without one: the only run on the farm, or the first that appears."""
     out: Path = Path("recordings")
-    """Folder that the run's recording gets a folder in."""
+    """Folder in which the recording's folder is made."""
     file: bool = True
     """Write run.rrd and replay.rrd."""
     serve: str | None = None
-    """Stream the recording live as well, at [HOST:]PORT (host: 127.0.0.1)."""
+    """Also stream the recording live, at [HOST:]PORT (host: 127.0.0.1)."""
     spawn: bool = False
     """Open a viewer on the live stream."""
     farm: str = "farm"
@@ -44,9 +44,9 @@ class RecordCommand:
     tls: Path | None = None
     """Folder with certificates: a viewer's bundle."""
     name: str = ""
-    """Which viewer's, where the folder holds several."""
+    """Which viewer's certificate to use, if the folder holds several."""
     allow_file: tuple[Path, ...] = ()
-    """Use the task or policy in this file, repeatable, where the run's is in a file on the learner's machine."""
+    """A copy of the file that the run's task or policy is in, if it is a file on the learner's machine; repeatable."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -78,7 +78,7 @@ def main(words: Sequence[str]) -> int:
         remote = record(command, stop.is_set)
     where = "" if remote.folder is None else f" in {remote.folder.path}"
     if remote.end is None:
-        say(f"recorded up to generation {remote.done}{where}; the same command goes on")
+        say(f"recorded up to generation {remote.done}{where}; the same command continues")
         return INTERRUPTED
     say(f"run over after generation {remote.done}, all recorded{where}")
     if remote.folder is not None:

@@ -1,4 +1,4 @@
-"""What several commands say of recordings: how to look on, which files they are, where one may be written."""
+"""What several commands say of recordings: how to watch a run live, which files they are, where one may be written."""
 
 import socket
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _MAGIC: Final = b"RRF"  # what a recording begins with, whichever release of Rer
 
 
 def look_on(uri: str) -> list[str]:
-    """How to open a live stream: here, and from elsewhere where it listens on this machine alone."""
+    """How to open a live stream: on this machine, and on another one if it listens only here."""
     address = urlsplit(uri)
     lines = [f"live: farm view {uri}   (--web for a browser)"]
     if address.hostname in ("127.0.0.1", "::1", "localhost"):
@@ -45,7 +45,7 @@ def sources(what: str) -> list[str]:
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     if begin != _MAGIC:
-        raise ConfigError(f"{path} is no recording: give a run's folder or a .rrd file")
+        raise ConfigError(f"{path} is not a recording: give a run's folder or a .rrd file")
     return [what]
 
 

@@ -28,28 +28,28 @@ MOST: Final = 12
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayCommand(Settings):
-    """Any policy or rollout of a run again, at physics rate; its task may have other settings."""
+    """Simulates any policy or rollout of a run again, at physics rate, also with a changed task."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     to: Path | None = None
-    """Recording to write; None: rollout.rrd in the run's folder."""
+    """Recording to write; by default rollout.rrd in the run's folder."""
     generation: int | None = setting(None, least=0)
-    """Generation whose mean policy is shown, 0 for the first, or whose rollouts are; None: the last."""
+    """Generation whose mean policy (0: before learning) or whose rollouts are shown; by default the last."""
     rollout: tuple[int, ...] = ()
-    """Show this exploring rollout of the generation, from 0 on; repeatable."""
+    """Show this exploring rollout of the generation, counted from 0; repeatable."""
     best: int | None = setting(None, least=1, most=MOST)
-    """Show so many exploring rollouts of the generation, those of the highest returns, side by side."""
+    """Show this number of the generation's exploring rollouts, those with the highest returns, side by side."""
     worst: int | None = setting(None, least=1, most=MOST)
-    """Show so many of the lowest returns."""
+    """Show this number of rollouts, those with the lowest returns."""
     video: Path | None = None
-    """Video to write as well: a name that ends in .gif or .mp4."""
+    """Also write a video: a name that ends in .gif or .mp4."""
     speed: float = setting(0.25, least=0.01, most=10)
     """Speed of the video: 1 is real time."""
     task: TaskConfig = field(default_factory=TaskConfig)
-    """Settings of the task, the run's own unless given."""
+    """Settings of the task; the default is the run's own."""
     ended: int | None = None
-    """Show so many rollouts that the task ended; the flag has the task's own word for it, see `_command`."""
+    """Show this number of rollouts that the task ended; the flag has the task's own word for it, see `_command`."""
 
     @property
     def rewinds(self) -> bool:
@@ -194,7 +194,7 @@ def config_of(words: Sequence[str]) -> RunConfig | None:
 
 
 def task_of(words: Sequence[str]) -> TaskConfig | None:
-    """The task's settings of that run."""
+    """The task's settings in that run."""
     config = config_of(words)
     return config.task_config if config else None
 

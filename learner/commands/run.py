@@ -18,11 +18,11 @@ class RunCommand(Settings):
     """Learner and local workers together: learns a task and records it."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
-    """Where the run comes from and where it goes."""
+    """Where the run starts from, where it is saved, and how it is reached."""
     workers: int = setting(2, least=0, most=1024)
     """Worker processes on this machine."""
     backend: str = "cpu"
-    """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
+    """Simulation backend of these workers: a name (farm tasks lists them), or FILE.py:CLASS."""
     run: RunConfig = field(default_factory=RunConfig)
     """The run."""
 

@@ -19,14 +19,14 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class RunsCommand:
-    """A table of the runs in a folder."""
+    """Prints a table of the runs in a folder."""
 
     dir: tyro.conf.Positional[Path] = Path("runs")
     """Folder that holds run folders."""
     json: bool = False
     """Print JSON instead of a table."""
     csv: bool = False
-    """Print CSV instead of a table: a column for each name in summary.json."""
+    """Print CSV instead of a table: one column per field of summary.json."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -70,7 +70,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _succeeds(row: dict[str, Any]) -> str:
-    """Whether the run's policy succeeds; of one that was cut short nobody knows what it would have learnt."""
+    """Whether the run's policy succeeds; unknown if the run was cut short."""
     if row["mean_policy_success"] is False and row["state"] != "finished":
         return "not yet"
     return {True: "yes", False: "no", None: ""}[row["mean_policy_success"]]

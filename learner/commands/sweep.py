@@ -25,22 +25,22 @@ from learner.setup import problem
 
 @dataclass(frozen=True, kw_only=True)
 class SweepCommand:
-    """Settings x seeds on one set of workers, then a table and a figure; given again, it goes on."""
+    """Learns settings x seeds on one set of workers; a table and a figure. Run it again to continue."""
 
     vary: tuple[str, ...] = ()
-    """NAME=V1,V2,...: a setting and its values, repeatable; every combination is done."""
+    """NAME=V1,V2,...: a setting and its values, repeatable; every combination is learnt."""
     seeds: str = "0-4"
-    """Seeds of every setting: A-B or A,B,C."""
+    """Seeds of every combination: A-B or A,B,C."""
     out: Path = Path("sweeps/sweep")
     """Folder of the sweep: its runs, table.csv, table.parquet, figure.svg."""
     preset: str | None = None
-    """Settings to begin with, by name (farm tasks NAME lists a task's); None: the task's first."""
+    """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
     config: Path | None = None
-    """Settings to begin with: a config.json (other flags override it)."""
+    """Settings to start from: a config.json (other flags override it)."""
     sharing: sweep.Sharing = field(default_factory=sweep.Sharing)
-    """Where the runs are done."""
+    """Which workers do the runs."""
     run: RunConfig = field(default_factory=RunConfig)
-    """What all runs share."""
+    """Settings of all runs."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -66,7 +66,7 @@ def main(words: Sequence[str]) -> int:
         if outcomes.available():
             outcomes.write_parquet(chosen.path / "table.parquet", chosen, table)
         if stop.is_set():
-            say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command goes on with them")
+            say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command continues with them")
             return INTERRUPTED
     _print(chosen, table)
     _draw(chosen)
@@ -94,7 +94,7 @@ def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
 
 
 def _parts(values: dict[str, str]) -> list[str]:
-    """The flags that choose task, policy and algorithm: which others there are depends on them."""
+    """The flags that choose task, policy and algorithm, because the other flags depend on them."""
     return [_word(name, value) for name, value in values.items() if name in ("task", "policy", "algorithm")]
 
 
@@ -106,7 +106,7 @@ def _word(name: str, value: str) -> str:
 
 
 def _check_begins(chosen: Sweep) -> None:
-    """See that every setting's task can be begun: better now than hours later."""
+    """Check that every setting's task can start: better now than hours later."""
     begun: list[Any] = []
     for setting in chosen.settings:
         try:
@@ -146,7 +146,7 @@ def _spread(found: tuple[float, float] | None, *, percent: bool) -> str:
 
 
 def _draw(chosen: Sweep) -> None:
-    """The figure, where there is matplotlib and anything to draw."""
+    """Draw the figure, if matplotlib is installed and there is anything to draw."""
     if not figure.available():
         say(f"no figure: {figure.INSTALL}")
         return
@@ -158,7 +158,7 @@ def _draw(chosen: Sweep) -> None:
 
 
 def check_sharing(sharing: sweep.Sharing) -> None:
-    """See that there is what the runs need: Rerun to record with, certificates."""
+    """Check what the runs need: Rerun for recordings, and certificates."""
     if sharing.record:
         check_rerun()
     if sharing.tls is not None:
@@ -166,7 +166,7 @@ def check_sharing(sharing: sweep.Sharing) -> None:
 
 
 class Runs:
-    """How runs side by side are doing: bars on a terminal, a line a run elsewhere."""
+    """Shows runs side by side: bars on a terminal, else one line per run."""
 
     def __init__(self, paths: Iterable[Path], where: Path) -> None:
         paths = list(paths)
@@ -196,7 +196,7 @@ class Runs:
         self._bars.update(self._tasks[run], completed=generation, said=f"{returned:8.3f}")
 
     def said(self, run: str, line: str) -> None:
-        """A learner has something to say, perhaps that nobody answers; the same is said once."""
+        """Show a learner's message, for example that no worker answers; equal messages are shown once."""
         if line not in self._heard:
             self._heard.add(line)
             self._print(f"{run}: {line}")

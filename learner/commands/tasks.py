@@ -30,7 +30,7 @@ class TasksCommand:
     """Lists tasks, policies, algorithms, backends and loggers; with a name, its settings and presets."""
 
     name: tyro.conf.Positional[str] = ""
-    """One of them, or FILE.py:CLASS; without: all."""
+    """A name, or FILE.py:CLASS; without one: list all."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -63,14 +63,14 @@ def _doc(plugin: plugins.Plugin) -> str:
 
 
 def _plugin(kind: str, name: str) -> plugins.Plugin:
-    """The plug-in of a name, or of any variant where it is one that is many."""
+    """The plug-in with this name, or any variant of it if it has variants."""
     with contextlib.suppress(ConfigError):
         return plugins.find(kind, name)
     return plugins.find(kind, f"{name}:NAME")
 
 
 def described(name: str) -> str:
-    """Where a plug-in is from, its presets and settings; a ConfigError where nothing has this name."""
+    """Where a plug-in comes from, its presets and settings; a ConfigError if there is none of this name."""
     kind = _kind(name)
     plugin = _plugin(kind, name)
     lines = [f"{_KINDS[kind]} {plugin.wire}, {plugin.origin}", _doc(plugin), ""]

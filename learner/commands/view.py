@@ -26,7 +26,7 @@ _CLOSING = 5.0  # [s] that it has to end
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand:
-    """Opens the recordings of runs in the Rerun viewer; those of several runs with a table of the runs."""
+    """Opens recordings of runs in the Rerun viewer; several runs together, with a table of them."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of runs, recordings (.rrd), or the address of a live stream."""
@@ -40,7 +40,7 @@ def main(words: Sequence[str]) -> int:
     logs.set_up("WARNING")
     check_rerun()
     if not command.runs:
-        raise ConfigError("nothing to look at: give a run's folder or a .rrd file")
+        raise ConfigError("nothing to open: give a run's folder or a .rrd file")
     found = [recordings.sources(what) for what in command.runs]
     if not command.web:
         check_display(command.runs[0])

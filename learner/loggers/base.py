@@ -17,7 +17,7 @@ class Logger(Protocol):
     """Takes a run's figures to another tool."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:
-        """Begin, or go on with, a run's log.
+        """Begin or continue a run's log.
 
         Args:
           folder: of the run; its name is the run's.
@@ -66,7 +66,7 @@ class Loggers:
             getattr(self._open[name], method)(values)
         except Exception as error:  # whatever another's tool may raise
             del self._open[name]
-            log.error("--log %s ends here, learning goes on: %s: %s", name, type(error).__name__, brief(str(error)))
+            log.error("--log %s ends here, learning continues: %s: %s", name, type(error).__name__, brief(str(error)))
 
 
 def _begun(name: str, folder: Path, config: Mapping[str, Any], done: int) -> Logger:

@@ -10,7 +10,7 @@ class WeightsAndBiases:
     """A run at Weights & Biases; needs the extra `wandb`, and an account or WANDB_MODE=offline."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:  # noqa: ARG002  steps say it
-        """Begin a run of that name, or go on with the one that this folder began."""
+        """Begin a run with this name, or continue the one that this folder began."""
         import wandb
 
         known = folder / "wandb" / "id"

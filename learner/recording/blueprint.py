@@ -231,7 +231,7 @@ def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:
         end=rr.TimeRangeBoundary.cursor_relative(seconds=horizon),
     )
     curves = [("/reward/terms", "Reward terms", len(spec.terms)), ("/actions", "Actions", spec.action)]
-    curves += [(path(c.name), title(c), c.shape[0]) for c in spec.channels if c.kind == "scalars"]
+    curves += [(path(c.name), title(c), c.shape[0] + 2 * len(c.limits)) for c in spec.channels if c.kind == "scalars"]
     plots: list[rrb.View] = [
         rrb.TimeSeriesView(
             origin=origin,

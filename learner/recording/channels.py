@@ -1,7 +1,8 @@
 """A task's channels as Rerun entities, by kind: what never changes, and columns for a rollout's frames.
 
-Scalars are curves at /NAME, flags state lanes at /NAME/LABEL, images pictures at /NAME/LABEL (and with places points on
-their bodies, at /world/BODY/NAME), arrows and points are at /world/NAME.
+Scalars are curves at /NAME and their limits constant lines at /NAME/limits, flags state lanes at /NAME/LABEL, images
+pictures at /NAME/LABEL (and with places points on their bodies, at /world/BODY/NAME), arrows and points are at
+/world/NAME.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,7 @@ from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.sim.channels import Channel
 from farm.sim.scene import Scene
 from farm.tasks.base import TaskSpec
-from learner.recording.curves import lines, pack, palette, ramp
+from learner.recording.curves import lighter, lines, pack, palette, ramp
 from learner.recording.solids import rotate
 
 STATES: Final = ("off", "on")
@@ -57,6 +58,9 @@ class ChannelDrawing:
         colours = channel.colours or palette(channel.shape[0])
         if channel.kind == "scalars":
             yield self._entity, lines(channel.names, colours)
+            if channel.limits:
+                of = [lighter(colours[channel.names.index(label)]) for label in channel.limits for _ in range(2)]
+                yield f"{self._entity}/limits", lines(limits(channel), of, width=1.5)
         elif channel.kind == "flags":
             for entity, colour in zip(entities(channel), colours, strict=True):
                 yield entity, rr.StateConfiguration(values=STATES, colors=[_OFF, colour])
@@ -81,6 +85,9 @@ class ChannelDrawing:
         match self._channel.kind:
             case "scalars":
                 yield Columns(self._entity, scalars(values))
+                if self._channel.limits:
+                    ends = np.array([each for pair in self._channel.limits.values() for each in pair])
+                    yield Columns(f"{self._entity}/limits", scalars(np.tile(ends, (len(values), 1))))
             case "flags":
                 yield from self._flags(values, begins)
             case "images":
@@ -155,6 +162,15 @@ def path(name: str) -> str:
 def entities(channel: Channel) -> list[str]:
     """Paths of the channel's parts, by their labels."""
     return [f"{path(channel.name)}{path(label)}" for label in channel.names]
+
+
+def limits(channel: Channel) -> list[str]:
+    """What a legend says of the channel's limits, the least and the greatest of each label."""
+    return [
+        f"{label}, {what} {value:g} {channel.unit}".strip()
+        for label, pair in channel.limits.items()
+        for what, value in zip(("least", "most"), pair, strict=True)
+    ]
 
 
 def _on_bodies(channel: Channel, bodies: list[str]) -> list[str]:

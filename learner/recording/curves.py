@@ -34,6 +34,12 @@ def palette(count: int) -> list[Colour]:
     return list(islice(cycle(PALETTE), count))
 
 
+def lighter(colour: Colour) -> Colour:
+    """Halfway to white."""
+    red, green, blue = ((255 + part) // 2 for part in colour)
+    return red, green, blue
+
+
 def lines(
     names: Sequence[str], colours: Iterable[Colour] | None = None, width: float = 2.0, hidden: Sequence[str] = ()
 ) -> rr.SeriesLines:

@@ -105,7 +105,7 @@ class Recorder:
         self.replay = partial(record_replay, run=run, drawing=drawing, config=config)
         """Records named rollouts into a file of their own."""
         if scene.left_out:
-            log.info("%d meshes or height fields of the scene are not drawn", scene.left_out)
+            log.info("%d height fields or distance fields of the scene are not drawn", scene.left_out)
         self.uri: str | None = None
         """Address that a viewer opens: `rerun URI`; None where nothing is served."""
         sinks: list[Any] = []

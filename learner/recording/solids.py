@@ -1,11 +1,11 @@
-"""Primitives of a MuJoCo model as Rerun archetypes, and turning by quaternions."""
+"""Primitives and meshes of a MuJoCo model as Rerun archetypes, and turning by quaternions."""
 
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 
-from farm.arrays import FloatArray
+from farm.arrays import FloatArray, IntArray
 from farm.sim.scene import Geometry
 
 ENDLESS: Final = 50.0
@@ -15,7 +15,7 @@ _THIN: Final = 0.001  # [m]
 
 
 def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (archetypes without a common base)
-    """A MuJoCo primitive as a Rerun one, in its body's frame."""
+    """A MuJoCo primitive or mesh as a Rerun one, in its body's frame."""
     quaternion = np.array(geometry.quaternion)
     style = {
         "quaternions": [xyzw(quaternion)],
@@ -23,21 +23,42 @@ def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (archetypes without a com
         "fill_mode": rr.components.FillMode.Solid,
     }
     centre, size = np.array(geometry.position), geometry.size
+    if geometry.vertices is not None and geometry.faces is not None:
+        return _mesh(geometry.vertices @ _turned(quaternion) + centre, geometry.faces, style["colors"][0])
     if geometry.shape == "box":
         return rr.Boxes3D(half_sizes=[size[:3]], centers=[centre], **style)
     if geometry.shape == "plane":  # Rerun has none: a thin box below it
         sides = [side or ENDLESS for side in size[:2]]
         below = centre - rotate(quaternion, np.array([0.0, 0.0, _THIN]))
         return rr.Boxes3D(half_sizes=[[*sides, _THIN]], centers=[below], **style)
-    if geometry.shape == "ellipsoid":
-        return rr.Ellipsoids3D(half_sizes=[size], centers=[centre], **style)
-    if geometry.shape == "sphere":
-        return rr.Ellipsoids3D(radii=[size[0]], centers=[centre], **style)
+    if geometry.shape in ("sphere", "ellipsoid"):
+        half_sizes = [size if geometry.shape == "ellipsoid" else size[:1] * 3]
+        return rr.Ellipsoids3D(half_sizes=half_sizes, centers=[centre], **style)
     if geometry.shape == "cylinder":
         return rr.Cylinders3D(radii=[size[0]], lengths=[2 * size[1]], centers=[centre], **style)
     # MuJoCo's capsule is centred, Rerun's starts where its axis begins.
     start = centre - rotate(quaternion, np.array([0.0, 0.0, size[1]]))
     return rr.Capsules3D(radii=[size[0]], lengths=[2 * size[1]], translations=[start], **style)
+
+
+def _mesh(vertices: FloatArray, faces: IntArray, colour: list[int]) -> rr.Mesh3D:
+    """Triangles between vertices (V, 3); a vertex' normal is the mean of its faces', by area."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, faces, across[:, None])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=faces,
+        vertex_normals=normals / np.where(length > 0, length, 1.0),
+        albedo_factor=colour,
+    )
+
+
+def _turned(quaternion: FloatArray) -> FloatArray:
+    """The matrix that turns rows from its right, (3, 3)."""
+    return rotate(np.tile(quaternion, (3, 1)), np.eye(3))
 
 
 def rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:

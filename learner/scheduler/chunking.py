@@ -20,6 +20,8 @@ class SchedulerConfig(Settings):
     """Work sent to a worker in one message [s], by the running median."""
     least_seconds: float = setting(0.015, above=0.0)
     """Towards the end of a round chunks shrink down to this [s]: rollouts in small batches are slower."""
+    short_seconds: float = setting(0.06, least=0.0)
+    """A round is short where a worker's share takes no longer; it goes out in one message [s]."""
     straggler_factor: float = setting(4.0, least=1.0)
     """A job out longer than this many running medians is copied to another worker."""
     straggler_seconds: float = setting(1.0, above=0.0)
@@ -58,16 +60,25 @@ class Chunking:
         factor = self._config.straggler_factor
         return max(self._config.straggler_seconds, factor * (self.median or 0.0))
 
-    def chunk(self, waiting: int, workers: int) -> int:
+    def chunk(self, jobs: int, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.
 
         Some `chunk_seconds` of work, but at most half a worker's share of what waits, so that
         chunks shrink towards the end and all workers end together; never below `least_seconds`,
-        unless a worker's whole share is less. One job as long as nothing is known about its duration.
+        unless a worker's whole share is less. In a short round each worker has its whole share at once: the time lost
+        when one ends later is less than what a batch in two parts takes longer. One job as long as nothing is known
+        about its duration.
+
+        Args:
+            jobs: of the round.
+            waiting: of these, not given out yet.
+            workers: that take part.
         """
         if self.median is None:
             return 1
         seconds = max(self.median, 1e-9)  # a median of 0 (a coarse clock) only says that the share decides
         share, half = (-(-waiting // (parts * max(workers, 1))) for parts in (1, 2))
+        if -(-jobs // max(workers, 1)) * seconds <= self._config.short_seconds:
+            return max(1, share)
         least = min(share, math.floor(self._config.least_seconds / seconds))
         return max(1, least, min(half, math.floor(self._config.chunk_seconds / seconds + 0.5)))

@@ -8,7 +8,7 @@ import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -150,11 +150,12 @@ class Dispatcher:
             run=self.run, incarnation=self._incarnation, round=self._header.round + 1,
             generation=generation, spec=self._header.spec, traces=traces, mu=mu, normaliser=normaliser,
         )  # fmt: skip
-        self._session.publish(keys.generation(self._farm, self.run), codec.encode(self._header))
+        header = codec.encode(self._header)
         self._round = RoundResults(jobs, traces, self._trace, self._shapes, normaliser.shape[-1])
         self._scheduler.begin(len(jobs))
         self._audit.begin(len(jobs))
-        self._issue()
+        self._session.publish(keys.generation(self._farm, self.run), header)  # back to back with the jobs
+        self._send(self._scheduler.assign(time.monotonic()))
 
     def collect(self) -> RoundResults:
         """Wait for the results of the round that has begun.
@@ -175,7 +176,7 @@ class Dispatcher:
             for event in self._events():
                 self._take(event)
             if not self._scheduler.complete:
-                self._issue()
+                self._send(self._scheduler.assign(time.monotonic()))
             self._tell_when_alone()
             self._tell_status()
             if self._stopped():
@@ -193,7 +194,7 @@ class Dispatcher:
         asked = self._audit.assign(willing, time.monotonic(), self._scheduler.patience)
         for worker, indices in asked.items():
             self._scheduler.lend(worker, indices)
-            self._send(worker, indices)
+        self._send(asked.items())
         if self._audit.disputed:
             self._warn(
                 f"{self._audit.disputed} give different numbers for the same job, and no third host is there to say "
@@ -327,8 +328,7 @@ class Dispatcher:
 
     def _decide_numbers(self, worker: str) -> None:
         """The first result that counts says which machines' numbers are the run's: others leave."""
-        canaries = self._census.canaries()
-        if worker not in canaries or not self.admission.counted(canaries[worker]):
+        if not self.admission.counted(self._census.canary(worker)):
             return
         for want in self._census.requests():
             refusal = self.admission.refusal(want)
@@ -391,21 +391,17 @@ class Dispatcher:
         self._audit.lost(worker)
         return again
 
-    def _issue(self) -> None:
-        now = time.monotonic()
-        for worker, indices in self._scheduler.assign(now):
-            self._send(worker, indices)
-
-    def _send(self, worker: str, indices: Sequence[int]) -> None:
-        """Jobs into a worker's inbox."""
+    def _send(self, assigned: Iterable[tuple[str, Sequence[int]]]) -> None:
+        """Jobs into workers' inboxes."""
         assert self._round is not None
         # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
         head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
         size = self._header.mu.nbytes + self._header.normaliser.nbytes  # of eps, and of what comes back
         most = max(1, _CHUNK // max(1, size))
-        for first in range(0, len(indices), most):
-            chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices[first : first + most]), **head))
-            self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
+        for worker, indices in assigned:
+            for first in range(0, len(indices), most):
+                chunk = codec.encode(Chunk.carrying(self._round.jobs.take(indices[first : first + most]), **head))
+                self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
     def report(self, progress: GenerationStats) -> None:
         """Take in how the last generation went, for people who ask."""

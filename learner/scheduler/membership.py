@@ -136,10 +136,6 @@ class Census:
             while known.recent[0][0] < now - _WINDOW:
                 known.recent.popleft()
 
-    def canaries(self) -> dict[str, str]:
-        """The digests of the workers' numbers."""
-        return {name: known.want.canary for name, known in self._known.items()}
-
     def canary(self, worker: str) -> str:
         """The digest of a worker's numbers; empty where it is a device, or gone."""
         known = self._known.get(worker)

@@ -165,7 +165,7 @@ class Scheduler:
         one to work on and one to go on with; the rest waits here, so that all end together.
         """
         self._tick(now)
-        size = self._chunking.chunk(self._table.waiting, len(self._table.workers))
+        size = self._chunking.chunk(self._table.size, self._table.waiting, len(self._table.workers))
         chunks = self._again(self._table.failed, size)
         chunks += self._first_time(size)
         if not self._table.any_pending():

@@ -20,7 +20,7 @@ from learner.telemetry.report_log import ReportLog
 log = logging.getLogger(__name__)
 
 LINES: Final = 100
-"""Lines of the log that a report carries, the last ones."""
+"""Largest number of log lines in a report; the latest are kept."""
 LINE: Final = 500
 """Characters of a line."""
 _TRACES: Final = 8 << 20  # [bytes]; larger traces of all rollouts stay with the learner
@@ -29,7 +29,7 @@ _LOOK: Final = 0.02  # [s] between two looks at whether they have
 
 
 class Publisher(logging.Handler):
-    """Publishes reports without ever waiting for anybody, and keeps a history for who asks.
+    """Publishes each generation's report without waiting; serves past reports on request.
 
     What a recorder misses it notices by the generation's number, and asks for.
     """
@@ -52,7 +52,7 @@ class Publisher(logging.Handler):
         logging.getLogger().addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Have a line travel with the next report."""
+        """Send a line with the next report."""
         self._lines = [*self._lines[1 - LINES :], Line(level=record.levelname, text=record.getMessage()[:LINE])]
 
     def generation(self, report: Report) -> None:
@@ -66,7 +66,7 @@ class Publisher(logging.Handler):
             self._outlet.publish(codec.encode(message))
 
     def end(self, summary: dict[str, Any], evaluation: Evaluation | None, best_generation: int) -> None:
-        """Say that the run is over for good, and give recorders a moment to ask for what they lack."""
+        """Announce the end of the run, and give recorders a moment to request missing reports."""
         best = wire(evaluation.replay) if evaluation else None
         if best is not None:
             self._best = best, best_generation
@@ -109,7 +109,7 @@ class Publisher(logging.Handler):
         return lines
 
     def _bounded(self, report: Report) -> Report:
-        """The report without the traces of all rollouts, where a message should not be so large."""
+        """The report without the traces of all rollouts, if a message should not be so large."""
         if "all" not in report.traces or report.traces["all"].nbytes <= _TRACES:
             return report
         if not self._told:

@@ -1,4 +1,4 @@
-"""What is known of a generation that is over, and how it travels."""
+"""The report of a finished generation, and its message."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -54,7 +54,7 @@ class ReportLog:
             return tuple(chosen)
 
     def _first(self, generation: int) -> int:
-        """Where the first report of this generation or a later one stands; one a generation, but some may lack."""
+        """Position of the first report of this generation or a later one; reports may be missing."""
         at = min(max(generation - 1, 0), len(self._reports))
         while at > 0 and self._at(at - 1).generation >= generation:
             at -= 1

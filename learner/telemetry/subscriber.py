@@ -1,4 +1,4 @@
-"""A run as somebody elsewhere follows it: its reports in order, each once, however often either side goes away."""
+"""Follows a run over the network: its reports in order, each once, even if either side is away for a time."""
 
 import logging
 import time
@@ -80,7 +80,7 @@ class Subscriber:
         raise Interrupted(f"stopped before run {self._run} was there")
 
     def follow(self, done: int, stopped: Callable[[], bool]) -> Iterator[RunReport | RunEnd]:
-        """Reports after generation `done` in order, each once; last the end, when the run is over for good.
+        """Reports after generation `done` in order, each once; finally the end, when the run is over for good.
 
         Raises:
           RunError: the run began anew with other settings, or its learner speaks another version.
@@ -121,7 +121,7 @@ class Subscriber:
             self._ask_at = 0.0
 
     def _ask(self) -> RunHistory | None:
-        """What the learner reported after the last generation we have, None when nobody answers."""
+        """The learner's reports after the last known generation, None if it does not answer."""
         payload = self._session.ask(f"{self._key}?from={self._done + 1}", _ANSWER)
         self._ask_at = time.monotonic() + (_AGAIN if payload is None else _QUIET)
         if payload is None:
@@ -144,11 +144,13 @@ class Subscriber:
                 yield report
 
     def _recognise(self, page: RunHistory) -> None:
-        """See that a learner that comes back goes on with the run we know."""
+        """Check that a returning learner continues the same run."""
         config = self._read(page)
         if self._config is not None:
             for name, old, new in configs.other(self._config, config):
-                raise RunError(f"run {self._run} began anew: --{name} was {old} and is {new}; start a recorder anew")
+                raise RunError(
+                    f"run {self._run} was started again with --{name} {new} instead of {old}; start a new recorder"
+                )
         if self._incarnation:
             log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
         self._incarnation = page.incarnation
@@ -159,7 +161,7 @@ class Subscriber:
 
 
 def localised(config: dict[str, Any], files: tuple[Path, ...]) -> dict[str, Any]:
-    """A configuration whose classes in files are looked for in these files; a ConfigError where one is in no such."""
+    """A configuration whose classes come from these files; a ConfigError if a class is in none of them."""
     out = dict(config)
     for part in ("task", "policy", "algorithm"):
         table = config.get(part)

@@ -199,7 +199,7 @@ def test_run_folders_and_checkpoints(farm: Farm) -> None:
 
     assert "exists and is never overwritten" in farm.call("run", "--name", "r", *SMALL, status=2)
     assert "--seed is 0 in the run and 4 here" in farm.call("run", "--resume", "runs/r", "--seed", "4", status=2)
-    assert "the run has 2 behind it" in farm.call("run", "--resume", "runs/r", "--generations", "1", status=2)
+    assert "the run has already done 2" in farm.call("run", "--resume", "runs/r", "--generations", "1", status=2)
     said = farm.call("run", "--init-from", "runs/r", "--policy", "cosine", "--features", "9", status=2)
     assert "its parameters mean something else" in said
 

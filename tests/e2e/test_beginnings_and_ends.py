@@ -26,6 +26,13 @@ def test_a_run_that_starts_from_another(farm: Farm, sigma: str) -> None:
     assert not np.array_equal(c.state["mu"], a.state["mu"])
 
 
+def test_runs_that_begin_together_have_folders_of_their_own(farm: Farm) -> None:
+    processes = [farm.start("run", "--generations", "1", *SMALL) for _ in range(3)]
+    said = [process.communicate(timeout=100)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0] * 3, said
+    assert len(list((farm.folder / "runs").iterdir())) == 3
+
+
 def test_a_run_that_ends_when_it_is_solved(farm: Farm) -> None:
     farm.call("run", "--name", "a", "--generations", "100", "--stop-when-solved", "3", "--no-record")
     summary, lines = farm.summary("a"), farm.progress("a")

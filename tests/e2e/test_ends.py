@@ -53,7 +53,7 @@ def test_a_run_with_recording(farm: Farm, number: signal.Signals, record_propert
     said = end(process, number, record_property)
     assert process.returncode == 130
     assert f"{'Ctrl-C' if number == signal.SIGINT else 'SIGTERM'}: saving and ending" in said
-    assert "go on with: farm run --resume runs/r" in said
+    assert "continue with: farm run --resume runs/r" in said
     assert farm.summary("r")["state"] == "interrupted"
     assert farm.summary("r")["generations"] == len(farm.progress("r"))
 
@@ -143,12 +143,12 @@ def test_workers_that_cannot_work(farm: Farm, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.fixture
 def small_disk(farm: Farm) -> Iterator[Path]:
-    """A file system of 60 kB at `runs`, and a way to make it larger."""
+    """A file system of 100 kB at `runs`, and a way to make it larger."""
     if os.geteuid() != 0 or shutil.which("mount") is None:
         pytest.skip("only root can mount a small file system")
     folder = farm.folder / "runs"
     folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=60k", "tmpfs", str(folder)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(folder)]
     if subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("this container may not mount a small file system")
     yield folder
@@ -159,13 +159,13 @@ def small_disk(farm: Farm) -> Iterator[Path]:
 def test_a_full_disk(farm: Farm, small_disk: Path) -> None:
     said = farm.call("run", "--name", "r", "--generations", "40", *SMALL, status=1)
     (line,) = [line for line in said.splitlines() if line.startswith("farm: ")]
-    assert "cannot write to runs/r: No space left on device; the run stands as of generation " in line
+    assert "cannot write to runs/r: No space left on device; the run is saved up to generation " in line
     assert line.endswith(": make room and --resume it")
     assert "Traceback" not in said
     assert "Logging error" not in said
     assert not list(small_disk.glob("r/*.new"))
-    stands = int(line.partition("as of generation ")[2].partition(":")[0])
-    assert 0 < stands < 40
+    saved = int(line.partition("up to generation ")[2].partition(":")[0])
+    assert 0 < saved < 40
 
     said = farm.call("run", "--resume", "runs/r", "--no-record", status=1)
     assert "No space left on device" in said

@@ -180,7 +180,7 @@ def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:
     check("router killed and back", 15, said=" left")
 
 
-@pytest.mark.parametrize("which", [0, 1], ids=["dialled", "dialling"])
+@pytest.mark.parametrize("which", [0, 1], ids=["listening", "connecting"])
 def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: int) -> None:
     here, there = free_endpoint(), free_endpoint()
     flags = [(here,), (there, "--connect", here)]
@@ -192,7 +192,7 @@ def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: 
     routers[which].communicate(timeout=10)
     farm.start_router(*flags[which])
     finish(learner)
-    check(f"router of two sites killed and back ({('dialled', 'dialling')[which]})", 15, said=" left")
+    check(f"of two joined routers, the {('listening', 'connecting')[which]} one killed and back", 15, said=" left")
 
 
 def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:

@@ -489,7 +489,7 @@ MISTAKES = [
     (("replay", "runs/a", "--to", "runs/a/replay.rrd"), 2, "--to runs/a/replay.rrd would replace the run's own"),
     (("replay", "runs/a", "--to", "runs/a/checkpoint"), 2, "--to runs/a/checkpoint: a recording's name ends in .rrd"),
     (("compare", "runs/a", "runs/b", "--to", "runs/a/config.json"), 2, "a recording's name ends in .rrd"),
-    (("view", "runs/a/config.json", "--web"), 2, "runs/a/config.json is no recording"),
+    (("view", "runs/a/config.json", "--web"), 2, "runs/a/config.json is not a recording"),
     (("compare", "runs/a"), 2, "1 runs to compare; expected 2 to 7"),
     (("compare", "runs/a", "runs/../runs/a"), 2, "is there twice"),
     (("compare", "runs/a", "nowhere"), 2, "nowhere is not a run's folder"),

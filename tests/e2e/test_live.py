@@ -17,10 +17,10 @@ COUNT = 150
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 
 
-def connections(port: int) -> int:
-    """How many are connected to a port of this machine."""
+def connections(port: int, state: str = "01") -> int:
+    """How many are connected to a port of this machine; in state 0A: how many listen there."""
     lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-    return sum(int(line[1].partition(":")[2], 16) == port and line[3] == "01" for line in lines)
+    return sum(int(line[1].partition(":")[2], 16) == port and line[3] == state for line in lines)
 
 
 def free_port() -> int:
@@ -62,7 +62,7 @@ def test_whatever_viewers_do(farm: Farm, viewers: Viewers) -> None:
     endpoint, late = free_endpoint(), farm.folder / "late.rrd"
     flags = ("--pairs", "6", "--generations", str(COUNT))
     learner = farm.start("learner", "--name", "r", "--listen", endpoint, "--serve", f"127.0.0.1:{viewers.port}", *flags)
-    farm.wait_for((farm.folder / "runs/r/run.rrd").exists)
+    farm.wait_for(lambda: connections(viewers.port, "0A"))
     looking, killed = viewers.look(), viewers.look()
     farm.start("worker", "--connect", endpoint, "--processes", "1")
 

@@ -171,7 +171,7 @@ def test_stopped_and_gone_on(farm: Farm, number: signal.Signals) -> None:
     begun = time.monotonic()
     said = finish(process, 130)
     assert time.monotonic() - begun < 10
-    found = re.search(r"recorded up to generation (\d+) in recordings/r; the same command goes on", said)
+    found = re.search(r"recorded up to generation (\d+) in recordings/r; the same command continues", said)
     assert found
     assert generations(farm.folder / FILE) == numbers(int(found[1]))
     assert learning.poll() is None

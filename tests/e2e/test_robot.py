@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,15 @@ def test_the_example_is_short_and_needs_nothing_of_ours() -> None:
     assert len(text.splitlines()) <= 150
     imports = {line.split()[1].partition(".")[0] for line in text.splitlines() if line.startswith(("import", "from"))}
     assert imports & {"numpy", "mujoco", "farm", "learner", "workers"} == set()
+
+
+@pytest.mark.parametrize("words", [("--connect", "foo"), ("--tls", "/nowhere")])
+def test_what_it_cannot_begin_with_is_said_without_a_traceback(words: tuple[str, str]) -> None:
+    command = [sys.executable, str(EXAMPLES / "robot_worker.py"), *words]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    assert "robot_worker.py: error: it cannot begin with these: " in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> None:

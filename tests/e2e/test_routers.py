@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def learns(farm: Farm, reference: dict[str, Any]) -> Callable[..., None]:
-    """Ten generations by a learner that dials one router and workers that dial another, or the same."""
+    """Ten generations by a learner that connects to one router and workers that connect to another, or the same."""
 
     def run(learner: list[str], worker: list[str]) -> None:
         farm.start("worker", "--processes", "2", *worker)
@@ -37,7 +37,7 @@ def test_one_router(farm: Farm, learns: Callable[..., None], zenohd: bool) -> No
 @pytest.mark.parametrize("zenohd", [False, True], ids=["ours", "zenohd"])
 @pytest.mark.parametrize("encrypted", [False, True], ids=["tcp", "tls"])
 def test_two_sites(farm: Farm, tmp_path: Path, learns: Callable[..., None], encrypted: bool, zenohd: bool) -> None:
-    """The learner at one site, workers at the other; the second site's router is there first, and dials until."""
+    """The learner at one site, workers at the other; the second site's router is there first, and tries until then."""
     here, there, learner, worker = free_endpoint(), free_endpoint(), [], []
     if encrypted:
         certificates.main(["new", str(tmp_path / "certs"), "--learner", "127.0.0.1", "--worker", "w"])

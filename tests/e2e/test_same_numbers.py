@@ -60,7 +60,7 @@ def test_interrupted_and_resumed(farm: Farm, reference: dict[str, Any], number: 
     process.send_signal(number)
     said, _ = process.communicate(timeout=10)
     assert process.returncode == 130, said
-    assert "go on with: farm run --resume" in said
+    assert "continue with: farm run --resume" in said
     assert farm.summary("r")["state"] == "interrupted"
     assert children(process.pid) == []
     farm.call("run", "--resume", "runs/r", "--no-record")

@@ -28,7 +28,7 @@ def test_an_interrupted_sweep_goes_on_to_the_numbers_of_runs_one_after_another(f
     begun.send_signal(signal.SIGTERM)
     said, _ = begun.communicate(timeout=60)
     assert begun.returncode == 130, said
-    assert "the same command goes on with them" in said
+    assert "the same command continues with them" in said
     assert not any(Path(f"/proc/{pid}").exists() for pid in started)
     said = farm.call(*SHORT, "--out", "s", "--workers", "2")
     assert "(0 left)" in said

@@ -56,7 +56,7 @@ def test_every_command_on_one_machine(copied: Farm) -> None:
 def test_the_commands_of_several_machines(copied: Farm) -> None:
     assert all(words in COMMANDS for words in APART)
     few = ("--generations", "180", "--no-record")
-    [resume] = re.findall(r"`farm (learner --resume runs/apart)`", TEXT)
+    [resume] = re.findall(r"`farm (learner\s+--resume\s+runs/apart)`", TEXT)
     learner, workers = (copied.start(*words[1:], *more) for words, more in zip(APART, (few, ()), strict=True))
     copied.wait_for(lambda: len(copied.progress("apart")) >= 3)
     os.kill(children(workers.pid)[0], signal.SIGKILL)

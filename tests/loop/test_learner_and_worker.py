@@ -150,6 +150,23 @@ def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(
     assert evaluate(RunFolder.open(tmp_path / "3"), 100, 0)["perturbed"]["return_mean"] == runs[0]["robust_return"]
 
 
+def test_the_average_of_the_last_means_is_judged_kept_and_resumed(cart: Path, tmp_path: Path) -> None:
+    config = configure(f"{cart}:Cart", **SMALL, average=4, learning_rate_mu=0.05)  # far from the actuator's limits
+    whole = learnt(config, tmp_path / "whole", 2, cart)
+    learnt(replace(config, generations=3), tmp_path / "half", 1, cart)
+    resumed = learnt(config, tmp_path / "half", 2, cart, resume=True)
+    alone = learnt(replace(config, average=1), tmp_path / "alone", 1, cart)
+    assert whole["parameters_sha256"] == resumed["parameters_sha256"] == alone["parameters_sha256"]
+    assert whole["mean_policy_return"] == resumed["mean_policy_return"] != alone["mean_policy_return"]
+    assert whole["robust_return"] == resumed["robust_return"] != alone["robust_return"]
+    folder = RunFolder.open(tmp_path / "half")
+    policy = load(folder.path)
+    np.testing.assert_array_equal(policy.mu, np.mean(folder.parameters()["mu"][-4:], axis=0))
+    assert policy.rollout().trajectory.value == whole["mean_policy_return"]
+    assert evaluate(folder, 100, 0)["perturbed"]["return_mean"] == whole["robust_return"]
+    assert evaluate(folder, 100, 0, average=1)["perturbed"]["return_mean"] == alone["robust_return"]
+
+
 def test_a_fitted_start_is_kept_and_repeated(cart: Path, tmp_path: Path) -> None:
     config = configure(f"{cart}:Cart", policy="kernel", start="fitted", initial_mu=1.0, generations=2, pairs=3)
     first = learnt(config, tmp_path / "a", 1, cart)

@@ -84,7 +84,7 @@ def test_an_imap_that_is_left_stands_in_nobodys_way(pool: farm.Farm, thetas: Flo
         break  # what is out is void
     results = pool.imap(thetas, seeds=range(COUNT))
     next(results)
-    with pytest.raises(farm.RunError, match=r"an imap of this thread is not over: take its last pair, or close\(\)"):
+    with pytest.raises(farm.RunError, match=r"an imap of this thread has not ended: take its last pair, or close\(\)"):
         pool.map(thetas)
     results.close()  # type: ignore[attr-defined]
     assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
@@ -148,7 +148,12 @@ def test_names_and_numbers_that_no_farm_has() -> None:
     for workers in (1025, 1.5, "2"):
         with pytest.raises(farm.ConfigError, match=f"workers is {workers!r}; expected 1 to 1024"):
             farm.Farm("finger-gait", workers=workers)  # type: ignore[arg-type]
-    with pytest.raises(farm.ConfigError, match="workers is 0; expected 1 to 1024, or connect to a farm"):
+        with pytest.raises(farm.ConfigError, match=f"workers is {workers!r}; expected 1 to 1024"):
+            list(farm.learn(farm.configure("finger-gait"), "never", workers=workers))  # type: ignore[arg-type]
+    for connect in (5, [5], b"tcp/127.0.0.1:1"):
+        with pytest.raises(farm.ConfigError, match=r"expected tcp/HOST:PORT or tls/HOST:PORT, or several of them"):
+            farm.Farm("finger-gait", connect=connect)  # type: ignore[arg-type]
+    with pytest.raises(farm.ConfigError, match="workers is 0; expected 1 to 1024 processes on this machine"):
         farm.Farm("finger-gait", workers=0)
 
 

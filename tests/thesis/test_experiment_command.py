@@ -118,7 +118,7 @@ def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (("fig-9",), "unknown experiment 'fig-9'; known are fig-4.1"),
         ((), "which experiment? python -m benchmarks.thesis --list shows them"),
         (("fig-4.5", "--out", str(tmp_path / "side")), "side holds fig-4.3: give another --out"),
-        (("fig-4.3", "--workers", "0"), "nobody would simulate"),
+        (("fig-4.3", "--workers", "0"), "there would be no workers"),
         (("fig-4.3", "--trials", "0"), "trials is 0; expected 1 to 1000"),
         (("plot", "nowhere"), "nowhere is not an experiment's folder"),
     ):
@@ -137,7 +137,7 @@ def test_an_interrupted_experiment_goes_on_to_the_same_numbers(farm: Farm, done:
     begun.send_signal(signal.SIGTERM)
     said, _ = begun.communicate(timeout=60)
     assert begun.returncode == 130, said
-    assert "the same command goes on with them" in said
+    assert "the same command continues with them" in said
     call(farm, *SHORT, "--out", "side")
     assert hashes(farm.folder / "side").items() <= hashes(done.folder / "side").items()
     assert len(hashes(farm.folder / "side")) == 6

@@ -1,1 +1,1 @@
-"""Finger gaiting: an Allegro hand changes its grip of an object by touch (Plage 2016)."""
+"""Finger gaiting: an Allegro hand changes its grip of an object (Plage 2016)."""

@@ -7,7 +7,8 @@ constant that is drawn for each rollout, so that the joints' deflection is a poo
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.settings import setting
+from farm.sim.channels import Channel
 from farm.sim.sim import Sim
 from farm.tasks.base import Record, Score, Task, TaskConfig, TaskSpec
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
@@ -92,7 +94,7 @@ class FragileBar(FingerGait):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
             "policy": "weighted-kernel", "width": 0.4, "weight_scale": 0.05, "algorithm": "snes", "pairs": 32,
-            "initial_sigma": 0.5, "generations": 20,
+            "initial_sigma": 0.5, "generations": 20, "average": 10,
         },
     }  # fmt: skip
     return_scale = Task.return_scale
@@ -153,6 +155,12 @@ class FragileBar(FingerGait):
         there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose]).all(axis=1)
         whole = (middle <= BREAKS).all(axis=1) & (record.steps == self.steps) & ~record.failed
         return np.asarray(_gentle(middle[:, last]).all(axis=1) & held & there & whole)
+
+    @cached_property
+    def channels(self) -> tuple[Channel, ...]:  # type: ignore[override]  # as the finger gait's
+        """The finger gait's, with the forces of the middle finger that are a success."""
+        window = {"middle": WINDOW}
+        return tuple(replace(c, limits=window) if c.name == "contacts/force" else c for c in super().channels)
 
     def exported(self) -> dict[str, Any]:
         """Nothing of its own."""

@@ -1,4 +1,4 @@
-"""Finger gaiting: from one grip of an object to another by touch (Plage 2016, ch. 3).
+"""Finger gaiting: from one grip of an object to another (Plage 2016, ch. 3).
 
 The hand closes a start grip round a frozen object and releases it; for `steps` control steps of SUBSTEPS x TIMESTEP
 the controller sets joint targets; a demonstration of the goal grip defines the reward.
@@ -103,7 +103,7 @@ class FingerGaitConfig(TaskConfig):
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
     state: str = "joints"
-    """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile."""
+    """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile | forces | cop."""
     reward: str = "full"
     """Reward: basic (thesis 3.3: joints, action) | full (3.5: tactile image and contact points as well) |
     limited (full, no action punished for more than its joint's range)."""
@@ -180,7 +180,7 @@ class Perturbation:
 
 
 class FingerGait(Task):
-    """An Allegro hand changes from one grip of an object to another by touch."""
+    """An Allegro hand changes from one grip of an object to another."""
 
     Config = FingerGaitConfig
     steps = 15

@@ -83,7 +83,7 @@ def test_names_that_a_certificate_does_not_take(
 ) -> None:
     before = files(tmp_path)
     for name in ("n" * 65, "n" * 100):
-        expected = f"{role} {name} has {len(name)} characters; a certificate takes 64"
+        expected = f"{role} {name} has {len(name)} characters; a certificate can have at most 64"
         assert expected in refused(["add", str(folder), f"--{role}", "ok", f"--{role}", name], capsys)
         assert expected in refused(["new", str(tmp_path / "b"), "--learner", "h", f"--{role}", name], capsys)
     for name in ("", "n" * 101, "größe", "a b", "a/b"):

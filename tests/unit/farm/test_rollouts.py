@@ -243,9 +243,12 @@ def test_other_code_is_refused_and_named(spec, file, name, words, digest):
     [
         ({"task": "juggling"}, r"unknown task 'juggling'; known are finger-gait, fragile-bar, gym, or FILE\.py:CLASS"),
         ({"policy": "pid"}, "unknown policy 'pid'; known are direct"),
-        ({"policy_release": "mine 2"}, "the run has direct of mine 2, here is the farm's"),
-        ({"task": "finger-gait", "release": "theirs 1"}, "the run has finger-gait of theirs 1, here is the farm's"),
-        ({"task_release": "gymnasium 9"}, "the run has pole.py:Pole of gymnasium 9, here is "),
+        ({"policy_release": "mine 2"}, "the run uses direct of mine 2, but here direct belongs to rolloutfarm"),
+        (
+            {"task": "finger-gait", "release": "theirs 1"},
+            "the run uses finger-gait of theirs 1, but here finger-gait belongs to rolloutfarm",
+        ),
+        ({"task_release": "gymnasium 9"}, "the run uses pole.py:Pole of gymnasium 9, but .* is installed here"),
         ({"task_config": {"colour": "red"}}, "pole.py:Pole: unknown setting colour; known are steps"),
         ({"task_config": {"steps": "15"}}, "steps is '15'; expected int"),
         ({"task_config": {"steps": np.array([15, 15])}}, "steps is .*; expected int"),
@@ -282,7 +285,7 @@ def test_what_is_no_task_is_no_task(spec, tmp_path):
     path = tmp_path / "pole.py"
     path.write_text("class Pole:\n    pass\n")
     code = spec.code | {"task": plugins.find("tasks", f"{path}:Pole").digest()}
-    with pytest.raises(UnservedError, match="pole.py:Pole is no Task"):
+    with pytest.raises(UnservedError, match="pole.py:Pole is not a Task"):
         served(replace(spec, code=code), (path,))
 
 

@@ -263,7 +263,7 @@ def test_help_is_silent_on_what_need_not_be_given(
     with pytest.raises(SystemExit):
         arguments.parse(Everything, ["--help"], "farm try")
     said = capsys.readouterr().out
-    for none in ("(default: None)", "{None}|", "{None,"):
+    for none in ("(default: None)", "(default: '')", "{None}|", "{None,"):
         assert none not in said
     assert "--limit INT" in said
     assert "(default: 3)" in said

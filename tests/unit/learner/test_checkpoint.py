@@ -16,7 +16,7 @@ from farm.errors import CheckpointError
 from farm.net import codec
 from learner import checkpoint as checkpoints
 from learner.algorithms import PGPE, PGPEState
-from learner.checkpoint import BestRollout, Checkpoint, load, save
+from learner.checkpoint import BestRollout, Checkpoint, load, save, settle
 from learner.config import RunConfig, to_dict
 
 RNG = np.random.default_rng(3)
@@ -155,7 +155,7 @@ def test_a_failure_leaves_the_old_one(tmp_path: Path, whole: bytes, monkeypatch:
 
     monkeypatch.setattr(checkpoints.os if call == "fsync" else Path, call, full)
     with pytest.raises(OSError, match="No space left"):
-        save(path, checkpoint(rollouts=240))
+        save(path, checkpoint(rollouts=240), durable=True)
     monkeypatch.undo()
     assert path.read_bytes() == whole
     assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"], "the torn new one takes room"
@@ -168,3 +168,26 @@ def test_more_than_a_message_may_hold(tmp_path: Path) -> None:
     save(tmp_path / "checkpoint", large)
     assert (tmp_path / "checkpoint").stat().st_size > codec.MAX_BYTES
     assert load(tmp_path / "checkpoint").constants["frequencies"].shape == large.constants["frequencies"].shape
+
+
+def test_a_file_that_a_power_failure_tore_has_a_copy(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "checkpoint"
+    save(path, checkpoint(rollouts=1), durable=True)
+    save(path, checkpoint(rollouts=2))
+    assert load(path).rollouts == 2
+    assert not caplog.records
+
+    path.write_bytes(path.read_bytes()[:-100])
+    assert load(path).rollouts == 1
+    assert "checkpoint is missing or damaged; going on from its copy checkpoint.safe" in caplog.text
+
+
+def test_a_run_that_is_over_has_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    save(path, checkpoint(rollouts=1), durable=True)
+    save(path, checkpoint(rollouts=2))
+    settle(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["checkpoint"]
+    path.write_bytes(b"")
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
+        load(path)

@@ -64,7 +64,7 @@ def test_names_are_as_short_as_they_can_be() -> None:
 
 def test_a_run_without_a_generation(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "r", RunConfig())
-    with pytest.raises(ConfigError, match="has no generation behind it"):
+    with pytest.raises(ConfigError, match="has done no generation yet"):
         compare.read([folder])
 
 

@@ -155,7 +155,7 @@ def test_names_that_two_parts_have_are_refused(file: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("NoTask", r"NoTask is no Task: derive its class from farm\.Task"),
+        ("NoTask", r"NoTask is not a Task: derive its class from farm\.Task"),
         ("Bare", r"put @dataclass\(frozen=True"),
         ("Flat", "presets of .*: expected tables of settings by name"),
         ("Strange", r"derive its Config from farm\.TaskConfig"),
@@ -165,7 +165,7 @@ def test_names_that_two_parts_have_are_refused(file: Path) -> None:
 def test_classes_that_are_no_tasks_or_have_no_settings(file: Path, name: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         RunConfig(task=f"{file}:{name}")
-    with pytest.raises(ConfigError, match="is no Policy"):
+    with pytest.raises(ConfigError, match="is not a Policy"):
         RunConfig(policy=f"{file}:Pole")
     with pytest.raises(ConfigError, match="is no algorithm: it needs signs"):
         RunConfig(algorithm=f"{file}:Pole")

@@ -2,6 +2,7 @@
 
 import io
 import logging
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -16,24 +17,44 @@ from learner.telemetry.report import Report
 ATTACK = "\x1b[2J\x1b]0;owned\a\u202e\x9b3J [bold]"
 
 
-def test_nothing_of_the_network_reaches_the_terminal_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logging.root, "handlers", [])
-    worker = WorkerStatus(
-        worker=f"w{ATTACK}/1", host=f"h{ATTACK}", cores=1, version="1", canary="c", rollouts=1, rate=1.0, seen=1.0
-    )
+def screen(workers: list[WorkerStatus], width: int, show: Callable[[], None] = lambda: None) -> str:
+    """What a terminal of that width is sent for one generation."""
     learner = SimpleNamespace(config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0))
-    farm = SimpleNamespace(census=lambda: [worker])
+    farm = SimpleNamespace(census=lambda: workers)
     run = cast("Any", SimpleNamespace(learner=learner, farm=farm, recording=None, live=None))
-    numbers = dict.fromkeys(GenerationStats.__dataclass_fields__, 1)
-    progress = GenerationStats(**cast("Any", numbers))
+    progress = GenerationStats(**cast("Any", dict.fromkeys(GenerationStats.__dataclass_fields__, 1)))
     report = Report(progress=progress, rate=1.0, sample=None, traces={}, replay=None, replay_generation=0)
     file = io.StringIO()
-    with LiveDisplay(Console(file=file, force_terminal=True, width=300, color_system=None), run, []) as shown:
-        logging.getLogger().warning("it says %s", ATTACK)
+    with LiveDisplay(Console(file=file, force_terminal=True, width=width, color_system=None), run, []) as shown:
+        show()
         shown.show(report)
-    said = file.getvalue()
+    return file.getvalue()
+
+
+def worker(name: str, rate: float, host: str = "h") -> WorkerStatus:
+    return WorkerStatus(worker=name, host=host, cores=1, version="1", canary="c", rollouts=1, rate=rate, seen=1.0)
+
+
+def test_nothing_of_the_network_reaches_the_terminal_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.root, "handlers", [])
+    attacker = worker(f"w{ATTACK}/1", 1.0, f"h{ATTACK}")
+    said = screen([attacker], 300, lambda: logging.getLogger().warning("it says %s", ATTACK))
     assert "it says \\x1b[2J" in said
     assert "h\\x1b[2J" in said
     for part in ("\x1b[2J", "\x1b]", "\a", "\u202e", "\x9b"):
         assert part not in said
     assert "[bold]" in said
+
+
+def test_the_workers_rates_add_up_to_the_farms() -> None:
+    said = screen([worker(f"h/{i}", 0.5 + i) for i in range(9)], 80)
+    rates = [int(line.split("rollouts/s")[0].split()[-1]) for line in said.splitlines() if "rollouts/s" in line]
+    named = [int(line.split()[0]) for line in said.splitlines() if "h/" in line or line.strip().endswith(" more")]
+    assert rates[-1] == sum(named[-7:])
+
+
+@pytest.mark.parametrize("width", [58, 80, 120])
+def test_nothing_is_cut_off(width: int) -> None:
+    said = screen([worker("lab-machine-3/123456", 1234.0, "lab-machine-3")], width)
+    assert "…" not in said
+    assert "1 rollouts ended early, 1 failed" in said

@@ -195,11 +195,11 @@ def test_a_full_disk_leaves_the_last_generation(pole: str, tmp_path: Path, monke
     next(reports)
     before = state(tmp_path / "r")
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(checkpoints, "save", full)
-    with pytest.raises(RunError, match=r"No space left on device; the run stands as of generation 1: make room and"):
+    with pytest.raises(RunError, match=r"No space left on device; the run is saved up to generation 1: make room and"):
         next(reports)
     monkeypatch.undo()
     assert learner.state.generation == 1

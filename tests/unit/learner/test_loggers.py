@@ -122,7 +122,7 @@ def test_one_that_fails_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixt
     (tmp_path / "own.py").write_text(OWN)
     logged((f"{tmp_path}/own.py:Failing", "tensorboard"), tmp_path, last=3)
     (said,) = caplog.messages
-    assert said == f"--log {tmp_path}/own.py:Failing ends here, learning goes on: OSError: the disk is full"
+    assert said == f"--log {tmp_path}/own.py:Failing ends here, learning continues: OSError: the disk is full"
     assert (tmp_path / "own.txt").read_text() == "3 0"
     assert max(event.step for event in events(tmp_path / "tensorboard")) == 3
 

@@ -37,5 +37,5 @@ def test_changed_code_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
         after = farm.load(folder.path).rollout().rollouts.returns
     np.testing.assert_allclose(after - before, 3.0)
     assert [m.partition(": ")[2] for m in caplog.messages] == [
-        "the code of its task has changed since the run began; these are numbers of today's"
+        "the code of its task has changed since the run began; these are the numbers of the present code"
     ]

@@ -88,7 +88,7 @@ def test_a_run_that_began_from_another(task: str, tmp_path: Path, caplog: pytest
     assert rewind(tmp_path / "s", 1).returns.tolist() != first.tolist()
     (said,) = caplog.messages
     assert "these are not the rollouts of generation 1 to the last bit" in said
-    assert "the run it began from has changed" in said
+    assert "--init-from run have changed" in said
 
 
 def test_the_best_the_worst_and_those_that_ended(task: str, tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_a_number_of_pairs_that_cannot_be(task: str, tmp_path: Path) -> None:
 def test_rollouts_that_there_are_not(task: str, tmp_path: Path) -> None:
     learnt(task, tmp_path / "r")
     for generation in (0, 9):
-        with pytest.raises(ConfigError, match=f"generation {generation} of the run .* it has generations 1 to 4"):
+        with pytest.raises(ConfigError, match=f"generation {generation} of the run .* it has done generations 1 to 4"):
             rewind(tmp_path / "r", generation)
     with pytest.raises(ConfigError, match="generation 1 has no rollout 8: there are 0 to 7"):
         rewind(tmp_path / "r", 1).rollout(8)

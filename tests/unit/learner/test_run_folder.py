@@ -103,6 +103,29 @@ def test_read_back_exactly(folder: RunFolder) -> None:
     assert rows["mu"][3].tobytes() == ROWS[4][0].tobytes()
 
 
+def test_means_are_averaged_over_the_last_generations(folder: RunFolder) -> None:
+    fill(folder, 6)
+    mu = ROWS[6][0]
+    assert folder.average(6, mu, 1) is mu
+    np.testing.assert_array_equal(folder.average(6, mu, 3), (ROWS[4][0] + ROWS[5][0] + mu) / 3)
+    whole = sum(ROWS[g][0] for g in range(1, 7)) / 6
+    np.testing.assert_array_equal(folder.average(6, mu, 6), whole)
+    np.testing.assert_array_equal(folder.average(6, mu, 100), whole)  # there are no more
+    np.testing.assert_array_equal(folder.average(1, mu, 100), mu)
+
+
+def test_means_that_are_not_stored_are_not_averaged(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    np.testing.assert_array_equal(folder.average(6, ROWS[6][0], 3), ROWS[6][0])
+    assert "parameters lacks means of generations 4 to 5: the average is of 1 instead of 3" in caplog.text
+    monkeypatch.setattr(folders, "PARAMETERS_LIMIT", 440)  # every second generation is stored
+    fill(folder, 7)
+    np.testing.assert_array_equal(folder.average(7, ROWS[7][0], 4), (ROWS[4][0] + ROWS[6][0] + ROWS[7][0]) / 3)
+    np.testing.assert_array_equal(folder.average(12, ROWS[12][0], 4), ROWS[12][0])
+    assert "lacks means of generations 9 to 11: the average is of 1 instead of 2" in caplog.text
+
+
 @pytest.mark.parametrize(("limit", "kept"), [(880, 1), (879, 2), (440, 2), (439, 3), (87, 11)])
 def test_beyond_the_limit_every_kth_is_kept(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, limit: int, kept: int
@@ -205,6 +228,17 @@ def test_a_crash_tears_off_an_end_without_a_word(folder: RunFolder, caplog: pyte
     folder.rewind(checkpoint(3))
     assert not caplog.messages
     assert not list(folder.path.glob("*.damaged*"))
+
+
+def test_parameters_that_end_before_the_checkpoint_are_refused(folder: RunFolder) -> None:
+    fill(folder, 3)
+    with pytest.raises(
+        CheckpointError, match=r"ends with generation 3, the checkpoint is of 5; if there is a checkpoint\.safe"
+    ):
+        folder.rewind(checkpoint(5))
+    assert_holds(folder, [1, 2, 3])
+    (folder.path / "parameters").unlink()
+    folder.rewind(checkpoint(5))
 
 
 def test_what_cannot_be_copied_is_not_cut(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:

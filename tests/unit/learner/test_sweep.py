@@ -109,7 +109,7 @@ def test_values_that_make_no_name_are_numbered(tmp_path):
         (("--seed", "4"), "--seed is for one run: give --seeds"),
         (("--seeds", "x"), "--seeds 'x' is not of the form"),
         (("--nope", "3"), "unrecognized options"),
-        (("--workers", "0"), "nobody would simulate"),
+        (("--workers", "0"), "there would be no workers"),
         (("--parallel", "0"), "parallel is 0; expected 1 to 256"),
     ],
 )

@@ -101,6 +101,25 @@ def test_tip_frames_look_along_the_finger_and_to_the_object(scene, data):
         assert along[2] > 0.02
 
 
+def test_what_is_shown_of_a_link_touches_nothing_and_is_a_little_larger(scene):
+    model = scene.model
+    shells = [i for i in range(model.ngeom) if model.geom(i).name.endswith("_shell")]
+    assert len(shells) == (model.geom_group == 3).sum() == 15
+    for i in shells:
+        box = model.geom(model.geom(i).name.removesuffix("_shell")).id
+        assert (model.geom_contype[i], model.geom_conaffinity[i]) == (0, 0)
+        assert (model.geom_contype[box], model.geom_conaffinity[box]) == (1, 2)
+        assert (model.geom_group[i], model.geom_group[box]) == (2, 3)
+        assert model.geom_bodyid[i] == model.geom_bodyid[box]
+        mesh, turned = model.geom_dataid[i], np.zeros(9)
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        mujoco.mju_quat2Mat(turned, model.geom_quat[i])  # MuJoCo turns a mesh to its principal axes
+        vertices = model.mesh_vert[first : first + count] @ turned.reshape(3, 3).T
+        larger = np.abs(vertices).max(axis=0) / model.geom_size[box]
+        assert ((larger > 1.0) & (larger < 1.0201)).all()
+        np.testing.assert_allclose(model.geom_pos[i], model.geom_pos[box], atol=1e-6)
+
+
 # ---------------------------------------------------------------- figures
 
 

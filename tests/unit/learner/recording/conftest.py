@@ -32,7 +32,10 @@ MJCF = """
 """
 PLACES = np.stack([np.arange(18.0).reshape(6, 3) / 100, np.arange(18.0).reshape(6, 3) / 50])
 CHANNELS = (
-    Channel(name="touch/force", kind="scalars", shape=(2,), labels=("left", "right side"), unit="N"),
+    Channel(
+        name="touch/force", kind="scalars", shape=(2,), labels=("left", "right side"), unit="N",
+        limits={"right side": (0.25, 1.5)},
+    ),
     Channel(name="touch/state", kind="flags", shape=(2,), labels=("left", "right side")),
     Channel(
         name="pads", kind="images", shape=(2, 2, 3), labels=("left", "right side"), top=2.0, bodies=("ball", "arm"),

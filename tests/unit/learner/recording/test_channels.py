@@ -36,6 +36,34 @@ def test_curves_hold_what_the_rollout_held(written):
     assert rows.fixed("/actions", "names") == ["1", "2"]
 
 
+def test_limits_are_constant_lines_beside_their_curve(written):
+    shown, rows = written
+    assert rows.column("/touch/force/limits", "scalars") == [[0.25, 1.5]] * 7
+    assert rows.times("/touch/force/limits") == rows.times("/touch/force")
+    assert rows.fixed("/touch/force/limits", "names") == ["right side, least 0.25 N", "right side, most 1.5 N"]
+    shade = 0xF2CF7FFF  # between that of "right side" and white
+    assert rows.fixed("/touch/force/limits", "colors") == [shade, shade]
+    assert rows.fixed("/touch/force/limits", "widths") < rows.fixed("/touch/force", "widths")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"limits": {"c": (0.0, 1.0)}},
+        {"limits": {"a": (1.0, 0.0)}},
+        {"kind": "flags", "limits": {"a": (0, 1)}},
+        {"limits": {"a": ("0", "1")}},
+        {"limits": {"a": (0, 1, 2)}},
+        {"limits": {"a": (0, float("inf"))}},
+    ],
+)
+def test_limits_without_a_curve_or_a_range_are_refused(wrong):
+    with pytest.raises(
+        ConfigError, match=r"channel x: limits \(.*\) of '[ac]'; expected two rising finite numbers for scalars"
+    ):
+        Channel(**{"name": "x", "kind": "scalars", "shape": (2,), "labels": ("a", "b"), **wrong})
+
+
 def test_bodies_are_where_they_were(written, scene):
     shown, rows = written
     poses = shown.bodies[:, scene.bodies.index("arm")]
@@ -164,6 +192,20 @@ def test_a_plane_is_a_thin_box_with_its_top_where_the_plane_is(size, sides):
 def test_an_ellipsoid_has_three_radii():
     shape = Geometry("e", "b", "ellipsoid", (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (1.0, 0, 0, 0), (1.0, 0, 0, 1.0))
     np.testing.assert_allclose(solid(shape).half_sizes.as_arrow_array().to_pylist(), [[0.1, 0.2, 0.3]], rtol=1e-6)
+
+
+def test_a_mesh_is_turned_and_placed_with_normals_that_look_outwards():
+    half = np.sqrt(0.5)  # turned by 90 degrees about z: x becomes y
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    place, turn, colour = (1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (0.2, 0.4, 0.6, 1.0)
+    drawn = solid(Geometry("m", "b", "mesh", (1.0, 1.0, 1.0), place, turn, colour, corners, faces))
+    found = np.array(drawn.vertex_positions.as_arrow_array().to_pylist())
+    np.testing.assert_allclose(found, [[1, 2, 3], [1, 3, 3], [0, 2, 3], [1, 2, 4]], atol=1e-6)
+    normals = np.array(drawn.vertex_normals.as_arrow_array().to_pylist())
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    assert (np.sum(normals * (found - found.mean(axis=0)), axis=1) > 0).all()
+    assert drawn.triangle_indices.as_arrow_array().to_pylist() == faces.tolist()
 
 
 def test_colours_run_from_violet_to_yellow():

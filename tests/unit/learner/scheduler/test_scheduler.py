@@ -12,7 +12,7 @@ from learner.scheduler.scheduler import Assignment, Scheduler, SchedulerConfig
 
 def started(jobs, workers=(), *, credits=4, seconds=None, **config):
     """Return a scheduler in a round of `jobs`; `seconds` a job are known from a round before."""
-    scheduler = Scheduler(SchedulerConfig(**{"chunk_seconds": 0.08, **config}))
+    scheduler = Scheduler(SchedulerConfig(**{"chunk_seconds": 0.08, "short_seconds": 0.0, **config}))
     if seconds is not None:
         scheduler.begin(1)
         scheduler.want("teacher", 1, now=-seconds)
@@ -149,6 +149,13 @@ def test_chunks_do_not_shrink_below_what_is_worth_a_message():
     assert [len(chunk.indices) for chunk in scheduler.assign(0.0)] == [8, 8, 2, 2]
     scheduler = started(6, ["a", "b"], credits=100, seconds=0.001, least_seconds=0.008)
     assert [len(chunk.indices) for chunk in scheduler.assign(0.0)] == [3, 3]
+
+
+def test_a_short_round_is_not_cut():
+    scheduler = started(31, ["a", "b"], credits=100, seconds=0.003, short_seconds=0.06)
+    assert [len(chunk.indices) for chunk in scheduler.assign(0.0)] == [16, 15]
+    scheduler = started(42, ["a", "b"], credits=100, seconds=0.003, short_seconds=0.06)
+    assert [len(chunk.indices) for chunk in scheduler.assign(0.0)] == [11, 11, 10, 10]
 
 
 def test_what_is_left_after_the_first_chunks_is_dealt_evenly():

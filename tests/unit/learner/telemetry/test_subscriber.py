@@ -149,7 +149,7 @@ def test_another_run_of_the_same_name(told: tuple[Told, Subscriber]) -> None:
     learner.page = replace(learner.page, incarnation="two", generation=0, config=config)
     learner.history = ReportLog()
     learner.report(1)
-    with pytest.raises(RunError, match="run r began anew: --seed was 0 and is 5"):
+    with pytest.raises(RunError, match="run r was started again with --seed 5 instead of 0"):
         next(reports)
 
 

@@ -10,7 +10,7 @@ import pytest
 from farm.errors import ConfigError
 from farm.rollouts import Runner
 from farm.tasks.base import Record
-from farm.tasks.finger_gait.fragile_bar import BREAKS, HEIGHT, TERMS, FragileBar, FragileBarConfig
+from farm.tasks.finger_gait.fragile_bar import BREAKS, HEIGHT, TERMS, WINDOW, FragileBar, FragileBarConfig
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.loop import Batch, Rollouts, Seed, again
 
@@ -165,3 +165,8 @@ def test_settings_that_make_no_sense() -> None:
         FragileBarConfig(steps=2)
     with pytest.raises(ConfigError, match="bias"):
         FragileBarConfig(bias=-1.0)
+
+
+def test_the_force_that_is_allowed_is_shown():
+    channels = {channel.name: channel for channel in FragileBar().channels}
+    assert channels["contacts/force"].limits == {"middle": WINDOW}

@@ -1,0 +1,247 @@
+"""A plate turned by regrasping: a script, not a policy, and what comes of it from perturbed starts; one table.
+
+    python benchmarks/turning.py [--reach 4,6,8,10] [--cycles 8] [--starts 200] [--video FILE.gif] [--torsion 2]
+
+The plate lies on the thumb. Index and middle finger push it in opposite directions, then each of them is lifted,
+brought back and set down, while the other one holds. The script knows the model's kinematics and nothing of what
+happens. Reach and torsional friction are in mm; the film is of the first reach. Of several starts a row has the least
+turn and speed, the latest time, the largest tilt and drift.
+"""
+
+import argparse
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from farm import seeds
+from farm.arrays import BoolArray, FloatArray
+from farm.sim import rendering, video
+from farm.sim.channels import Camera
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks.finger_gait import model
+from farm.tasks.finger_gait.grasp import Grasping
+from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS, LOWER, UPPER
+from farm.tasks.finger_gait.model import Hand
+from farm.tasks.finger_gait.task import MAX_SHIFT, TIMESTEP, FingerGait, FingerGaitConfig
+from farm.tasks.loop import Seed, again
+
+MOST_TILT: Final = 30.0
+"""Tilt from which the plate counts as dropped [deg]."""
+CAMERA: Final = Camera(lookat=(0.062, 0.022, 0.022), distance=0.2, azimuth=158.0, elevation=-42.0)
+TURN: Final = 360.0
+"""What is to be reached [deg]."""
+SIDE: Final = (264, 216)
+"""Width and height of the film [pixels]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Script:
+    """What the fingers do in a cycle."""
+
+    reach: float = 0.006
+    """How far from the plate's middle a stroke begins and ends [m]."""
+    press: float = 2.0
+    """Force with which index and middle finger are told to press [N]."""
+    thumb: float = 3.0
+    """The thumb's [N]."""
+    pinch: float = 2.5
+    """The thumb's while one finger is lifted [N]."""
+    lift: float = 0.01
+    """How high a finger is lifted [m]."""
+    stroke: float = 0.5
+    """Time of a stroke [s]."""
+    move: float = 0.1
+    """Time to lift a finger, to bring it back, to set it down: each [s]."""
+
+
+class Keys:
+    """Joint targets of places over the plate, by the model's kinematics."""
+
+    def __init__(self, hand: Hand, script: Script) -> None:
+        self.script = script
+        self._hand, self._data = hand, mujoco.MjData(hand.model)
+        grasping = Grasping(hand)
+        self._centre, self._touch = grasping.centre, grasping.contact
+        self._height = {finger: float(self._reached(finger, grasping.contact)[2]) for finger in FINGERS}
+
+    def targets(self, index: float, middle: float, lifted: str = "") -> FloatArray:
+        """Targets with the fingers so far along x from the plate's middle, one of them lifted or none, (8,)."""
+        script, out = self.script, np.empty(len(JOINTS))
+        for finger, along in (("index", index), ("middle", middle)):
+            own = 0.0 if finger == lifted else -script.press
+            out[FINGER_JOINTS[finger]] = self._at(finger, along, script.lift if finger == lifted else 0.0, own)
+        out[FINGER_JOINTS["thumb"]] = self._at("thumb", 0.0, 0.0, script.pinch if lifted else script.thumb)
+        return np.clip(out, LOWER, UPPER)
+
+    def _at(self, finger: str, along: float, up: float, force: float) -> FloatArray:
+        """A finger's targets at a place, pressing upwards with a force: J' F / k beyond the place."""
+        joints, own = FINGER_JOINTS[finger], self._hand.model
+        goal = np.array([self._centre[0] + along, self._height[finger] + up])
+        values, jacobian = self._touch.copy(), np.empty((3, own.nv))
+        for _ in range(40):
+            error = goal - self._reached(finger, values)[[0, 2]]
+            mujoco.mj_jacSite(own, self._data, jacobian, None, self._site(finger))
+            plane = jacobian[[0, 2]][:, joints]
+            values[joints] += np.linalg.lstsq(plane, error, rcond=None)[0]
+        return values[joints] + jacobian[2, joints] * force / own.actuator_gainprm[joints, 0]
+
+    def _reached(self, finger: str, values: FloatArray) -> FloatArray:
+        """Where a fingertip is [m]."""
+        self._data.qpos[: len(JOINTS)] = values
+        mujoco.mj_kinematics(self._hand.model, self._data)
+        mujoco.mj_comPos(self._hand.model, self._data)
+        return self._data.site_xpos[self._site(finger)].copy()
+
+    def _site(self, finger: str) -> int:
+        return self._hand.tip_sites[FINGERS.index(finger)]
+
+
+def phases(keys: Keys) -> list[tuple[FloatArray, float]]:
+    """A cycle: targets, and the time in which they are approached [s]."""
+    script, far = keys.script, keys.script.reach
+    return [
+        (keys.targets(far, -far), script.stroke),
+        (keys.targets(far, -far, "index"), script.move),
+        (keys.targets(-far, -far, "index"), script.move),
+        (keys.targets(-far, -far), script.move),
+        (keys.targets(-far, -far, "middle"), script.move),
+        (keys.targets(-far, far, "middle"), script.move),
+        (keys.targets(-far, far), script.move),
+    ]
+
+
+def script_of(keys: Keys, cycles: int) -> FloatArray:
+    """Targets for each physics step, (T, 8): to where a stroke begins, and the cycles."""
+    begin = (keys.targets(-keys.script.reach, keys.script.reach), keys.script.stroke)
+    last, out = keys.targets(0.0, 0.0), []
+    for targets, seconds in [begin, *phases(keys) * cycles]:
+        part = np.arange(1, round(seconds / TIMESTEP) + 1)[:, None] / max(1, round(seconds / TIMESTEP))
+        out.append(last + (targets - last) * part)
+        last = targets
+    return np.concatenate(out)
+
+
+@dataclass(frozen=True)
+class Turned:
+    """What the plate did at each physics step after its release, in B rollouts."""
+
+    degrees: FloatArray
+    """About the vertical, counted on from turn to turn, clockwise seen from above, (B, T)."""
+    tilt: FloatArray
+    """Of the plate's upright axis [deg], (B, T)."""
+    drift: FloatArray
+    """Of its centre from where it was released [m], (B, T)."""
+    lost: BoolArray
+    """No fingertip touches it, or it is out of place, at this step or at one before, (B, T)."""
+    felt: BoolArray
+    """Which fingertips touch it, (B, T, 3)."""
+    qpos: FloatArray
+    """(B, T, nq)."""
+
+    def first(self, row: int) -> "Turned":
+        """One rollout until the plate was lost."""
+        steps = max(1, int(np.argmax(self.lost[row]))) if self.lost[row].any() else self.lost.shape[1]
+        one = slice(row, row + 1)
+        return Turned(*(getattr(self, field.name)[one, :steps] for field in fields(self)))
+
+
+def task(object_name: str = "plate", torsion: float | None = None) -> FingerGait:
+    """The finger gait's hand, three-finger grip and perturbations, with an object as it is or of other friction."""
+    three = "index+middle+thumb"
+    config = FingerGaitConfig(object=object_name, pose="between", start_grip=three, goal_grip=three)
+    if torsion is None:
+        return FingerGait(config)
+    files = model.files(config.object, config.pose)
+    thing = ET.fromstring(files["object.xml"])
+    for geom in thing.iterfind(".//geom[@friction]"):
+        sliding, _, rolling = geom.attrib["friction"].split()
+        geom.set("priority", "1")
+        geom.set("friction", f"{sliding} {torsion} {rolling}")
+    return FingerGait(config, files={**files, "object.xml": ET.tostring(thing, encoding="unicode")})
+
+
+def turn(gait: FingerGait, targets: FloatArray, starts: Sequence[Seed]) -> Turned:
+    """Close the grip at each start, release the plate, and play the targets (T, 8)."""
+    sim = Sim(gait.engine(lambda own: BatchEngine(own, len(starts))))
+
+    def played() -> tuple[FloatArray, BoolArray]:
+        gait.setup(sim)
+        sim.begin(len(starts))
+        gait.prepare(sim, [None if seed is None else np.random.default_rng(seed) for seed in starts])
+        sim.start(np.arange(len(starts)))
+        poses, felt = [], []
+        for each in targets:
+            poses.append(sim.qpos.copy())
+            sim.play(each[None])
+            felt.append((gait.measure(sim)["force"] > 0).any(axis=-1))
+        return np.stack(poses, axis=1), np.stack(felt, axis=1)
+
+    qpos, felt = again(played)
+    w, x, y, z = np.moveaxis(qpos[..., -4:], -1, 0)
+    heading = np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), axis=1)
+    tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
+    place = qpos[..., -7:-4]
+    drift = np.linalg.norm(place - place[:, :1], axis=-1)
+    lost = np.maximum.accumulate(~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1)
+    return Turned(np.degrees(heading[:, :1] - heading), tilt, drift, lost, felt, qpos)
+
+
+def main() -> None:
+    """Turn it, and print what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--object", default="plate")
+    parser.add_argument("--reach", default="6", help="half a stroke [mm], several with commas")
+    parser.add_argument("--torsion", type=float, help="torsional friction of the object [mm]; the plate has 2")
+    parser.add_argument("--cycles", type=int, default=8)
+    parser.add_argument("--starts", type=int, default=200, help="perturbed ones")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="a film of the nominal start: .gif or .mp4")
+    chosen = parser.parse_args()
+    if chosen.video is not None:
+        video.check(chosen.video)
+    gait = task(chosen.object, chosen.torsion and 1e-3 * chosen.torsion)
+    print(
+        "| reach [mm] | start | turned [deg] | in [s] | deg/s | 360 after [s] | tilt [deg] | drift [mm] | reached 360 |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for number, reach in enumerate(chosen.reach.split(",")):
+        keys = Keys(gait.hand, Script(reach=1e-3 * float(reach)))
+        turned = turn(gait, script_of(keys, chosen.cycles), [None, *(seeds.trial(0, i) for i in range(chosen.starts))])
+        print(f"| {reach} | nominal | {row(turned, slice(0, 1))} |")
+        if chosen.starts:
+            print(f"| | {chosen.starts} perturbed | {row(turned, slice(1, None))} |", flush=True)
+        if chosen.video is not None and not number:
+            video.write(chosen.video, film(gait, turned))
+
+
+def row(turned: Turned, rows: slice) -> str:
+    """Cells of the table: of several rollouts the least turn, the latest time, the largest tilt and drift."""
+    each = [turned.first(i) for i in range(len(turned.lost))[rows]]
+    whole = [i for i in each if i.degrees[0].max(initial=0.0) >= TURN]
+    degrees = min(i.degrees[0, -1] for i in each)
+    seconds = max(i.degrees.shape[1] for i in each) * TIMESTEP
+    speed = min(i.degrees[0, -1] / (i.degrees.shape[1] * TIMESTEP) for i in each)
+    late = [int(np.argmax(i.degrees[0] >= TURN)) * TIMESTEP for i in whole]
+    after = f"{max(late):.1f}" if late else "-"
+    tilt, drift = max(i.tilt.max() for i in each), max(1e3 * i.drift.max() for i in each)
+    reached = f"{len(whole)} of {len(each)}"
+    return f"{degrees:.0f} | {seconds:.1f} | {speed:.0f} | {after} | {tilt:.1f} | {drift:.1f} | {reached}"
+
+
+def film(gait: FingerGait, turned: Turned) -> Iterator[rendering.Picture]:
+    """The first rollout in real time, until the plate is round."""
+    first = turned.first(0)
+    round_at = np.flatnonzero(first.degrees[0] >= TURN)
+    poses = first.qpos[0, : round_at[0] + 1] if len(round_at) else first.qpos[0]
+    shown = video.moments((np.arange(len(poses)) * TIMESTEP).tolist(), speed=1.0, rest=0.0)[::2]
+    for picture in rendering.pictures(gait.model, poses[shown], SIDE, camera=CAMERA):
+        yield from (picture, picture)  # a gif keeps it once
+
+
+if __name__ == "__main__":
+    main()
