@@ -114,6 +114,7 @@ class SubprocessRunner:
           UnservedError: it does not answer, or cannot be begun again.
         """
         if self._process.ended:
+            self._process.close()
             self._start(RunnerProcess(self._folder))
         found = self._process.ask(Order(jobs=jobs, traces=traces, mu=mu, normaliser=normaliser), _JOBS).results
         if found is None:

@@ -115,6 +115,7 @@ def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, c
     safe.results()
     first = process(worker).pid
     os.kill(first, signal.SIGKILL)
+    until(lambda: process(worker)._process.ended)
     author.send(worker.id, 1)
     assert indices(safe.results()) == [1], "its job is tried once more"
     pid = process(worker).pid
