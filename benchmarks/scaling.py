@@ -59,7 +59,7 @@ class MadeUp:
 
     def __init__(self, task: Task, policy: Policy) -> None:
         """Know the shapes that a learner expects."""
-        self.policy, self.spec, self._parts = policy, policy.spec, task.substeps
+        self.size, self.spec, self._parts = policy.size, policy.spec, task.substeps
         shapes = self.spec.shapes(len(Scene(task.model).bodies))
         self._plain = {name: shape for name, shape in shapes.items() if not name.startswith("channels/")}
         self._channels = {name[9:]: shape for name, shape in shapes.items() if name.startswith("channels/")}
@@ -126,17 +126,17 @@ class Emulated(Worker):
 
 
 class Noted(Events):
-    """Events that are sent on; not a round's mean, which is useful only together with jobs."""
+    """Events of which somebody is told, unless they wake nobody."""
 
     def __init__(self, tell: Callable[[], None]) -> None:
         """Know how to tell."""
         super().__init__()
         self._tell = tell
 
-    def put(self, event: Event) -> None:
+    def put(self, event: Event, *, wake: bool = True) -> None:
         """Append, and tell."""
-        super().put(event)
-        if event.topic != "generation":
+        super().put(event, wake=wake)
+        if wake:
             self._tell()
 
 

@@ -135,6 +135,7 @@ class Audit:
     def assign(self, workers: Sequence[str], now: float, patience: float) -> dict[str, list[int]]:
         """Whom to ask what now. A check that nobody can answer is dropped, unless two answers differ: that waits."""
         asked: dict[str, list[int]] = {}
+        parties = {name: self._party(name) for name in workers} if self._checks else {}
         for index, check in list(self._checks.items()):
             if check.asked and now - check.since > patience:
                 check.passed.add(check.asked)
@@ -142,8 +143,10 @@ class Audit:
             if check.asked:
                 continue
             hosts, canary = {party.host for party in check.answers}, self._whose(index).canary
-            alike = [name for name in workers if self._party(name).canary == canary and name not in check.passed]
-            free = [name for name in alike if host(name) not in hosts]
+            free = [
+                name for name, party in parties.items()
+                if party.canary == canary and party.host not in hosts and name not in check.passed
+            ]  # fmt: skip
             if free:
                 check.asked, check.since = min(free, key=lambda name: len(asked.get(name, ()))), now
                 asked.setdefault(check.asked, []).append(index)

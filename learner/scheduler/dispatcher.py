@@ -31,7 +31,8 @@ from learner.scheduler.scheduler import Scheduler, SchedulerConfig, Verdict
 log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] between two looks at whether to stop
-_STATUS: Final = 0.5  # [s] between two refreshments of the status
+_STATUS: Final = 0.5  # [s] between two refreshments of the status, at least
+_STATUS_PART: Final = 0.02  # of the learner's time that they may take: with a thousand workers one takes long
 _ASK: Final = 0.5  # [s] for a token that may be there
 _LOOKS: Final = 5  # tokens that are asked for at a time: for all at once Zenoh needs 9 s where there are 30 000
 _CHUNK: Final = 32 << 20  # [bytes] of eps in one message, unless one job alone has more
@@ -412,8 +413,8 @@ class Dispatcher:
         now = time.monotonic()
         if now < self._status_due:
             return
-        self._status_due = now + _STATUS
         self._look_who_is_there(now)
+        begun = time.monotonic()
         last, flood = self._progress, self._session.events.dropped
         if flood:
             self.ignored["flood"] = flood
@@ -430,6 +431,7 @@ class Dispatcher:
             workers=self.census(),
         )
         self._status = codec.encode(status)
+        self._status_due = max(now + _STATUS, begun + (time.monotonic() - begun) / _STATUS_PART)
 
     def _tell_when_alone(self) -> None:
         now = time.monotonic()

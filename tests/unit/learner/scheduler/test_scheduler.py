@@ -158,6 +158,15 @@ def test_a_short_round_is_not_cut():
     assert [len(chunk.indices) for chunk in scheduler.assign(0.0)] == [11, 11, 10, 10]
 
 
+def test_chunks_grow_with_the_farm_and_so_does_patience():
+    names = [f"w{i:03}" for i in range(600)]
+    scheduler = started(60_000, names, credits=128, seconds=0.02, chunk_seconds=0.2)
+    assert scheduler.patience == 1.0
+    assert {len(chunk.indices) for chunk in scheduler.assign(0.0)} == {50}
+    assert scheduler.patience == 4.0
+    assert scheduler.next_deadline(0.0) == 4.0
+
+
 def test_what_is_left_after_the_first_chunks_is_dealt_evenly():
     names = [f"w{i:02}" for i in range(64)]
     scheduler = started(1001, names, credits=128, seconds=0.02, chunk_seconds=0.2)
