@@ -27,4 +27,4 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
     lines = [line.strip() for line in done.stdout.splitlines() if line.startswith("|")]
     heads = sum(line.startswith("|--") for line in lines)
     assert len(lines) - 2 * heads == rows, done.stdout
-    assert all(line.count("|") > 3 for line in lines)
+    assert all(line.count("|") >= 3 for line in lines)
