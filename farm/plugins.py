@@ -47,6 +47,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "backends": {
         "cpu": "workers.backends.cpu:CpuBackend",
+        "warp": "workers.backends.warp:WarpBackend",
     },
     "loggers": {
         "tensorboard": "learner.loggers.tensorboard:TensorBoard",
@@ -143,7 +144,8 @@ def find(kind: str, name: str) -> Plugin:
         try:
             found = Plugin(kind, name, getattr(load(module), attribute), variant)
         except ImportError as error:
-            raise ConfigError(f"{_one(kind)} {own!r} cannot be imported: {error}") from error
+            package = (error.name or "").partition(".")[0].replace("_", "-")  # built-in ones miss extras only
+            raise ConfigError(f"{_one(kind)} {own!r} needs {package}: pip install {package}") from error
     else:
         found = _from_package(kind, own, variant)
     takes = getattr(found.target, "takes", "")

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from farm import plugins, settings
-from farm.arrays import FloatArray
+from farm.arrays import FloatArray, IntArray
 from farm.errors import ConfigError, UnservedError
 from farm.moments import usable
 from farm.net.messages import Spec
@@ -27,13 +27,22 @@ SIMULATION = "farm.tasks.loop"
 class Runner:
     """Runs one run's jobs."""
 
-    def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine) -> None:
-        """Prepare what all rollouts need; a ConfigError if the task cannot start."""
+    def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine, *, exact: bool = True) -> None:
+        """Prepare what all rollouts need; a ConfigError if the task cannot start.
+
+        Args:
+          task: what is simulated.
+          policy: what decides the actions.
+          make: makes the engine.
+          exact: whether its numbers are MuJoCo's on a processor. If not, MuJoCo on this processor simulates the mean
+            policy and every rollout that is shown; the engine simulates what explores.
+        """
         quiet()
         self.task, self.policy = task, policy
         self.spec, self.scene = policy.spec, Scene(task.model)
         self.sim = Sim(task.engine(make))
-        loop.again(lambda: task.setup(self.sim))
+        self._judge = self.sim if exact else Sim(task.engine(BatchEngine))
+        loop.again(lambda: task.setup(self._judge))
 
     @property
     def size(self) -> int:
@@ -57,19 +66,21 @@ class Runner:
         theta, seeds = jobs.theta(mu), jobs.seeds()
         policies, wanted = self._normalised(normaliser), normaliser.shape[-1]
         kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: normalised in its own way
+        if self._judge is not self.sim:
+            kinds[(jobs.seen | ~jobs.explores) & ~jobs.physics] = 3  # as 0, but elsewhere
         kind_of, there = np.repeat(kinds, jobs.rollouts), set(kinds.tolist())
         returns, flags = np.zeros(len(theta)), np.zeros((len(theta), 4), dtype=bool)
         steps = np.zeros(len(theta), dtype="<i8")
         moments = np.zeros((len(theta), 1 + 2 * wanted) if wanted else (0, 0))
         seen: dict[int, WireTrajectory] = {}
-        values = np.empty((0, *self.spec.trace), dtype="<f4")
-        for kind, policy in enumerate(policies):
+        done: list[tuple[IntArray, loop.Rollouts]] = []
+        for kind, policy in enumerate((*policies, policies[0])):
             if kind not in there:
                 continue
-            rows, physics = np.flatnonzero(kind_of == kind), kind > 0
+            rows, physics = np.flatnonzero(kind_of == kind), kind in (1, 2)
             rollouts = loop.run(
-                self.task, policy, self.sim, theta[rows], [seeds[row] for row in rows.tolist()], int(physics),
-                moments=bool(wanted) and not physics,
+                self.task, policy, self._judge if kind else self.sim, theta[rows], [seeds[r] for r in rows.tolist()],
+                int(physics), moments=bool(wanted) and not physics,
             )  # fmt: skip
             returns[rows], flags[rows], steps[rows] = rollouts.returns, rollouts.flags, rollouts.steps
             if rollouts.moments.size:
@@ -77,10 +88,13 @@ class Runner:
             for job in np.flatnonzero(jobs.seen & (kinds == kind)).tolist():
                 first = int(jobs.rollouts[:job].sum())
                 seen[job] = WireTrajectory.of(self.trajectory(rollouts, int(np.searchsorted(rows, first))))
-            if not physics:
-                exploring = ~np.repeat(jobs.seen, jobs.rollouts)[rows]
-                chosen = traced(traces if self.spec.traced else "none", rollouts.returns, exploring)
-                values = loop.traces(self.task, self.spec, rollouts, chosen)
+            done.append((rows, rollouts))
+        chosen = traced(traces if self.spec.traced else "none", returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        values = np.zeros((len(chosen), *self.spec.trace), dtype="<f4")
+        for rows, rollouts in done:
+            mine = np.isin(chosen, rows)
+            if mine.any():
+                values[mine] = loop.traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
         return Simulated(returns, flags, steps, values, tuple(seen[job] for job in sorted(seen)), moments)
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy, Policy]:
@@ -102,7 +116,8 @@ class Runner:
 
     def close(self) -> None:
         """Give back what it holds."""
-        self.sim.engine.close()
+        for sim in {self.sim, self._judge}:
+            sim.engine.close()
 
 
 def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
@@ -167,3 +182,8 @@ def backend(name: str) -> Backend:
     if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
         raise ConfigError(f"{name} is no backend: it needs capacity and engine(model)")
     return cast("Backend", target())
+
+
+def exact(backend: Backend) -> bool:
+    """Whether a backend's numbers are those of the backend `cpu`."""
+    return bool(getattr(backend, "exact", True))

@@ -45,6 +45,8 @@ DOORS = {
     "tensorboardX": ("learner/loggers/tensorboard.py",),
     "wandb": ("learner/loggers/wandb.py",),
     "pyarrow": ("learner/outcomes.py",),
+    "mujoco_warp": ("workers/backends/warp.py",),
+    "warp": ("workers/backends/warp.py",),
     "imageio_ffmpeg": ("farm/sim/video.py",),
 }
 """The only modules that may import a package from outside."""

@@ -106,7 +106,8 @@ def serve(link: socket.socket) -> None:
     begin = receive(link, Begin)
     try:
         files = tuple(Path(path) for path in begin.files)
-        runner = Runner(*served(begin.spec, files), rollouts.backend(begin.backend).engine)
+        own = rollouts.backend(begin.backend)
+        runner = Runner(*served(begin.spec, files), own.engine, exact=rollouts.exact(own))
     except Exception as error:  # whatever the code may raise
         send(link, _failed(error, begin.files))
         return

@@ -67,7 +67,7 @@ class WorkerConfig(Settings):
     timeout: float | None = setting(None, least=0.0)
     """Give up when nobody answers for so long at the start [s]; by default keep trying."""
     backend: str = "cpu"
-    """What simulates: a name, or FILE.py:CLASS."""
+    """What simulates: a name (farm tasks lists them), or FILE.py:CLASS; its class says whether it needs --mixed."""
     allow_file: tuple[Path, ...] = ()
     """Serve runs whose task or policy is a class in this file, repeatable; the learner's must be the same file."""
     accept_code: bool = False
@@ -148,7 +148,7 @@ class Worker:
         self._sources = SourceCache()
         self._spare: RunnerProcess | None = None  # begun beforehand: imports take half a second
         self._backend = rollouts.backend(config.backend)
-        self._canary = fingerprint.digest()
+        self._canary = fingerprint.digest() if rollouts.exact(self._backend) else ""
         self._credits = 2 * self._backend.capacity
         self._mute = 0.0  # as _Served.mute, for all runs whose token was not seen
         self._spoke = time.monotonic()
@@ -408,7 +408,9 @@ class Worker:
                  (plugins.named_file(spec.policy), spec.code.get("policy", ""))}  # fmt: skip
         travels = sorted((name, digest) for name, digest in named - here if name)
         if not (travels and self._config.accept_code):
-            return Runner(*served(spec, self._config.allow_file), self._backend.engine)
+            return Runner(
+                *served(spec, self._config.allow_file), self._backend.engine, exact=rollouts.exact(self._backend)
+            )
         for name, digest in travels:
             path = self._sources.place(name, digest)
             if not path.is_file():

@@ -121,6 +121,11 @@ class Jobs:
         return np.count_nonzero(self.table[:, _SIGN], axis=1)
 
     @property
+    def explores(self) -> BoolArray:
+        """Which jobs have parameters of their own, (J,)."""
+        return self.table[:, _EXPLORES] != 0
+
+    @property
     def seen(self) -> BoolArray:
         """Which jobs want a trajectory, (J,)."""
         return self.table[:, _RATE] != RATES.index("none")

@@ -32,7 +32,7 @@ class BatchEngine:
         """A live array over all rows."""
         known = self._fields.get(name)
         if known is None:
-            _check_field(name)
+            check_field(name)
             known = self._fields[name] = self._batch.bind(name)
             if not known.flags.writeable:
                 raise Rebound
@@ -114,9 +114,9 @@ class DataEngine:
 
     def field(self, name: str) -> AnyArray:
         """A live array of one row."""
-        _check_field(name)
+        check_field(name)
         values = np.asarray(getattr(self.data, name))[None]
-        if name not in _STATE_FIELDS:
+        if name not in STATE_FIELDS:
             values.flags.writeable = False
         return values
 
@@ -169,12 +169,14 @@ class DataEngine:
         """Hold nothing that Python does not give back."""
 
 
-def _check_field(name: str) -> None:
+def check_field(name: str) -> None:
+    """Raise an AttributeError unless MjData has such a field."""
     if name not in mujoco.batch.DATA_FIELDS:
         raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
 
 
-_STATE_FIELDS = (
-        "time", "qpos", "qvel", "act", "history", "qacc_warmstart", "plugin_state", "ctrl", "qfrc_applied",
-        "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata",
-)  # fmt: skip
+STATE_FIELDS = (
+    *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "plugin_state", "ctrl", "qfrc_applied"),
+    *("xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata"),
+)
+"""Fields of MjData that can be written; all others are outputs."""

@@ -74,6 +74,8 @@ class Backend(Protocol):
 
     capacity: ClassVar[int]
     """Rollouts that are worth having at a time."""
+    exact: ClassVar[bool]
+    """Whether its numbers are those of the backend `cpu` to the last bit; true where a class does not say."""
 
     def engine(self, model: mujoco.MjModel) -> Engine:
         """Make room for a model's simulations."""

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import tyro
 
-from farm import plugins, seeds, settings
+from farm import plugins, rollouts, seeds, settings
 from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError, TaskError
+from farm.rollouts import Runner
 from farm.tasks.base import TaskConfig
 from learner import config as configs
 from learner.commands.replay import ReplayCommand
@@ -36,6 +37,8 @@ class CheckCommand:
     """The task: a name, gym:NAME, or FILE.py:CLASS."""
     picture: Path | None = None
     """Where to write the picture of the start, NAME.png; by default the task's name."""
+    backend: str = "cpu"
+    """Backend that is compared with cpu, in returns and rollouts per second: a name, or FILE.py:CLASS."""
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task."""
 
@@ -50,7 +53,7 @@ def main(words: Sequence[str]) -> int:
     assert own is not None
     settings.distinct(RunCommand(run=own), "farm run")
     settings.distinct(ReplayCommand(run=Path(), task=own.task_config), "farm replay")
-    for line in checked(replace(own, task_config=command.task), command.picture):
+    for line in checked(replace(own, task_config=command.task), command.picture, command.backend):
         say(line)
     return 0
 
@@ -62,10 +65,11 @@ def _name(words: Sequence[str]) -> str | None:
     return next(iter(named or loose), None)
 
 
-def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
+def checked(config: RunConfig, picture: Path | None, backend: str = "cpu") -> Iterator[str]:
     """Lines about a task, as they are found out; a TaskError where rollouts depend on their batch."""
     from learner.setup import problem
 
+    other = None if backend == "cpu" else rollouts.backend(backend)
     found = problem(config)
     spec, model = found.spec, found.task.model
     low, high = found.task.limits
@@ -90,17 +94,29 @@ def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
         _same({k: v[row] for k, v in _arrays(together).items()}, {k: v[0] for k, v in _arrays(alone).items()}, "alone")
     runner.trajectory(together, 0)
     yield "same bits together, in another order, and one by one"
-    begun, many = time.perf_counter(), np.tile(theta, (4, 1))
-    runner.rollouts(many, drawn * 4)
-    yield f"{len(many) / (time.perf_counter() - begun):.0f} rollouts/s on one core"
+    yield f"{_speed(runner, theta, drawn):.0f} rollouts/s on one core"
+    if other is not None:
+        compared = Runner(found.task, found.policy, other.engine, exact=rollouts.exact(other))
+        most = np.abs(compared.rollouts(theta, drawn).returns - together.returns).max()
+        if most and rollouts.exact(other):
+            raise TaskError(f"returns on backend {backend} differ by up to {most:.3g}: its class needs exact = False")
+        speed = _speed(compared, theta, drawn)
+        yield f"backend {backend}: returns differ by at most {most:.3g}; {speed:.0f} rollouts/s"
     yield _picture(found, together.start["qpos"][0], picture)
 
 
-def _arrays(rollouts: "Rollouts") -> dict[str, FloatArray]:
+def _speed(runner: Runner, theta: FloatArray, drawn: list[tuple[int, ...] | None]) -> float:
+    """Rollouts per second of a batch four times as large."""
+    begun, many = time.perf_counter(), np.tile(theta, (4, 1))
+    runner.rollouts(many, drawn * 4)
+    return len(many) / (time.perf_counter() - begun)
+
+
+def _arrays(of: "Rollouts") -> dict[str, FloatArray]:
     """Everything that must not depend on the batch, the earliest cause first."""
-    out = {f"{name} at the start": values for name, values in rollouts.start.items()}
-    out |= {"actions": rollouts.actions, **rollouts.frames}
-    return out | {name: getattr(rollouts, name) for name in ("terms", "returns", "success", "ended")}
+    out = {f"{name} at the start": values for name, values in of.start.items()}
+    out |= {"actions": of.actions, **of.frames}
+    return out | {name: getattr(of, name) for name in ("terms", "returns", "success", "ended")}
 
 
 def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str) -> None:

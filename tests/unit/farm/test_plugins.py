@@ -33,6 +33,8 @@ def test_built_in() -> None:
 )
 def test_every_built_in_one_is_there(kind: str, name: str) -> None:
     chosen = f"{name}:Swimmer-v5" if name == "gym" else name
+    if name == "warp":
+        pytest.importorskip("mujoco_warp")
     assert callable(find(kind, chosen).target)
 
 
@@ -41,7 +43,7 @@ def test_every_built_in_one_is_there(kind: str, name: str) -> None:
     [
         ("tasks", "juggling", r"unknown task 'juggling'; known are finger-gait, fragile-bar, gym, or FILE\.py:CLASS"),
         ("policies", "pid", r"unknown policy 'pid'; known are direct, .*, or FILE\.py:CLASS"),
-        ("backends", "gpu", r"unknown backend 'gpu'; known are cpu, or FILE"),
+        ("backends", "gpu", r"unknown backend 'gpu'; known are cpu, warp, or FILE"),
         ("commands", "fly", r"unknown command 'fly'; known are run, .*certificates$"),
         ("tasks", "gym", "task 'gym': expected gym:NAME"),
         ("tasks", "gym:", "task 'gym:': expected gym:NAME"),
@@ -268,3 +270,10 @@ def test_farm_alone_imports_nothing_heavy() -> None:
     code = "import sys, farm; farm.Task; print(*sorted({'mujoco', 'zenoh', 'rerun', 'tyro'} & set(sys.modules)))"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == "", "a task is declared without simulator or network"
+
+
+def test_a_backend_whose_simulator_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    monkeypatch.delitem(sys.modules, "workers.backends.warp", raising=False)
+    with pytest.raises(ConfigError, match="^backend 'warp' needs mujoco-warp: pip install mujoco-warp$"):
+        plugins.find("backends", "warp")

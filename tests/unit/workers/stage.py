@@ -33,7 +33,8 @@ class Runner:
     made: ClassVar[list[str]]
     ran: ClassVar[list[str]]
 
-    def __init__(self, name: str, policy: Any, make: Callable[..., Any]) -> None:
+    def __init__(self, name: str, policy: Any, make: Callable[..., Any], *, exact: bool) -> None:
+        assert exact
         self.name, self.size = name, policy.size
         self.made.append(name)
         assert callable(make)

@@ -1,0 +1,62 @@
+"""Physics steps per second of the backend `warp`, beside MuJoCo on this machine's processor; one table.
+
+    python benchmarks/gpu.py [--worlds 1024,4096,16384] [--tasks finger-gait,gym:Ant-v5,gym:HalfCheetah-v5]
+        [--steps 20] [--threads 2,16]
+
+Rollouts of a random linear policy, from perturbed starts, with everything that a control step needs: observation,
+action, reward. Steps before the start (closing a grip) take time but are not counted; compiling takes none. Without a
+GPU, MuJoCo Warp simulates on the processor, slowly: take few worlds.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from farm import configure, rollouts, seeds
+from farm.rollouts import Runner
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import MakeEngine
+from learner.setup import problem
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", default="1024,4096,16384")
+    parser.add_argument("--tasks", default="finger-gait,gym:Ant-v5,gym:HalfCheetah-v5")
+    parser.add_argument("--steps", type=int, default=20, help="control steps of a rollout")
+    parser.add_argument("--threads", default="2,16", help="of MuJoCo on the processor")
+    chosen = parser.parse_args()
+    print("| task | simulated by | together | physics steps/s |\n|---|---|---|---|")
+    for name in chosen.tasks.split(","):
+        for count in map(int, chosen.threads.split(",")):
+            row(name, f"{count} threads", 256, chosen.steps, threads(count, 256))
+        for worlds in map(int, chosen.worlds.split(",")):
+            made = rollouts.backend("warp")
+            made.__class__.capacity = worlds
+            row(name, "warp", worlds, chosen.steps, made.engine, exact=False)
+
+
+def threads(count: int, size: int) -> MakeEngine:
+    """Engines of MuJoCo on so many threads."""
+    make: Callable[..., BatchEngine] = BatchEngine
+    return lambda model: make(model, size, count)
+
+
+def row(name: str, by: str, worlds: int, steps: int, make: MakeEngine, *, exact: bool = True) -> None:
+    """Run once to compile, run again, and print."""
+    found = problem(configure(name, policy="linear", steps=steps))
+    runner = Runner(found.task, found.policy, make, exact=exact)
+    theta = 0.1 * np.random.default_rng(0).standard_normal((worlds, runner.size))
+    drawn: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(worlds)]
+    runner.rollouts(theta, drawn)
+    begun = time.perf_counter()
+    done = runner.rollouts(theta, drawn)
+    speed = found.task.substeps * done.steps.sum() / (time.perf_counter() - begun)
+    print(f"| {name} | {by} | {worlds} | {speed:.3g} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

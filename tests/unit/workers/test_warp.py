@@ -1,0 +1,124 @@
+"""The backend `warp` on the processor, which MuJoCo Warp can use as a device: few worlds, the same code."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from farm import seeds
+from farm.arrays import FloatArray
+from farm.errors import FarmError
+from farm.net.work import Jobs
+from farm.policies.networks import Linear
+from farm.rollouts import Runner, backend, exact
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks.base import Task, TaskConfig
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # compiling takes a minute, once for each machine
+pytest.importorskip("mujoco_warp")
+warp = pytest.importorskip("workers.backends.warp")
+
+ROWS = 6
+
+
+class Kicked(Task):
+    """A paddle pushes a ball, of a mass of its own in each rollout, over the ground."""
+
+    xml = """
+<mujoco>
+  <option timestep="0.005" integrator="implicitfast" cone="elliptic"/>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 0.05"><freejoint/><geom size="0.05" mass="0.2"/></body>
+    <body pos="-0.06 0 0.2">
+      <joint name="a" axis="0 1 0" damping="0.2"/><geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.01" mass="0.3"/>
+    </body>
+  </worldbody>
+  <actuator><position joint="a" kp="2"/></actuator>
+</mujoco>"""
+    steps, substeps = 5, 10
+
+    def reset(self, sim: Sim, row: int, rng: np.random.Generator | None) -> None:
+        """Another mass, another place."""
+        if rng is not None:
+            sim.expand("body_mass")[row, 1] *= rng.uniform(0.5, 2.0)
+            sim.qpos[row, :2] += rng.uniform(0.0, 0.01, 2)
+
+    def reward(self, sim: Sim, action: FloatArray) -> FloatArray:
+        """How far the ball is, and how the paddle stands."""
+        reward: FloatArray = sim.qpos[:, 0] + 0.1 * sim.xquat[:, 2, 2] - 0.01 * (action * action).sum(axis=1)
+        return reward
+
+
+@pytest.fixture(scope="module")
+def runners() -> tuple[Runner, Runner]:
+    """Of one task, on the processor and in Warp."""
+    made = backend("warp")
+    assert not exact(made)
+    task = Kicked(TaskConfig())
+    policy = Linear(Linear.Config(), task.spec(), {})
+    return Runner(task, policy), Runner(task, policy, made.engine, exact=False)
+
+
+def jobs(policy: Linear) -> Jobs:
+    """Three pairs, and the mean, shown."""
+    eps = 0.3 * np.random.default_rng(0).standard_normal((3, policy.size))
+    drawn = [seeds.trial(0, i) for i in range(3)]
+    return Jobs.joined([Jobs.exploring(eps, (1, -1), drawn), Jobs.mean("control", [None])])
+
+
+def test_returns_are_mujocos_to_single_precision(runners: tuple[Runner, Runner]) -> None:
+    cpu, gpu = runners
+    theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
+    drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    expected, got = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)
+    assert np.allclose(got.start["qpos"], expected.start["qpos"], atol=1e-6)
+    assert not np.array_equal(got.returns, expected.returns), "it was Warp that simulated"
+    np.testing.assert_allclose(got.returns, expected.returns, rtol=1e-3)
+    np.testing.assert_allclose(got.frames["qpos"], expected.frames["qpos"], atol=1e-4)
+
+
+def test_a_rollouts_numbers_do_not_depend_on_the_others(runners: tuple[Runner, Runner]) -> None:
+    _, gpu = runners
+    theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, gpu.size))
+    drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    together, order = gpu.rollouts(theta, drawn), np.random.default_rng(1).permutation(ROWS)
+    permuted = gpu.rollouts(theta[order], [drawn[i] for i in order])
+    alone = gpu.rollouts(theta[2:3], [drawn[2]])
+    assert np.array_equal(permuted.returns, together.returns[order])
+    assert np.array_equal(alone.frames["qpos"][0], together.frames["qpos"][2])
+
+
+def test_the_mean_and_what_is_shown_are_the_processors(runners: tuple[Runner, Runner]) -> None:
+    cpu, gpu = runners
+    asked, mu = jobs(cpu.policy), np.full(cpu.size, 0.1)  # type: ignore[arg-type]
+    expected, got = cpu.run(mu, asked), gpu.run(mu, asked)
+    assert got.returns[-1] == expected.returns[-1]
+    assert np.array_equal(got.trajectories[0].bodies, expected.trajectories[0].bodies)
+    assert (got.returns[:-1] != expected.returns[:-1]).any()
+
+
+def test_too_little_room_is_noticed_and_doubled(
+    runners: tuple[Runner, Runner], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cpu, gpu = runners
+    theta = 0.3 * np.random.default_rng(0).standard_normal((2, cpu.size))
+    monkeypatch.setattr(warp, "_defaults", lambda _: (1, 2))
+    small = Runner(cpu.task, cpu.policy, lambda model: warp.WarpEngine(model, 4), exact=False)
+    got = small.rollouts(theta, [None, None])
+    assert small.sim.engine._room > 1  # type: ignore[attr-defined]
+    np.testing.assert_allclose(got.returns, gpu.rollouts(theta, [None, None]).returns, rtol=0.02)
+    monkeypatch.setattr(warp, "_MOST_ROOM", 2)
+    small = Runner(cpu.task, cpu.policy, lambda model: warp.WarpEngine(model, 4), exact=False)
+    with pytest.raises(FarmError, match="has no room for this model's contacts"):
+        small.rollouts(theta, [None, None])
+
+
+def test_a_model_that_it_cannot_simulate_is_refused_in_a_line() -> None:
+    joints = "".join('<body><joint type="slide"/><geom size="0.1"/></body>' for _ in range(61))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option jacobian="dense"/><worldbody>{joints}</worldbody></mujoco>'
+    )
+    assert BatchEngine(model, 1).size == 1
+    with pytest.raises(FarmError, match="MuJoCo Warp cannot simulate this model: Dense is unsupported"):
+        warp.WarpEngine(model, 4)

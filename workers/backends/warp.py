@@ -1,0 +1,235 @@
+"""The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU; the only door to it.
+
+Everything on the device is in single precision, so the numbers are not those of the backend `cpu`. Arrays for tasks
+are in the host's memory, read back after control steps, not after each physics step.
+"""
+
+import copy
+from typing import Any, ClassVar, Final
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import warp
+
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.errors import FarmError
+from farm.sim.engines import STATE_FIELDS, check_field
+from farm.sim.sim import Rebound, failed_rows, own_value
+
+_Overflow: Final = mujoco_warp.OverflowType
+_FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATIONS))
+"""What there was no room for; that a solver stops at its last iteration is no such thing."""
+_MOST_ROOM: Final = 64
+_DERIVED: Final = (
+    *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
+    *("geom_aabb", "geom_rbound", "eq_data"),
+)
+"""Constants that follow from fields that may differ between rollouts."""
+
+
+class WarpBackend:
+    """Makes engines of MuJoCo Warp, on the GPU if there is one.
+
+    Its workers take part in runs with `--mixed`. MuJoCo on the worker's processor simulates the mean policy and
+    whatever is shown: only exploring rollouts are the GPU's.
+    """
+
+    capacity: ClassVar[int] = 4096
+    exact: ClassVar[bool] = False
+
+    def engine(self, model: mujoco.MjModel) -> "WarpEngine":
+        """Make room for a model's simulations."""
+        return WarpEngine(model, self.capacity)
+
+
+class WarpEngine:
+    """Simulations of one model in MuJoCo Warp, each in a world of its own."""
+
+    def __init__(self, model: mujoco.MjModel, size: int) -> None:
+        """Allow `size` rows; the device's memory is taken when they are used.
+
+        Raises:
+          FarmError: MuJoCo Warp does not simulate such a model.
+        """
+        warp.config.log_level = warp.LOG_WARNING
+        self.model, self.size = model, size
+        self._plain = copy.copy(model)
+        self._plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp never resets by itself
+        self._host: dict[str, AnyArray] = {}  # (size, ...)
+        self._expanded: dict[str, AnyArray] = {}  # (size, ...)
+        self._example = mujoco.MjData(model)
+        self._worlds, self._room, self._graph = 0, 1, None
+        self._device: Any = None
+        self._data: Any = None
+        self._put(1)
+
+    def field(self, name: str) -> AnyArray:
+        """A live array over all rows."""
+        known = self._host.get(name)
+        if known is None:
+            check_field(name)
+            if not hasattr(self._data, name):
+                raise AttributeError(f"sim has no {name!r} on the backend warp: MuJoCo Warp does not give it")
+            like = np.asarray(getattr(self._example, name))
+            known = self._host[name] = np.zeros((self.size, *like.shape), like.dtype)
+            self._read(name)
+        known = known.view()
+        known.flags.writeable = name in STATE_FIELDS
+        return known
+
+    def reset(self, ids: IntArray) -> None:
+        """Bring all rows to the model's own start."""
+        self._put(len(ids))
+        mujoco_warp.reset_data(self._device, self._data)
+        self._read_all()
+
+    def step(self, ids: IntArray, count: int) -> None:
+        """Advance rows by physics steps."""
+        self._write()
+        for _ in range(count):
+            self._advance()
+        self._checked(ids)
+
+    def play(self, ids: IntArray, controls: FloatArray) -> None:
+        """Advance rows by one physics step for each of their controls."""
+        self._write()
+        row = np.zeros((self._worlds, self.model.nu), dtype=np.float32)
+        for step in range(controls.shape[1]):
+            row[ids] = controls[:, step]
+            self._data.ctrl.assign(row)
+            self._advance()
+        self._checked(ids)
+
+    def forward(self, ids: IntArray) -> None:
+        """Compute outputs."""
+        self._write()
+        mujoco_warp.forward(self._device, self._data)
+        self._checked(ids)
+
+    def copy(self, sources: IntArray) -> None:
+        """Give row i the state of row sources[i]."""
+        self._write()
+        state = {name: _numbers(getattr(self._data, name))[sources] for name in STATE_FIELDS if self._has(name)}
+        self._put(len(sources))
+        for name, values in state.items():
+            whole = _numbers(getattr(self._data, name))
+            whole[: len(sources)] = values
+            getattr(self._data, name).assign(whole)
+            if name in self._host:
+                self._read(name)
+
+    def blown_up(self, ids: IntArray) -> BoolArray:
+        """Rows whose state is no longer a reasonable number."""
+        return failed_rows(np.concatenate([self.field(name)[ids] for name in ("qpos", "qvel", "act")], axis=1))
+
+    def contact_forces(self, ids: IntArray) -> FloatArray:
+        """Forces of contacts on every body of rows, (n, nbody, 6)."""
+        mujoco_warp.rne_postconstraint(self._device, self._data)
+        return _numbers(self._data.cfrc_ext)[ids].astype(float)
+
+    def expand(self, name: str) -> AnyArray:
+        """A field of the model with values for each row."""
+        if name not in self._expanded:
+            own = np.asarray(own_value(self.model, name))
+            self._expanded[name] = np.tile(own, (self.size, *[1] * own.ndim))
+            self._model()
+        return self._expanded[name]
+
+    def set_const(self, ids: IntArray) -> None:  # noqa: ARG002  those of all rows are updated
+        """Update derived constants."""
+        for name, values in self._expanded.items():
+            field = getattr(self._device, name)
+            field.assign(_like(values[: self._worlds], field))
+        mujoco_warp.set_const(self._device, self._data)
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._device = self._data = self._graph = None
+
+    def _put(self, rows: int) -> None:
+        """Have at least so many worlds; states of those that there were are lost if there are more now."""
+        if rows <= self._worlds:
+            return
+        self._worlds = min(self.size, 1 << (rows - 1).bit_length())
+        self._model()
+        contacts, constraints = (int(n) for n in _defaults(self._plain))
+        self._data = mujoco_warp.make_data(
+            self._plain, nworld=self._worlds, nconmax=self._room * contacts, njmax=self._room * constraints
+        )
+
+    def _model(self) -> None:
+        fields = {*self._expanded, *(_DERIVED if self._expanded else ())}
+        there = {name: self._worlds for name in fields if np.size(own_value(self.model, name))}
+        try:
+            self._device = mujoco_warp.put_model(self._plain, batch_sizes=there)
+        except (NotImplementedError, ValueError) as error:
+            raise FarmError(f"MuJoCo Warp cannot simulate this model: {error}") from None
+        self._device.opt.deterministic, self._device.opt.warn_overflow = True, False
+        self._device.opt.contact_sensor_maxmatch *= self._room
+        self._graph = None
+
+    def _advance(self) -> None:
+        """One physics step; on a GPU its hundreds of kernels are recorded once and launched together."""
+        if not warp.get_device().is_cuda:
+            mujoco_warp.step(self._device, self._data)
+            return
+        if self._graph is None:
+            mujoco_warp.step(self._device, self._data)  # compiles
+            with warp.ScopedCapture() as capture:
+                mujoco_warp.step(self._device, self._data)
+            self._graph = capture.graph
+            return
+        warp.capture_launch(self._graph)
+
+    def _checked(self, ids: IntArray) -> None:
+        """Read what is asked for back, unless there was no room for contacts or constraints.
+
+        Raises:
+          Rebound: the batch begins again with twice the room: what does not fit must not be left out silently.
+          FarmError: there is no end to it.
+        """
+        full = int(np.bitwise_or.reduce(_numbers(self._data.overflow)[ids], initial=0)) & _FULL
+        if not full:
+            self._read_all()
+            return
+        self._room, self._worlds = 2 * self._room, 0
+        if self._room > _MOST_ROOM:
+            raise FarmError(f"MuJoCo Warp has no room for this model's contacts: {_Overflow(full).name}")
+        raise Rebound
+
+    def _has(self, name: str) -> bool:
+        return hasattr(self._data, name) and np.size(getattr(self._example, name)) > 0
+
+    def _write(self) -> None:
+        """States as the host has them to the device; single precision back and forth changes nothing."""
+        for name, values in self._host.items():
+            if name in STATE_FIELDS and self._has(name):
+                field = getattr(self._data, name)
+                field.assign(_like(values[: self._worlds], field))
+
+    def _read_all(self) -> None:
+        for name in self._host:
+            self._read(name)
+
+    def _read(self, name: str) -> None:
+        if self._has(name):
+            known = self._host[name]
+            known[: self._worlds] = _numbers(getattr(self._data, name)).reshape(self._worlds, *known.shape[1:])
+
+
+def _numbers(values: Any) -> AnyArray:  # noqa: ANN401  a warp array
+    """On the host, a copy (worlds, ...)."""
+    return np.array(values.numpy())
+
+
+def _like(values: AnyArray, field: Any) -> AnyArray:  # noqa: ANN401  a warp array
+    """Values of the host in the device's type and shape."""
+    there = field.numpy()
+    return np.ascontiguousarray(values.reshape(there.shape), dtype=there.dtype)
+
+
+def _defaults(model: mujoco.MjModel) -> tuple[int, int]:
+    """Contacts and constraints for which MuJoCo Warp makes room in a world unless told otherwise."""
+    made = mujoco_warp.make_data(model)
+    return made.naconmax, made.njmax
