@@ -25,7 +25,7 @@ class RouterCommand:
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it): the router uses the learner's bundle."""
     trust_network: bool = False
-    """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
+    """Listen to other machines without certificates: everyone there can read everything and pose as a worker."""
     farm: str = "farm"
     """Name of the farm that access control is for."""
     print_config: bool = False

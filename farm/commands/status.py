@@ -29,7 +29,7 @@ class StatusCommand:
     """Shows the runs and workers of a farm, and how they are doing; on a terminal refreshed until Ctrl-C."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
+    """Where a learner or a router listens, repeatable; by default tcp/127.0.0.1:7447."""
     farm: str = "farm"
     """Name of the farm."""
     tls: Path | None = None

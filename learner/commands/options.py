@@ -32,7 +32,7 @@ class LearnerOptions:
     out: Path = Path("runs")
     """Folder in which run folders are made."""
     name: str = ""
-    """Name of the run and its folder; without one: task-preset-sSEED-UTC time."""
+    """Name of the run and its folder; by default task-preset-sSEED-UTC time."""
     record: bool = True
     """Record the run with Rerun."""
     log: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class LearnerOptions:
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
     trust_network: bool = False
-    """Listen to other machines without certificates: anybody there can read everything and pose as a worker."""
+    """Listen to other machines without certificates: everyone there can read everything and pose as a worker."""
     mixed: bool = False
     """Admit workers whose machines round differently, and resume with changed code: the run is not reproducible."""
     audit: float = setting(0.02, least=0.0, most=1.0)

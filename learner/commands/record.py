@@ -28,9 +28,9 @@ class RecordCommand:
     """Records a run on any machine, over the network: the whole run, even if it begins late."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
+    """Where a learner or a router listens, repeatable; by default tcp/127.0.0.1:7447."""
     run: str = ""
-    """Name of the run; without one: the only run on the farm, or the first that appears."""
+    """Name of the run; by default the only run on the farm, or the first that appears."""
     out: Path = Path("recordings")
     """Folder in which the recording's folder is made."""
     file: bool = True

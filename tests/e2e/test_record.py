@@ -77,7 +77,7 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     """Begun before there is a learner, with all there is to record."""
     endpoint = free_endpoint()
     process = farm.start("record", "--connect", endpoint)
-    until(process, "nobody answers")
+    until(process, "no answer from")
     flags = ("--name", "r", "--pairs", "3", "--generations", "12", "--traces", "all", "--listen", endpoint)
     farm.call("run", *flags)
     said = finish(process)

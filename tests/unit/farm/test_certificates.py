@@ -163,12 +163,12 @@ def test_a_key_that_others_can_read(folder: Path, capsys: pytest.CaptureFixture[
     key = folder / "worker-w1" / "key.pem"
     for mode in (0o644, 0o640, 0o602):
         key.chmod(mode)
-        with pytest.raises(ConfigError, match=rf"can be read by others \(mode {mode:04o}\).*: chmod 600 {key}"):
+        with pytest.raises(ConfigError, match=rf"can be read by other users \(mode {mode:04o}\).*: chmod 600 {key}"):
             find(folder, "worker")
     key.chmod(0o400)
     assert find(folder, "worker").name == "w1"
     (folder / "ca" / "key.pem").chmod(0o644)
-    assert "can be read by others (mode 0644)" in refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "can be read by other users (mode 0644)" in refused(["add", str(folder), "--worker", "w2"], capsys)
 
 
 def test_another_name_than_the_certificates_is_refused(folder: Path) -> None:
