@@ -35,7 +35,7 @@ COMMANDS: Final = {
     "record": "records a run on any machine, over the network",
     "view": "opens the recordings of runs in the Rerun viewer",
     "runs": "prints a table of the runs in a folder",
-    "status": "shows the runs and workers of a farm, and how they are doing",
+    "status": "shows the runs and workers of a farm, and their state",
     "router": "starts a permanent router that learners and workers connect to",
     "certificates": "makes certificates for a farm of several machines",
 }

@@ -171,7 +171,7 @@ class Session:
                     yield reply.ok.payload.to_bytes()
 
     def close(self) -> None:
-        """Undeclare everything and wait for the callbacks: one that still runs in Rust aborts the interpreter's exit."""
+        """Undeclare everything and wait for the callbacks: one left running in Rust aborts the interpreter's exit."""
         for token in self._tokens:
             token.undeclare()
         for declared in self._declared:

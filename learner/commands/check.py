@@ -1,4 +1,4 @@
-"""`farm check`: tells the author of a task in seconds what is wrong with it."""
+"""`farm check`: finds errors of a task in seconds."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from learner.setup import Problem
 
 ROWS = 8
-"""Rollouts that are compared."""
+"""Number of rollouts that are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +56,14 @@ def main(words: Sequence[str]) -> int:
 
 
 def _name(words: Sequence[str]) -> str | None:
-    """The task among the words: the first that looks like one, else the first that is no flag."""
+    """The task among the words: the first that looks like one, else the first that is not a flag."""
     loose = [word for word in words if not word.startswith("-")]
     named = [word for word in loose if ":" in word or word in plugins.names("tasks")]
     return next(iter(named or loose), None)
 
 
 def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
-    """Lines about a task, as they are found out; a TaskError where rollouts depend on their batch."""
+    """Yield lines about a task; a TaskError if rollouts depend on their batch."""
     from learner.setup import problem
 
     found = problem(config)
@@ -115,7 +115,7 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
 
 
 def _picture(found: "Problem", qpos: FloatArray, path: Path | None) -> str:
-    """Draw the start, and say where."""
+    """Draw the start; returns a line with the file's name."""
     from farm.sim import rendering
 
     target = path or Path(f"{type(found.task).__name__.lower()}.png")

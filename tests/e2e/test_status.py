@@ -58,7 +58,7 @@ def test_learners_of_another_release(farm: Farm) -> None:
         session.answer(keys.status("farm", "r"), lambda: codec.encode(STATUS, codec.SCHEMA + 1))
         said = farm.call("status", "--connect", endpoint, status=1)
     versions = f"schema version {codec.SCHEMA + 1}, this side has {codec.SCHEMA}"
-    assert f"a learner answers, but what it says cannot be read: {versions}" in said
+    assert f"a learner answers, but its message cannot be read: {versions}" in said
 
 
 def test_nobody_there(farm: Farm) -> None:
