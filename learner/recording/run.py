@@ -92,7 +92,7 @@ class RecorderThread:
             self._recorder.close(merge=self._merge)
         except Exception as error:
             self.failed = True
-            log.error("the recording ends here, learning goes on: %s", error)
+            log.error("the recording ends here, learning continues: %s", error)
             self._abandon()
 
     def _next(self) -> Callable[[], None] | None:
