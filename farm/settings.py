@@ -202,7 +202,7 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
     for each in dataclasses.fields(default):  # type: ignore[arg-type]
         value = getattr(default, each.name)
         if isinstance(value, tuple) and f"--{_flag(each.name)}" in given:
-            object.__setattr__(out, each.name, ())  # unchecked: what is given stands here in the end
+            object.__setattr__(out, each.name, ())  # not checked here: the given values replace them
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
             object.__setattr__(out, each.name, _emptied(value, arguments))
     return out

@@ -69,7 +69,7 @@ class RunConfig(Settings):
         """Fill in omitted settings, and check every value."""
         for part, kind in _PARTS.items():
             if name := getattr(self, part):
-                object.__setattr__(self, part, plugins.find(kind, name).name)  # a file's with its whole path
+                object.__setattr__(self, part, plugins.find(kind, name).name)  # of a file: with its absolute path
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()

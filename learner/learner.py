@@ -127,7 +127,7 @@ class Learner:
                     f"{before.generation}: {advice}"
                 ) from None
             if progress.failed == returns.size and not hopeless:
-                log.warning("the physics of all %d rollouts blew up: farm check shows how they start", returns.size)
+                log.warning("all %d rollouts became unstable: farm check shows how they start", returns.size)
             hopeless = progress.failed == returns.size
             farm.report(progress)
             yield Report(

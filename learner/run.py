@@ -149,7 +149,7 @@ class Run:
             if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
                 raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
         finally:
-            if state in ("finished", "diverged"):  # otherwise the run may go on
+            if state in ("finished", "diverged"):  # otherwise the run may continue
                 self.publisher.end(self.summary, evaluation, self.learner.best_generation)
 
 
@@ -270,7 +270,7 @@ class _Tending:
         if self.pool and time.monotonic() > self._next:
             self._next = time.monotonic() + _TEND
             if self.pool.tend() and not self.pool.pids:
-                raise RunError("no local worker keeps running; their own messages above say why")
+                raise RunError("no local worker keeps running; see their messages above")
         return self._stopped()
 
 

@@ -262,7 +262,7 @@ class RunFolder:
         if type(generation) is not int:
             raise CheckpointError(f"{self.checkpoint} holds no generation")
         size = np.asarray(checkpoint.state.get("mu")).size
-        whole = self._parameters_until(generation, size)  # or says why not
+        whole = self._parameters_until(generation, size)  # raises if unusable
         self._rewind_progress(generation)
         if whole is not None:
             with (self.path / "parameters").open("r+b") as file:

@@ -126,7 +126,7 @@ def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: "Runs", stopped
                 running.remove(learner)
                 _conclude(learner, shown)
             if pool and pool.tend() and not pool.pids:
-                raise RunError("no local worker keeps running; their own messages above say why")
+                raise RunError("no local worker keeps running; see their messages above")
             time.sleep(_LOOK)
         end([learner.process for learner in running], _GRACE)
         for learner in running:

@@ -22,7 +22,7 @@ class BatchEngine:
 
     def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
         """Make room for `size` rows; the physics runs on `threads`."""
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # what has blown up stays so
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # unstable states stay unstable
         self.model, self.size, self._threads = model, size, threads
         self._batch = mujoco.batch.Batch(model, size, threads)
         self._fields: dict[str, AnyArray] = {}

@@ -121,7 +121,7 @@ class Scene:
         return self.bodies.index(name)
 
     def poses(self, qpos: FloatArray) -> FloatArray:
-        """Where the drawn bodies are.
+        """Poses of the drawn bodies.
 
         Args:
           qpos: (F, nq) positions, one row per frame.

@@ -142,7 +142,7 @@ class Task:
         self.sources: Mapping[str, str] = self.files() if files is None else files
         self._model: mujoco.MjModel | None = None
 
-    # What is simulated
+    # Simulation
 
     def files(self) -> dict[str, str]:
         """Texts that decide numbers and are sent with a run, by name."""
@@ -214,7 +214,7 @@ class Task:
         raise NotImplementedError
 
     def measure(self, sim: "Sim") -> dict[str, FloatArray]:  # noqa: ARG002
-        """What is kept of every frame, (B, ...) each: values of channels, or what `score` and `show` need."""
+        """Values kept of every frame, (B, ...) each: those of channels, or those that `score` and `show` need."""
         return {}
 
     # Whole rollouts

@@ -192,7 +192,7 @@ class Environment(Task):
             return self.batched.reward(sim, sim.own["before"])
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where the environment terminated, (B,)."""
+        """Which environments terminated, (B,)."""
         return np.asarray(sim.terminated) if self.batched is None else self.batched.ended(sim)
 
 

@@ -59,7 +59,7 @@ class Batched:
         return np.square(action).sum(axis=1)
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where the environment terminates, (B,)."""
+        """Which rollouts the environment terminates, (B,)."""
         return np.zeros(len(sim), dtype=bool)
 
 
@@ -117,7 +117,7 @@ class Ant(Batched):
         self.main = env.data.body(env._main_body).id
 
     def before(self, sim: Sim) -> FloatArray:
-        """Where its main body is, (B, 2)."""
+        """Position of its main body, (B, 2)."""
         return np.array(sim.xpos[:, self.main, :2])
 
     def observe(self, sim: Sim) -> FloatArray:
@@ -161,7 +161,7 @@ class Humanoid(Ant):
         Batched.__init__(self, env)
 
     def before(self, sim: Sim) -> FloatArray:
-        """Where its centre of mass is, (B, 2)."""
+        """Position of its centre of mass, (B, 2)."""
         return self.centre(sim)
 
     def centre(self, sim: Sim) -> FloatArray:
@@ -225,7 +225,7 @@ class InvertedDoublePendulum(Batched):
         return np.concatenate(parts, axis=1)
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
-        """A bonus for standing, less how far the tip is from where it should be, and the speeds."""
+        """A bonus for standing, minus the tip's distance from its target and the speeds."""
         x, y = sim.site_xpos[:, 0, 0], sim.site_xpos[:, 0, 2]
         v1, v2 = sim.qvel[:, 1], sim.qvel[:, 2]
         bonus = self.env._healthy_reward * ~self.ended(sim)

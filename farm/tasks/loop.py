@@ -102,7 +102,7 @@ class Batch:
         task.prepare(sim, [None if seed is None else np.random.default_rng(seed) for seed in unique])
         sim.start(np.array([unique.index(seed) for seed in seeds]))
         count, self.active = len(seeds), np.arange(len(seeds))
-        self._start = {name: np.array(values) for name, values in self._measured().items()}  # they are live
+        self._start = {name: np.array(values) for name, values in self._measured().items()}  # the originals are live
         frames = (count, task.steps * self._parts)
         self._frames = {name: np.zeros((*frames, *values.shape[1:])) for name, values in self._start.items()}
         self._actions: FloatArray | None = None

@@ -81,7 +81,7 @@ def checked(config: RunConfig, picture: Path | None) -> Iterator[str]:
     least, most = together.returns.min(), together.returns.max()
     yield f"returns {least:.4g} to {most:.4g}, {int(together.ended.sum())} ended early"
     if together.failed.any():
-        yield f"warning: the physics of {int(together.failed.sum())} of {ROWS} rollouts blew up"
+        yield f"warning: the simulation of {int(together.failed.sum())} of {ROWS} rollouts became unstable"
     order = np.random.default_rng(1).permutation(ROWS)
     permuted = runner.rollouts(theta[order], [drawn[i] for i in order])
     _same(_arrays(together), {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()}, "in another order")

@@ -71,7 +71,7 @@ def learn(
                     path = path.with_name(f"{first}-{number}")
             assert run is not None
             shown = display.display(run, _announcement(run, place), chosen.style)
-            gc.freeze()  # what is there stays: looking through it for garbage took 20 ms a time
+            gc.freeze()  # existing objects stay: collecting garbage among them took 20 ms each time
             with shown:
                 for report in run.learn():
                     shown.show(report)

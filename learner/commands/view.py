@@ -78,7 +78,7 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
             if not web:
                 (show_table if table else show_newest)(port, gone)
             elif listens(page, gone):
-                live = [source for source in sources if "://" in source]  # these a browser reads itself
+                live = [source for source in sources if "://" in source]  # a browser can open these
                 say(_address(page, live or [f"rerun+http://127.0.0.1:{port}/proxy"]))
             while viewer.poll() is None and not stop.wait(_LOOK):
                 pass

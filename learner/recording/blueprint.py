@@ -22,9 +22,9 @@ _PICTURES: Final = 0.42  # height of the pictures below a scene of 1
 _CAPTION: Final = 0.16  # and of a caption alone
 _LEGEND: Final = 6  # no legend for more curves than this: it would hide them
 _MARGIN: Final = 1.6  # so many rollouts before the cursor: the legend covers the older ones
-_SEAM: Final = 1000  # [ns] before its end a rollout's last frame stands
+_SEAM: Final = 1000  # [ns] from a rollout's last frame to its end
 _FIRST: Final = 1.2  # height of the first plots, whose legend is mostly the longest; of others 1
-_ROWS: Final = 3  # more plots of a rollout stand in two columns
+_ROWS: Final = 3  # more plots of a rollout are in two columns
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ class Remote:
                     raise RunError(f"the learner cannot be understood: {error}") from None
                 self.done = message.generation
             if not self.recording.thread.settled():
-                raise RunError("the recording ended before its time; the line above says why")
+                raise RunError("the recording ended too early; see the message above")
 
     def _end(self, end: RunEnd) -> None:
         self.end = end

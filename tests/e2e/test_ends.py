@@ -137,7 +137,7 @@ def test_workers_that_cannot_work(farm: Farm, monkeypatch: pytest.MonkeyPatch) -
     (broken / "sitecustomize.py").write_text("import os, sys\nif 'workers' in sys.orig_argv:\n    os._exit(1)\n")
     monkeypatch.setenv("PYTHONPATH", str(broken))
     said = farm.call("run", "--name", "r", "--generations", "1", *SMALL, status=1)
-    assert "farm: no local worker keeps running; their own messages above say why" in said
+    assert "farm: no local worker keeps running; see their messages above" in said
     assert farm.summary("r")["state"] == "failed"
 
 
