@@ -53,8 +53,8 @@ class Accepted(Exception):  # noqa: N818  not an error
 
 
 def commands(page: Path) -> Iterator[tuple[str, bool]]:
-    """The commands of a page in order, and whether each is a line of code, not a part of the text."""
-    inside = ""
+    """The commands of a page, and whether each is a line of code, not a part of the text."""
+    inside, text = "", ""
     for line in page.read_text("utf-8").splitlines():
         if line.startswith("```"):
             inside = "" if inside else line
@@ -62,7 +62,8 @@ def commands(page: Path) -> Iterator[tuple[str, bool]]:
             for part in re.split(r" && ", line.strip()):
                 yield re.sub(r"^(/opt/rolloutfarm/|\.venv/)bin/", "", part), True
         elif not inside:
-            yield from ((part.replace("\\|", "|"), False) for part in re.findall(r"`([^`]+)`", line))
+            text += f"{line.strip()} "
+    yield from ((part.replace("\\|", "|"), False) for part in re.findall(r"`([^`]+)`", text))
 
 
 FOUND = [
