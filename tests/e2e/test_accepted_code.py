@@ -129,7 +129,7 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
         for worker in workers:
             said = ended(worker)
             for name in ("first", "second"):
-                assert f"run {name}: pole.py" in said
+                assert f"run {name}: received pole.py" in said
                 assert f"serving run {name}" in said
 
 
