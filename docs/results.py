@@ -54,39 +54,40 @@ FUTURE: Final = "future-work"
 
 HEAD = """# Results
 
-What Plage 2016 found, and the questions it left open, with this project: one page per question, claim by claim.
-Everything here is made by `docs/results.py` from the data in `docs/results/`. From a checkout, `python -m
-benchmarks.thesis plot docs/results` draws the figures again from it, and `python -m benchmarks.thesis NAME` does an
-experiment anew (`thesis` instead of a name: all of them; `--list` says what each costs).
+These pages test the claims of Plage 2016, and the questions that the thesis leaves open, with this project: one page
+per question. `docs/results.py` makes all of them from the data in `docs/results/`. From a checkout, `python -m
+benchmarks.thesis plot docs/results` draws the figures again from this data, and `python -m benchmarks.thesis NAME`
+repeats an experiment (`thesis` instead of a name repeats all; `--list` shows how long each takes).
 
 | question | experiment | verdict |
 |---|---|---|
 {overview}
 
-What the thesis proposes as future work (5.2), and what came of it, row by row: [{future}](results/{future}.md).
+What the thesis proposes as future work (5.2), and the result of each proposal: [{future}](results/{future}.md).
 
 Results that have pages of their own:
 
 | question | answer |
 |---|---|
 | [Does touch decide?](touch.md) | {touch} |
-| [How long does a chain of gaits go on?](chain.md) | ten cycles or more in five seeds of five |
+| [How many cycles does a chain of gaits make?](chain.md) | ten or more with each of five seeds |
 | [Can an object be turned?](turning.md) | a plate, by a script, not learnt: 360 degrees from each of 200 starts |
-| [How surely do the presets learn?](seeds.md) | `default` in ten seeds of ten, `thesis` in eight of ten |
+| [How reliably do the presets learn?](seeds.md) | `default` with ten of ten seeds, `thesis` with eight of ten |
 | [How do the learners compare with published scores?](learners.md) | a table per environment |
 
 ## How to read the pages
 
-A set-up is run with seeds 0 to {last}. Its settings are the preset `thesis` with what the figure's caption or text
-says, or what the preset `default` was then: mu 1.75, sigma 0.8, N 15, alpha_mu 0.1 ([method.md](method.md)). **Learnt**
-means: the final mean policy does the gait on the nominal start and on at least 80 % of 100 perturbed ones. Numbers are
-the mean over the trials, and in brackets the least and the greatest. To compare returns (weights *projected*): holding
-still gives -5.4, the three-finger grip's commands at once -0.07.
+Each set-up is run with seeds 0 to {last}, its *trials*. Its settings are the preset `thesis` with the changes in the
+thesis' caption or text, or the former preset `default`: mu 1.75, sigma 0.8, N 15, alpha_mu 0.1
+([method.md](method.md) explains the symbols). **Learnt** means that the final mean policy succeeds on the nominal
+start and on at least 80 % of 100 perturbed ones. Numbers are means over the trials, with the smallest and the largest
+in brackets. For comparison (weights *projected*): holding still returns -5.4, and the three-finger grip's commands
+from the first step on return -0.07.
 
-Nothing was tuned until it agreed. A verdict is arithmetic: each part of a claim is a comparison in
-`benchmarks/thesis/claims.py`; *reproduced* says that all hold, *in part* some, *not reproduced* none. Questions of ours
-have no claim: the table says which set-ups learn. The text below a result explains it; the evidence is in the
-experiments whose names begin with `why-`.
+Nothing was tuned to agree with the thesis. Verdicts are computed: each part of a claim is a comparison in
+`benchmarks/thesis/claims.py`; *reproduced* means that all hold, *in part* some, *not reproduced* none. Our own
+questions have no claim, so their tables show which set-ups learn. The text below a result explains it; the evidence
+is in the experiments whose names begin with `why-`.
 
 {machine}
 """
@@ -251,7 +252,7 @@ def section(experiment: Experiment, data: Data, note: str) -> str:
     if data.series:
         lines += ["\\* wall time of its runs, four at a time on the same workers.", ""]
     cost = f", about {minutes(tuple(experiment.curves.values())) * TRIALS:.0f} min on two cores" if data.series else ""
-    again = f"Again: `python -m benchmarks.thesis {experiment.name}`{cost}"
+    again = f"To repeat it: `python -m benchmarks.thesis {experiment.name}`{cost}"
     lines += [f"{again}; the figure alone: `python -m benchmarks.thesis plot docs/results`."]
     return "\n".join(lines)
 

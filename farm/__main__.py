@@ -20,14 +20,14 @@ _PIPE: Final = 141
 
 COMMANDS: Final = {
     "run": "starts a learner and local workers: learns a task and records it",
-    "learner": "starts the learner alone; workers join it from any machine",
-    "worker": "starts workers alone; they serve every learner they find",
+    "learner": "starts only the learner; workers join it from any machine",
+    "worker": "starts only workers; they serve every learner they find",
     "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
     "new-task": "writes a task of 31 lines that runs, to start from",
     "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
     "evaluate": "tries the learnt mean policy on perturbed starts",
     "replay": "simulates any policy or rollout of a run again, into a recording or a video",
-    "chain": "lets learnt policies act one after another, and counts the cycles",
+    "chain": "runs learnt policies one after another, and counts the cycles",
     "compare": "puts several runs into one recording: curves together, scenes side by side",
     "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
     "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
@@ -35,11 +35,11 @@ COMMANDS: Final = {
     "record": "records a run on any machine, over the network",
     "view": "opens the recordings of runs in the Rerun viewer",
     "runs": "prints a table of the runs in a folder",
-    "status": "shows the runs and workers of a farm, and how they are doing",
+    "status": "shows the runs and workers of a farm, and their state",
     "router": "starts a permanent router that learners and workers connect to",
     "certificates": "makes certificates for a farm of several machines",
 }
-"""What the built-in commands are for."""
+"""The built-in commands and their purposes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -70,7 +70,7 @@ def _run(words: Sequence[str], *, own: bool) -> int:
 
     command = plugins.find("commands", name).target
     if own:
-        _signals(signal.default_int_handler)  # where a command has no better idea, SIGTERM is as Ctrl-C
+        _signals(signal.default_int_handler)  # unless a command decides otherwise, SIGTERM acts like Ctrl-C
     return int(command(words[1:]))
 
 
@@ -96,10 +96,10 @@ def _streams() -> None:
 
 
 def _ended(error: BaseException) -> int:
-    """Say how a command ended, and return its exit status; what is no user's mistake is raised again."""
+    """Print how a command ended, and return its exit status; errors that are not the user's are raised again."""
     unwritten = _unwritten()
     if isinstance(error, BrokenPipeError) or isinstance(unwritten, BrokenPipeError):
-        return _PIPE  # whoever read had enough, as head does
+        return _PIPE  # the reader has ended, such as head
     if isinstance(error, KeyboardInterrupt | Interrupted):
         said, status = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n", 130
     elif isinstance(error, FarmError):
@@ -131,7 +131,7 @@ def _unwritten() -> OSError | None:
 
 
 def _system(error: OSError) -> str:
-    """What the system refused, and the remedy."""
+    """The system's error, and the remedy."""
     hints = {errno.EMFILE: "allow more of them: ulimit -n 1024", errno.ENOSPC: "make room"}
     try:
         Path.cwd()

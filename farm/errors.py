@@ -66,7 +66,7 @@ class UnservedError(ConfigError):
 
 
 class TaskError(FarmError):
-    """A task or policy whose arrays make no sense: names the array, what came and what was expected."""
+    """A task or policy with invalid arrays: names the array, its value and what was expected."""
 
 
 class RunError(FarmError):
@@ -79,7 +79,7 @@ class Interrupted(FarmError):  # noqa: N818  not an error
 
 @contextmanager
 def writing(what: object, kind: type[FarmError] = RunError) -> Iterator[None]:
-    """Turn an error of the file system into one line that says what could not be written."""
+    """Convert an error of the file system to one line that names what could not be written."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
-"""Running mean and spread of observations: of one rollout, merged over many, and what policies are given. Pure.
+"""Running mean and spread of observations: of one rollout, merged over many, and as given to policies. Pure.
 
 Moments of N observations (d,) are one row of 1 + 2 d numbers: N, their mean, and the sums of their squared deviations
-from it (M2). A row of zeros is of no observation. Every step is an elementwise operation in a given order, so that
+from it (M2). A row of zeros means no observations. All operations are elementwise and in a fixed order, so that
 equal observations give equal bits.
 """
 
@@ -11,14 +11,14 @@ import numpy as np
 
 from farm.arrays import FloatArray, IntArray
 
-_FLAT: Final = 1e-8  # a standard deviation below this is taken for none
+_FLAT: Final = 1e-8  # a standard deviation below this counts as zero
 
 
 class Moments:
-    """Of the observations of B rollouts, step by step (Welford 1962)."""
+    """Moments of the observations of B rollouts, updated in every step (Welford 1962)."""
 
     def __init__(self, rollouts: int, size: int) -> None:
-        """None so far, of observations of this size."""
+        """Start without observations; they have this size."""
         self.table = np.zeros((rollouts, 1 + 2 * size))
         """(B, 1 + 2 d)"""
         self._size = size

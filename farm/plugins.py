@@ -80,7 +80,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
 SOURCE_LIMIT: Final = 1_000_000
 """Largest size of a file that is sent to workers [bytes]."""
 
-_LINES: Final = 40  # of a traceback that others are told
+_LINES: Final = 40  # lines of a traceback that is sent to other machines
 _WIDTH: Final = 250  # characters of each
 
 _MODULES: Final = "rolloutfarm_file_"  # prefix of the modules that files become
@@ -112,7 +112,7 @@ class Plugin:
 
     @property
     def origin(self) -> str:
-        """Where it is from, for people."""
+        """Its origin, for display."""
         return str(self.file) if self.file else self.release or "built in"
 
     def digest(self) -> str:
@@ -194,7 +194,7 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
 
 @cache
 def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
-    """Import a file as it is now; the folder it lies in is on no path, so that it can shadow nothing."""
+    """Import a file in its present state; its folder is on no import path, so that it can shadow nothing."""
     name = _MODULES + hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
@@ -224,7 +224,7 @@ def author_frames(error: BaseException) -> list[str]:
 
 
 def root(error: BaseException) -> BaseException:
-    """What an error came from in the first place."""
+    """The first cause of an error."""
     for _ in range(_LINES):
         error = error.__cause__ or error
     return error
@@ -243,13 +243,13 @@ def author_traceback(error: BaseException) -> tuple[str, ...]:
 
 
 def named_file(wire: str) -> str:
-    """The file that a class NAME.py:CLASS lies in; empty for names of other kinds."""
+    """The file of a class NAME.py:CLASS; empty for names of other kinds."""
     name = wire.rpartition(":")[0]
     return name if name.endswith(".py") else ""
 
 
 def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:
-    """A class NAME.py:CLASS that somebody else named, from the one of these files of that name and digest.
+    """A class NAME.py:CLASS named by another machine, from one of these files with that name and digest.
 
     Raises:
       UnservedError: none is allowed, or the one that is differs.

@@ -1,4 +1,4 @@
-"""Worker processes on this machine: started as subprocesses, never forked, ended by pid."""
+"""Worker processes on this machine: started as subprocesses, never forked, stopped by pid."""
 
 import logging
 import subprocess
@@ -9,13 +9,13 @@ from typing import Any, Final
 
 log = logging.getLogger(__name__)
 
-_GRACE: Final = 1.5  # [s] that a worker has to leave before it is killed
-_RESTARTS: Final = 20  # a worker that keeps dying is not started for ever
+_GRACE: Final = 1.5  # [s] for a worker to leave before it is killed
+_RESTARTS: Final = 20  # a worker that keeps dying is not restarted forever
 _ENVIRONMENT: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def end(processes: "Sequence[subprocess.Popen[Any]]", grace: float) -> None:
-    """Ask processes to leave; those that still run after so many seconds are killed."""
+    """Ask processes to leave; those still running after this number of seconds are killed."""
     for process in processes:
         process.terminate()
     until = time.monotonic() + grace
@@ -33,20 +33,20 @@ class Pool:
     def __init__(self, processes: int, arguments: Sequence[str], environment: dict[str, str]) -> None:
         """Start them with these arguments; they end when this process does, however it ends."""
         self._command = [sys.executable, "-P", "-m", "workers", *arguments, "--exit-with-parent"]
-        # One thread a process: the cores are shared out among processes.
+        # One thread per process: the cores are divided among processes.
         self._environment = {**environment, **dict.fromkeys(_ENVIRONMENT, "1")}
         self._restarts = 0
         self._missed: set[int] = set()
         self._processes = [self._start() for _ in range(processes)]
 
     def _start(self) -> "subprocess.Popen[bytes]":
-        # Its standard input is a pipe that nobody writes to: it closes when this process ends.
+        # Its standard input is a pipe that is never written to: it closes when this process ends.
         # A session of its own keeps the terminal's Ctrl-C away: this process ends its workers.
         return subprocess.Popen(self._command, stdin=subprocess.PIPE, env=self._environment, start_new_session=True)
 
     @property
     def pids(self) -> list[int]:
-        """Process ids of the workers that run."""
+        """Process ids of the running workers."""
         return [process.pid for process in self._processes if process.poll() is None]
 
     def tend(self) -> list[int]:
@@ -57,7 +57,7 @@ class Pool:
             if status is None:
                 continue
             if status in (0, 1, 2) or self._restarts >= _RESTARTS:
-                given_up.append(status)  # it ended by itself and has said why, or keeps dying
+                given_up.append(status)  # it ended by itself with a message, or keeps dying
                 if process.pid not in self._missed:
                     self._missed.add(process.pid)
                     log.warning("worker process %d ended with status %d and is not replaced", process.pid, status)

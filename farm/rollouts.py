@@ -1,4 +1,4 @@
-"""What a run simulates, built from its specification: jobs in, results out. For workers and learners alike."""
+"""Builds a run's simulation from its specification and runs jobs; for workers and learners."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,14 +21,14 @@ from farm.tasks import loop
 from farm.tasks.base import Task
 
 SIMULATION = "farm.tasks.loop"
-"""The module whose code, with all its imports, decides every rollout's numbers, together with task and policy."""
+"""The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
 
 
 class Runner:
     """Runs one run's jobs."""
 
     def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine, *, exact: bool = True) -> None:
-        """Prepare what all rollouts need; a ConfigError if the task cannot start.
+        """Prepare the simulation; a ConfigError if the task cannot start.
 
         Args:
           task: what is simulated.
@@ -57,17 +57,17 @@ class Runner:
         Args:
           mu: (P,).
           jobs: what to run.
-          traces: which traces of exploring rollouts are wanted, one of TRACES.
-          normaliser: as a RoundHeader has it, (2, 2, d); with d > 0 the result has moments of the observations.
+          traces: which traces of exploring rollouts to return, one of TRACES.
+          normaliser: as in a RoundHeader, (2, 2, d); with d > 0 the result has moments of the observations.
 
         Raises:
-          UnservedError: the normaliser is of other observations.
+          UnservedError: the normaliser does not match the observations.
         """
         theta, seeds = jobs.theta(mu), jobs.seeds()
         policies, wanted = self._normalised(normaliser), normaliser.shape[-1]
-        kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: normalised in its own way
+        kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: has its own normaliser
         if self._judge is not self.sim:
-            kinds[(jobs.seen | ~jobs.explores) & ~jobs.physics] = 3  # as 0, but elsewhere
+            kinds[(jobs.seen | ~jobs.explores) & ~jobs.physics] = 3  # like 0, but on the processor
         kind_of, there = np.repeat(kinds, jobs.rollouts), set(kinds.tolist())
         returns, flags = np.zeros(len(theta)), np.zeros((len(theta), 4), dtype=bool)
         steps = np.zeros(len(theta), dtype="<i8")
@@ -98,7 +98,7 @@ class Runner:
         return Simulated(returns, flags, steps, values, tuple(seen[job] for job in sorted(seen)), moments)
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy, Policy]:
-        """The policy of jobs at control rate, of those at physics rate, and of those of parameters of their own."""
+        """Policies for jobs at control rate, at physics rate, and with parameters of their own."""
         if normaliser.shape[-1] not in (0, self.spec.observation):
             raise UnservedError(f"a normaliser of {normaliser.shape[-1]} numbers, not {self.spec.observation}")
         if not normaliser.size:
@@ -107,7 +107,7 @@ class Runner:
         return around, around, own
 
     def rollouts(self, theta: FloatArray, seeds: list[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
-        """Rollouts of parameters theta (B, P), with a frame each control step or each physics step."""
+        """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
         return loop.run(self.task, self.policy, self.sim, theta, seeds, 1 if physics else 0)
 
     def trajectory(self, rollouts: loop.Rollouts, row: int) -> Any:  # noqa: ANN401  a Trajectory
@@ -115,7 +115,7 @@ class Runner:
         return loop.trajectory(self.task, self.spec, self.scene, rollouts, row)
 
     def close(self) -> None:
-        """Give back what it holds."""
+        """Release its resources."""
         for sim in {self.sim, self._judge}:
             sim.engine.close()
 
@@ -151,7 +151,7 @@ def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping
     try:
         return cast("Task", plugin.target(config, plugin.variant, files))
     except TypeError as error:
-        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # it was not even called
+        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # the error is in the call itself
             raise ConfigError(f"{plugin.wire}: its __init__ must take config, variant and files ({error})") from None
         raise
 
@@ -160,7 +160,7 @@ _SAME = "install the learner's release on both sides"
 
 
 def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]) -> plugins.Plugin:
-    """The class that a specification names, if its code is the learner's."""
+    """The class named in a specification, if its code is the same as the learner's."""
     base = {"tasks": Task, "policies": Policy}[kind]
     from_file = plugins.named_file(name) != ""
     found = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)

@@ -1,7 +1,7 @@
-"""Where every random number of a run comes from. Pure.
+"""Seeds of all random numbers of a run. Pure functions.
 
-Each use has a number of its own in front, and all seeds are equally long: numpy pads a shorter
-seed with zeros, so that (7, 3) and (7, 3, 0) would be the same stream.
+Each use has its own first number, and all seeds have equal lengths: numpy pads a shorter seed
+with zeros, so that (7, 3) and (7, 3, 0) would give the same numbers.
 """
 
 from typing import Final
@@ -25,7 +25,7 @@ def exploration(seed: int, generation: int) -> np.random.Generator:
 
 
 def training(seed: int, generation: int, pair: int) -> tuple[int, ...]:
-    """Seed of the perturbation that a pair is trained under."""
+    """Seed of the perturbation for training a pair."""
     return (_TRAINING, seed, generation, pair)
 
 

@@ -38,7 +38,7 @@ def setting(
     above: float | None = None,
     below: float | None = None,
 ) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
-    """A field with bounds: least and most belong to what is allowed, above and below do not."""
+    """A field with bounds: inclusive (least, most) or exclusive (above, below)."""
     return field(default=default, metadata={"bounds": (least, most, above, below)})
 
 
@@ -46,7 +46,7 @@ def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
     """Check each field of a frozen dataclass by its annotation and bounds; whole numbers become floats where wanted.
 
     Raises:
-      ConfigError: names the first value that makes no sense, and what was expected.
+      ConfigError: names the first invalid value, and what was expected.
     """
     hints = _hints(type(settings))
     for each in dataclasses.fields(settings):
@@ -69,7 +69,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401
-    """The types a value may have; empty where anything goes."""
+    """The types a value may have; empty if it may have any."""
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
         parts = [_kinds(part) for part in get_args(hint)]
@@ -120,12 +120,12 @@ def _flag(name: str) -> str:
 
 
 def to_dict(settings: Any) -> dict[str, Any]:  # noqa: ANN401  any dataclass
-    """Every field by its name, as JSON takes it."""
+    """Every field by its name, as a JSON table."""
     return dataclasses.asdict(settings)
 
 
 def from_dict(kind: type[C], values: object, where: str) -> C:
-    """Settings from a table of JSON; what is missing keeps its default.
+    """Settings from a table of JSON; missing ones keep their defaults.
 
     Raises:
       ConfigError: unknown names, wrong types or impossible values; `where` is named.
@@ -145,21 +145,21 @@ def from_dict(kind: type[C], values: object, where: str) -> C:
 
 
 def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
-    """A value of JSON as the annotation has it: whole numbers that are floats, lists that are tuples."""
+    """Convert a JSON value for the annotation: whole numbers to floats, lists to tuples."""
     if type(value) is list:
         return tuple(value)
     return float(value) if type(value) is int and float in _kinds(hint) and int not in _kinds(hint) else value
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
-    """The dataclass that these arguments say; flags of nested dataclasses have no prefix, those of tuples are repeated.
+    """Parse arguments into a dataclass; flags of nested dataclasses have no prefix, those of tuples are repeated.
 
     `--help` prints and exits with status 0.
 
     Raises:
       ConfigError: an unknown flag, or a value of the wrong type, in one line.
     """
-    import tyro  # what only reads a configuration does without
+    import tyro  # not needed for reading configurations
 
     distinct(default, program)
     said = io.StringIO()
@@ -196,13 +196,13 @@ def _without_none(text: str) -> str:
 
 
 def _emptied(default: C, arguments: Sequence[str]) -> C:
-    """The defaults, with those tuples empty that arguments give: tyro would append to what is there."""
+    """The defaults, with empty tuples where arguments are given: tyro would append to the defaults."""
     given = {word.partition("=")[0] for word in arguments}
     out = copy.copy(default)
     for each in dataclasses.fields(default):  # type: ignore[arg-type]
         value = getattr(default, each.name)
         if isinstance(value, tuple) and f"--{_flag(each.name)}" in given:
-            object.__setattr__(out, each.name, ())  # unchecked: what is given stands here in the end
+            object.__setattr__(out, each.name, ())  # not checked here: the given values replace them
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
             object.__setattr__(out, each.name, _emptied(value, arguments))
     return out
@@ -225,7 +225,7 @@ def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass o
 
 
 def _one_line(box: str, program: str) -> str:
-    """The error in a box of tyro's, without frame and repetition."""
+    """The error text of tyro, without its frame and repetition."""
     body = [line.strip(_FRAME) for line in box.splitlines()[1:]]
     first = next((i for i, line in enumerate(body) if not line), len(body))
     said = " ".join(body[:first]).strip() or "these arguments make no sense"

@@ -1,1 +1,1 @@
-"""The learner: runs a search algorithm, gives out jobs, saves, records and shows."""
+"""The learner: runs a search algorithm, distributes jobs, saves, records and displays the run."""

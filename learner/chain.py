@@ -1,7 +1,8 @@
-"""An upper level over learnt policies: it lets one act until its goal has been felt, then the next.
+"""An upper level above learnt policies: one acts until its goal is reached, then the next.
 
-Plage 2016, 5.2: "an upper level control policy can then control the finger gaiting". A task can be chained if it says
-where its rollouts begin and end (`ends`), when the end is reached (`reached`) and when all is lost (`lost`).
+Plage 2016, 5.2: "an upper level control policy can then control the finger gaiting". A task can be chained if it
+defines where its rollouts begin and end (`ends`), when the end is reached (`reached`) and when a rollout is lost
+(`lost`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from farm.tasks.loop import Batch, Rollouts, Seed, again
 from learner.replay import LoadedPolicy
 
 FELT: Final = 3
-"""Control steps in a row for which a goal must be felt before the next policy acts."""
+"""Successive control steps for which a goal must be reached before the next policy acts."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,9 @@ class Chained:
     """Rollouts of a chain."""
 
     changes: IntArray
-    """(B,) how often a goal was reached until the end, or until all was lost."""
+    """(B,) how often a goal was reached until the end, or until the rollout was lost."""
     acting: IntArray
-    """(B, T) which policy acted, -1 after the end."""
+    """(B, T) index of the policy that acted, -1 after the end."""
     rollouts: Rollouts
     """Of the first policy's task, whose actions here are controls."""
     task: Task
@@ -49,7 +50,7 @@ class _Link:
 
     @classmethod
     def of(cls, learnt: LoadedPolicy, steps: int) -> "_Link":
-        """A policy that acts for up to so many steps."""
+        """A policy that acts for up to this number of steps."""
         task = _longer(type(learnt.problem.task), learnt, steps)
         sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
         again(lambda: task.setup(sim))
@@ -63,16 +64,16 @@ class _Link:
 
 
 def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *, every: int = 0) -> Chained:
-    """Run policies in turn, the first one first, each from where the one before it ended; the last leads to the first.
+    """Run policies in turn, each from where the previous one ended; the first follows the last.
 
     Args:
       policies: of tasks that can be chained.
       seeds: (B,) of the starts.
       steps: control steps.
-      every: physics steps between two frames; 0: one frame each control step.
+      every: physics steps between two frames; 0: one frame per control step.
 
     Raises:
-      ConfigError: the policies do not follow each other, or simulate different things.
+      ConfigError: the policies do not follow each other, or simulate different models.
     """
     check(policies)
     first = policies[0]
@@ -87,10 +88,10 @@ def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *
 
 
 def check(policies: Sequence[LoadedPolicy]) -> None:
-    """See that each policy ends where the next one begins.
+    """Check that each policy ends where the next one begins.
 
     Raises:
-      ConfigError: one does not; names the two.
+      ConfigError: one does not; names both.
     """
     if not policies:
         raise ConfigError("a chain needs policies: give one run or more, in the order in which they act")
@@ -127,7 +128,7 @@ def _longer(kind: type[Task], learnt: LoadedPolicy, steps: int) -> Task:
 def _run(
     task: Task, sim: Sim, links: Sequence[_Link], seeds: Sequence[Seed], every: int
 ) -> tuple[IntArray, IntArray, Rollouts]:
-    """As many rollouts as are stepped together."""
+    """Rollouts of a chain that are stepped together."""
     batch = Batch(task, sim, seeds, every)
     turn, felt, changes = (np.zeros(len(seeds), dtype=int) for _ in range(3))
     acting = np.full((len(seeds), task.steps), -1)
@@ -149,7 +150,7 @@ def _controls(links: Sequence[_Link], sim: Sim, turn: IntArray) -> FloatArray:
     """Controls of the rollouts still going, each by the policy whose turn it is, (n, nu)."""
     before: Mapping[str, Any] = {name: np.array(values) for name, values in sim.own.items()}
     given, own = [], []
-    for link in links:  # all of them for all rollouts: what a row gives does not depend on the others
+    for link in links:  # all policies for all rollouts: a row's result does not depend on the others
         sim.own.clear()
         sim.own.update({name: values.copy() for name, values in before.items()})
         given.append(link.controls(sim))
@@ -157,6 +158,6 @@ def _controls(links: Sequence[_Link], sim: Sim, turn: IntArray) -> FloatArray:
     rows = np.arange(len(turn))
     sim.own.clear()
     for name in dict.fromkeys(name for each in own for name in each):
-        known = next(each[name] for each in own if name in each)  # what one task alone remembers
+        known = next(each[name] for each in own if name in each)  # memory of one task only
         sim.own[name] = np.stack([each.get(name, known) for each in own])[turn, rows]
     return np.stack(given)[turn, rows]

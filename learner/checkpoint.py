@@ -1,4 +1,4 @@
-"""Everything a resume needs, in one file that is replaced atomically."""
+"""The state needed to resume a run, in one file that is replaced atomically."""
 
 import hashlib
 import logging
@@ -23,7 +23,7 @@ _DIGEST: Final = hashlib.sha256().digest_size
 
 @dataclass(frozen=True, kw_only=True)
 class BestRollout:
-    """A rollout that can be run again."""
+    """A rollout that can be repeated."""
 
     seed: tuple[int, ...] | None
     """None for nominal conditions."""
@@ -35,7 +35,7 @@ class BestRollout:
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """A run between two generations."""
+    """State of a run between two generations."""
 
     run: str
     config: dict[str, Any]
@@ -49,25 +49,25 @@ class Checkpoint:
     seconds: float
     """Wall time so far [s]."""
     solved: int
-    """Generations in a row in which the mean policy succeeded."""
+    """Successive generations in which the mean policy succeeded."""
     best: "BestRollout | None"
     """The best rollout so far."""
     best_generation: int
-    """The generation it came from."""
+    """The generation of the best rollout."""
     canary: str | None
-    """Digest of the numbers of the machines that simulated; None as long as none has."""
+    """Fingerprint of the numbers of the machines that simulated; None before the first."""
     replayed: bool
     """Whether it has been recorded at physics rate."""
     code: dict[str, str]
-    """Digests of the code that decides its numbers."""
+    """Digests of the code that determines its numbers."""
     files: dict[str, str]
-    """Texts that its task is made of."""
+    """Files of its task by name."""
     constants: dict[str, Any]
-    """Arrays that its policy is made of."""
+    """Constant arrays of its policy by name."""
     steps: int = 0
     """Control steps of all exploring rollouts so far."""
     pairs: int = 0
-    """Pairs of the next generation; 0: as the algorithm's settings say."""
+    """Pairs of the next generation; 0: the number in the algorithm's settings."""
     moments: FloatArray = array("<f8", 1, np.empty(0))
     """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
 
@@ -75,8 +75,8 @@ class Checkpoint:
 def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
     """Replace the file by a new one, or leave the old one as it is.
 
-    A killed process loses nothing. When the power fails, the file may be torn; `durable` keeps a copy that is whole
-    then, `FILE.safe`; it waits for the disk, which takes longer than a short generation.
+    A killed process loses nothing. A power failure may truncate the file; `durable` keeps a copy that survives it,
+    `FILE.safe`, but waits for the disk, which takes longer than a short generation.
     """
     body = codec.encode(checkpoint, _SCHEMA)
     content = _MAGIC + hashlib.sha256(body).digest() + body
@@ -86,7 +86,7 @@ def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
 
 
 def settle(path: Path) -> None:
-    """Write the file itself to the disk, and delete the copy."""
+    """Flush the file itself to the disk, and delete the copy."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
     _safe(path).unlink(missing_ok=True)
@@ -111,7 +111,7 @@ def _replace(path: Path, content: bytes, *, sync: bool = False) -> None:
 
 
 def load(path: Path) -> Checkpoint:
-    """The checkpoint in a file, or in its copy where the file is torn.
+    """Read the checkpoint in a file, or in its copy if the file is damaged.
 
     Raises:
       CheckpointError: there is none, or it is truncated or of another version.
@@ -123,7 +123,7 @@ def load(path: Path) -> Checkpoint:
             found = _read(_safe(path))
         except CheckpointError:
             raise error from None
-        log.warning("%s is missing or damaged; going on from its copy %s", path, _safe(path).name)
+        log.warning("%s is missing or damaged; continuing from its copy %s", path, _safe(path).name)
         return found
 
 

@@ -1,4 +1,4 @@
-"""The configuration of a run: everything its numbers depend on."""
+"""The configuration of a run: all settings that its numbers depend on."""
 
 import dataclasses
 import json
@@ -19,14 +19,14 @@ VERSION: Final = 2
 """Version of config.json."""
 
 _PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
-"""What is chosen by name and has settings of its own, and the kind of plug-in that it is."""
+"""Parts of a configuration that are chosen by name and have their own settings, with the kind of plug-in."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Settings):
     """A run. The same configuration gives the same numbers to the last bit for any number of workers.
 
-    What is left out is the first preset of the task: `RunConfig(task="gym:Swimmer-v5")` can be learnt.
+    Omitted settings are those of the task's first preset: `RunConfig(task="gym:Swimmer-v5")` can be learnt.
     """
 
     task: str = "finger-gait"
@@ -66,10 +66,10 @@ class RunConfig(Settings):
     """Which traces are recorded: those of all rollouts, of the best and worst of each generation, or none."""
 
     def __post_init__(self) -> None:
-        """Fill in what is left out, and check every value."""
+        """Fill in omitted settings, and check every value."""
         for part, kind in _PARTS.items():
             if name := getattr(self, part):
-                object.__setattr__(self, part, plugins.find(kind, name).name)  # a file's with its whole path
+                object.__setattr__(self, part, plugins.find(kind, name).name)  # of a file: with its absolute path
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -91,12 +91,12 @@ class RunConfig(Settings):
             raise ConfigError(f"most-pairs is {self.most_pairs}; expected at least {least} (pairs)")
 
     def algorithm_of(self, pairs: int) -> Algorithm[Any]:
-        """The algorithm of a generation of so many pairs; 0: as its settings say."""
+        """The algorithm with this number of pairs; 0: the number in its settings."""
         own: Any = self.algorithm_config
         return replace(own, pairs=pairs) if pairs else own
 
     def pairs_after(self, pairs: int, steps: int) -> int:
-        """Pairs of the generation that follows one of so many pairs and control steps; 0: as the algorithm says."""
+        """Pairs of the generation after one with these pairs and control steps; 0: as in the algorithm's settings."""
         if self.interactions is None:
             return 0
         least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
@@ -104,7 +104,7 @@ class RunConfig(Settings):
 
     @property
     def pairs_at_most(self) -> int:
-        """The most pairs of a generation, with interactions."""
+        """Largest number of pairs in a generation, with interactions."""
         least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
         return 8 * least if self.most_pairs is None else self.most_pairs
 
@@ -114,7 +114,7 @@ def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
 
 
 def _filled(config: RunConfig) -> dict[str, Any]:
-    """What a configuration leaves out, from the task's first preset."""
+    """Fill in omitted settings from the task's first preset."""
     parts = (config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)
     if all(parts) and config.generations is not None:
         return {}
@@ -131,14 +131,14 @@ def _filled(config: RunConfig) -> dict[str, Any]:
 
 
 _GENERATIONS: Final = 150
-"""Of presets that say nothing else."""
+"""Defaults of presets."""
 
 _GENERAL: Final[Mapping[str, Any]] = {
     "policy": "direct", "features": 50, "bandwidth": 1.0, "algorithm": "pgpe", "initial_mu": 0.0,
     "initial_sigma": 1.0, "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.5,
     "learning_rate_sigma": 0.1, "sigma_rule": "capped", "max_speed": 1.0,
 }  # fmt: skip
-"""The settings that runs start from, if the task has none of its own."""
+"""The settings that runs start from, if the task has no presets."""
 
 
 def settings_class(kind: str, name: str) -> type[Any]:
@@ -185,7 +185,7 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
     """A preset with some settings changed, each by its flag's name.
 
     Raises:
-      ConfigError: there is no such task, preset or setting, or a value makes no sense.
+      ConfigError: there is no such task, preset or setting, or a value is invalid.
     """
     table = presets(task)
     name = preset or next(iter(table))
@@ -193,7 +193,7 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
         raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
     begin = RunConfig(task=task)
     given: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
-    for part, kind in _PARTS.items():  # another policy takes of the preset's what it has, another algorithm nothing
+    for part, kind in _PARTS.items():  # another policy keeps settings of the preset, another algorithm none
         own = given.get(part, getattr(begin, part))
         chosen = changed.get(part, own)
         others = set(_fields(settings_class(kind, chosen))) if part == "policy" or chosen == own else set()
@@ -204,7 +204,7 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
 def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
     """A configuration with some settings changed, each by its flag's name.
 
-    A part that is chosen anew (or all, if `fresh`) begins with its own defaults.
+    A part that is replaced (or all, if `fresh`) starts with its own defaults.
     """
     parts: dict[str, Any] = {}
     known = {"task", "policy", "algorithm"}
@@ -224,7 +224,7 @@ _APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved", "s
 
 
 def preset_of(config: RunConfig) -> str:
-    """The preset that a configuration equals except for seed and length, "own" if there is none."""
+    """The preset that a configuration equals except for seed and length, or "own"."""
     for name in presets(config.task):
         if {change[0] for change in changes(configure(config.task, name), config)} <= _APART:
             return name
@@ -232,12 +232,12 @@ def preset_of(config: RunConfig) -> str:
 
 
 def properties(config: RunConfig) -> dict[str, str | int]:
-    """What distinguishes a run at a glance."""
+    """A short description of a run."""
     return {"preset": preset_of(config), "policy": config.policy, "task": config.task, "seed": config.seed}
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """As it is in config.json and in a checkpoint."""
+    """Its form in config.json and in a checkpoint."""
     parts = {part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
              for part in _PARTS}  # fmt: skip
     own = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in _PARTS}
@@ -270,7 +270,7 @@ def read(path: Path) -> RunConfig:
     """The configuration in a file.
 
     Raises:
-      ConfigError: it cannot be read or makes no sense.
+      ConfigError: it cannot be read or is invalid.
     """
     try:
         values = json.loads(path.read_text("utf-8"))
@@ -282,7 +282,7 @@ def read(path: Path) -> RunConfig:
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Settings that differ: name, old and new value; of another plug-in only those that both have."""
+    """Settings that differ: name, old and new value; for different plug-ins only those that both have."""
     before, after = flat(old), flat(new)
     for name, value in before.items():
         if name in after and value != after[name]:
@@ -290,7 +290,7 @@ def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, objec
 
 
 def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Changes by which two configurations are of different runs: all but the number of generations."""
+    """Differences that make two configurations different runs: all except the number of generations."""
     return (change for change in changes(old, new) if change[0] != "generations")
 
 

@@ -1,4 +1,4 @@
-"""The mean policy by itself: as jobs, and what they gave."""
+"""Evaluation of the mean policy: its jobs and their results."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,7 +8,7 @@ from farm.net.work import Jobs
 from farm.sim.trajectory import Trajectory
 
 EVALUATION_ROLLOUTS: Final = 100
-"""Rollouts of the evaluation at the end of a run, and of a plain `farm evaluate`."""
+"""Number of rollouts of the evaluation at the end of a run, and default of `farm evaluate`."""
 
 EVALUATION_SEED: Final = 0
 """Its seed."""
@@ -27,7 +27,7 @@ class Nominal:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The end of a run: the mean policy, unperturbed and perturbed."""
+    """Evaluation at the end of a run: the mean policy, unperturbed and perturbed."""
 
     mean: Nominal
     robust_success_rate: float | None
@@ -35,10 +35,10 @@ class Evaluation:
     robust_return: float
     """Mean return of the perturbed rollouts."""
     replay: Trajectory | None
-    """The best rollout of the run at physics rate, if it has not been shown yet."""
+    """The best rollout of the run at physics rate, if it has not been reported yet."""
 
 
 def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
-    """The mean policy on perturbed starts, and last on the nominal one at physics rate."""
+    """Jobs of the mean policy on perturbed starts, and last on the nominal one at physics rate."""
     trials = Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
     return Jobs.joined([*([trials] if rollouts else []), Jobs.mean("physics", [None])])

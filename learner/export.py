@@ -1,4 +1,4 @@
-"""A learnt policy as one .npz that plain MuJoCo and numpy run; docs/export.md describes it."""
+"""Exports a learnt policy as one .npz for plain MuJoCo and numpy; docs/export.md describes it."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ VERSION: Final = 2
 
 
 def contents(policy: LoadedPolicy) -> dict[str, Any]:
-    """Everything that the file holds, by name."""
+    """The contents of the file by name."""
     found = policy.problem
     task, config = found.task, found.config
     engine = DataEngine(task.model)
@@ -51,10 +51,10 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
 
 
 def write(path: Path, policy: LoadedPolicy) -> None:
-    """Write the file; it holds arrays and texts, nothing that has to be unpickled.
+    """Write the file; it holds arrays and texts, and needs no unpickling.
 
     Raises:
       RunError: it cannot be written.
     """
-    with writing(path), path.open("wb") as file:  # np.savez would add a suffix of its own
+    with writing(path), path.open("wb") as file:  # np.savez would append a suffix
         np.savez_compressed(file, allow_pickle=False, **contents(policy))

@@ -2,9 +2,9 @@
 
     sweep.json                 what is varied, the seeds, and each setting's configuration
     SETTING-sSEED/             a run's folder each
-    table.csv, .parquet, figure.svg      what came out
+    table.csv, .parquet, figure.svg      results
 
-Seeds may be added to a sweep later; nothing else of it may change.
+Seeds may be added to a sweep later; nothing else may change.
 """
 
 import itertools
@@ -25,10 +25,10 @@ from learner.config import RunConfig
 from learner.run_folder import replace_text
 
 MOST: Final = 10_000
-"""Runs of a sweep."""
+"""Largest number of runs of a sweep."""
 
 _VERSION: Final = 1
-_LONGEST: Final = 90  # characters of a setting's part of a run's name
+_LONGEST: Final = 90  # characters of a setting in a run's name
 _RANGE: Final = re.compile(r"(\d+)(?:-(\d+))?")
 
 
@@ -37,13 +37,13 @@ class Setting:
     """One configuration of a sweep, for all seeds."""
 
     values: Mapping[str, str]
-    """What is varied, by the flag's name with underscores: as it was given."""
+    """Varied values as given, by the flag's name with underscores."""
     config: RunConfig
     """Of seed 0."""
 
     @property
     def label(self) -> str:
-        """In tables and legends."""
+        """Name in tables and legends."""
         return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as given"
 
 
@@ -57,7 +57,7 @@ class Sweep:
 
     @property
     def vary(self) -> dict[str, list[str]]:
-        """What is varied, and its values."""
+        """The varied settings and their values."""
         names = self.settings[0].values
         return {name: list(dict.fromkeys(setting.values[name] for setting in self.settings)) for name in names}
 
@@ -76,7 +76,7 @@ class Sweep:
 
     @property
     def runs(self) -> dict[Path, RunConfig]:
-        """Configurations by folder, seed by seed: a first picture comes early."""
+        """Configurations by folder, seed by seed, so that every setting has an early result."""
         return {
             self.folder(i, seed): replace(setting.config, seed=seed)
             for seed in self.seeds
@@ -87,7 +87,7 @@ class Sweep:
         """Make the folder, or continue with it; seeds may be added.
 
         Raises:
-          ConfigError: it is another sweep's, or something else's.
+          ConfigError: it belongs to another sweep, or is not a sweep's folder.
         """
         file = self.path / "sweep.json"
         with writing(f"to {self.path}", ConfigError):
@@ -122,7 +122,7 @@ class Sweep:
 
 
 def _plain(values: Mapping[str, str]) -> str:
-    """Varied values as a part of a name; of a file only its own name."""
+    """Varied values as part of a run's name; a file without its path."""
     parts = [f"{name}-{value.rpartition('/')[2]}" for name, value in values.items()]
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", "-".join(parts))
 

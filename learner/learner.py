@@ -1,4 +1,4 @@
-"""The learning loop: ask, simulate, tell, save, and say how it went."""
+"""The learning loop: ask for samples, simulate, tell the results, save, and report."""
 
 import errno
 import hashlib
@@ -33,25 +33,25 @@ from learner.telemetry.report import Report
 log = logging.getLogger(__name__)
 
 REPLAY_EVERY: Final = 10
-"""Generations between two recordings of the best rollout at physics rate: near its end, most bring a new best."""
+"""Generations between two recordings of the best rollout at physics rate: late in a run, most have a new best."""
 
 
 DURABLE_EVERY: Final = 1.0
 """Time between two checkpoints that survive a power failure [s]; the others survive a killed learner only."""
 
-_FULL: Final = (errno.ENOSPC, errno.EDQUOT)  # the disk, or the user's share of it
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)  # full disk, or the user's quota
 
 
 class Learner:
     """One run, from its start or its checkpoint to its end."""
 
     def __init__(self, problem: Problem, folder: RunFolder, at: Checkpoint) -> None:
-        """Take up a run where its checkpoint is: `start`'s for a new one.
+        """Continue a run from its checkpoint; a new run has that of `start`.
 
         Raises:
           CheckpointError: the checkpoint does not fit the configuration.
         """
-        # The replay of the best is shown again: replay.rrd is written anew by whoever ends the run.
+        # The best rollout is reported again: the process that ends the run writes a new replay.rrd.
         self.problem, self.config, self.folder = problem, problem.config, folder
         self._at = replace(at, replayed=at.best is None)
         try:
@@ -67,40 +67,40 @@ class Learner:
 
     @property
     def run(self) -> str:
-        """The name that the run began with; its folder may have been renamed since."""
+        """The run's original name; its folder may have been renamed."""
         return self._at.run
 
     @property
     def spec(self) -> Spec:
-        """What workers simulate, under the folder's name, so that copies of a run can continue side by side."""
+        """The workers' specification, named after the folder, so that copies of a run can continue at the same time."""
         return self.problem.specification(self.folder.name)
 
     @property
     def canary(self) -> str | None:
-        """Digest of the numbers of the machines that simulated so far."""
+        """Fingerprint of the numbers of the machines that simulated so far."""
         return self._at.canary
 
     @property
     def _algorithm(self) -> Algorithm[Any]:
-        """The algorithm, of as many pairs as this generation has."""
+        """The algorithm with this generation's number of pairs."""
         return self.config.algorithm_of(self._at.pairs)
 
     @property
     def over(self) -> bool:
-        """Whether no generation is left to do."""
+        """Whether all generations are done."""
         config, at = self.config, self._at
-        # Of an average, all means that go into it must have succeeded.
+        # With averaging, all averaged means must have succeeded.
         solved = config.stop_when_solved is not None and at.solved >= max(config.stop_when_solved, config.average)
         spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
         return self.state.generation >= config.generations or solved or spent
 
     def learn(self, farm: Dispatcher) -> Iterator[Report]:
-        """Generations until the run is over; the next one is under way while a report is looked at.
+        """Yield generations until the run is over; the next one is simulated while the caller handles a report.
 
         Raises:
           Diverged: mu or sigma would not be finite; the state before is saved.
           RunError: a job failed on several workers, or a file cannot be written.
-          Stopped: the user asked to end; the last whole generation is saved.
+          Stopped: the user asked to stop; the last complete generation is saved.
         """
         begun = time.monotonic() - self._at.seconds
         if self.over:
@@ -108,7 +108,7 @@ class Learner:
         eps, hopeless = self._explore(farm), False
         while not self.over:
             results, last = farm.collect(), self._at
-            rollouts = len(eps) * len(self._signs)  # the jobs behind them are the mean policy's, and perhaps the best's
+            rollouts = len(eps) * len(self._signs)  # the following jobs are the mean policy's, and perhaps the best's
             returns = results.returns[:rollouts].reshape(len(eps), len(self._signs))
             before = self.state
             told = learnt_from(self.config, self.problem.task, returns, results.steps[:rollouts])
@@ -127,7 +127,7 @@ class Learner:
                     f"{before.generation}: {advice}"
                 ) from None
             if progress.failed == returns.size and not hopeless:
-                log.warning("the physics of all %d rollouts blew up: farm check shows how they start", returns.size)
+                log.warning("all %d rollouts became unstable: farm check shows how they start", returns.size)
             hopeless = progress.failed == returns.size
             farm.report(progress)
             yield Report(
@@ -158,7 +158,7 @@ class Learner:
         )
 
     def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
-        """What came out, as summary.json says it."""
+        """The results in summary.json."""
         at = self.state.generation
         rates = [p.success_rate for p in self.folder.progress() if p.generation == at]
         mean = evaluation.mean if evaluation else None
@@ -189,7 +189,7 @@ class Learner:
         return self._at.best_generation
 
     def _explore(self, farm: Dispatcher) -> FloatArray:
-        """Draw a generation's eps, and hand out its jobs: exploring ones, the mean policy, perhaps the best again."""
+        """Draw a generation's eps, and publish its jobs: exploring ones, the mean policy, perhaps the best again."""
         state = self.state
         eps, exploring = explored(self.config, state, self._at.pairs)
         replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
@@ -198,7 +198,7 @@ class Learner:
         return eps
 
     def _normalisers(self) -> FloatArray:
-        """Of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
+        """Normalisers of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
         now, best = normaliser(self._at.moments), self._at.best
         return np.stack([now, now if best is None else best.normaliser])
 
@@ -219,7 +219,7 @@ class Learner:
         seconds: float,
         farm: Dispatcher,
     ) -> None:
-        """Bring the checkpoint up to date after an update."""
+        """Update the checkpoint after an update of the algorithm."""
         best, generation = self._at.best, self._at.best_generation
         steps = int(results.steps[: returns.size].sum())
         replayed = self._at.replayed or len(results) > len(eps) + 1
@@ -274,7 +274,7 @@ class Learner:
         )
 
     def _success(self, flags: BoolArray) -> float | None:
-        """Part of the rollouts (S, 4) that succeeded, if the task knows success."""
+        """Fraction of the rollouts (S, 4) that succeeded, if the task defines success."""
         return float(np.mean(flags[:, 0])) if self._judged else None
 
     def _save(self, progress: GenerationStats) -> None:
@@ -287,7 +287,7 @@ class Learner:
 
 
 def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[FloatArray, Jobs]:
-    """A generation's eps, (rows, P), and its exploring jobs: all that is random in it, drawn from its number."""
+    """A generation's eps, (rows, P), and its exploring jobs: all its random numbers, seeded by its number."""
     algorithm = config.algorithm_of(pairs)
     eps = algorithm.ask(state, seeds.exploration(config.seed, state.generation))
     drawn = None
@@ -297,7 +297,7 @@ def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[Flo
 
 
 def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:
-    """Returns (rows, signs) with the reward's offset, of rollouts of so many steps (S,)."""
+    """Returns (rows, signs) including the reward's offset, of rollouts with these numbers of steps (S,)."""
     own = config.task_config
     if not own.reward_offset:
         return returns
@@ -307,10 +307,10 @@ def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntAr
 
 
 def _traces(traces: Mapping[int, AnyArray], returns: FloatArray, keep: str) -> dict[str, AnyArray]:
-    """Those of the rollouts' traces, (T, N) each, that are kept, by name."""
+    """The traces to keep, by name; each has (T, N) per rollout."""
     if keep == "none":
         return {}
     rows = {"best": int(returns.argmax()), "worst": int(returns.argmin())}
-    # Where machines of different numbers take part, a doubled job's trace may have travelled in another's place.
+    # If machines round differently, a job that ran twice may have sent the trace of another rollout.
     kept = {name: traces[row] for name, row in rows.items() if row in traces}
     return {**kept, "all": np.stack([traces[i] for i in range(returns.size)])} if keep == "all" else kept

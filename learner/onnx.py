@@ -1,7 +1,7 @@
-"""A learnt policy as an ONNX model: observation in, action out. A door to onnx; docs/export.md describes the file.
+"""Exports a learnt policy as an ONNX model: observation in, action out; docs/export.md describes the file.
 
-Double precision throughout, in the operators of opset 17. Sums and functions are the runtime's, so that the last bits
-are others than the farm's.
+Double precision throughout, with the operators of opset 17. The runtime computes sums and functions, so that the last
+bits differ from the farm's.
 """
 
 import json
@@ -20,7 +20,7 @@ from learner.replay import LoadedPolicy
 OPSET: Final = 17
 """Version of the operators."""
 IR: Final = 8
-"""Version of the file's format, which goes with them."""
+"""Version of the file's format for these operators."""
 
 
 class Graph:
@@ -159,7 +159,7 @@ def _weighted_kernel(graph: Graph, policy: LoadedPolicy, x: str) -> str:
 
 
 def _features(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    """Random features: `direct`, and those that are `direct` in what they prepare."""
+    """Random features: `direct`, and policies that can be converted to it."""
     found, config = policy.problem.policy, policy.problem.config.policy_config
     rows = (found.constants["frequencies"] / config.bandwidth).T.copy()  # type: ignore[attr-defined]
     weights = found.prepare(policy.mu[None])[0]

@@ -1,4 +1,4 @@
-"""What the runs of a sweep gave: a row each, means over the seeds, and curves."""
+"""Results of a sweep's runs: one row per run, means over the seeds, and curves."""
 
 import csv
 import importlib.util
@@ -21,15 +21,15 @@ COLUMNS: Final = {
     "mean_policy_return": "number", "mean_policy_success": "truth", "robust_success_rate": "number",
     "robust_return": "number", "seconds": "number", "parameters_sha256": "text",
 }  # fmt: skip
-"""Of the table, and their types, behind what is varied (text as it was given); names of summary.json, and the return
-of the mean policy before learning."""
+"""Columns of the table and their types, after the varied settings (text as given): names of summary.json, and the
+return of the mean policy before learning."""
 
 INSTALL: Final = "it needs pyarrow: pip install pyarrow"
-"""What to say where pyarrow is missing."""
+"""Message if pyarrow is missing."""
 
 
 def rows(sweep: Sweep) -> list[dict[str, Any]]:
-    """A row a run, setting by setting; what is not known is None."""
+    """One row per run, setting by setting; unknown values are None."""
     return [
         {**setting.values, **_row(sweep.folder(i, seed), seed)}
         for i, setting in enumerate(sweep.settings)
@@ -50,7 +50,7 @@ def _row(path: Path, seed: int) -> dict[str, Any]:
 
 
 def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
-    """Write table.csv, as a whole or not at all: a RunError says why not."""
+    """Write table.csv atomically; raises RunError if it cannot be written."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [*sweep.vary, *COLUMNS], lineterminator="\n")
     writer.writeheader()
@@ -60,12 +60,12 @@ def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None
 
 
 def available() -> bool:
-    """Whether pyarrow is there."""
+    """Whether pyarrow is installed."""
     return importlib.util.find_spec("pyarrow") is not None
 
 
 def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
-    """Write table.parquet, typed, as a whole or not at all: a RunError says why not."""
+    """Write table.parquet, with types, atomically; raises RunError if it cannot be written."""
     import pyarrow
     from pyarrow import parquet
 
@@ -79,7 +79,7 @@ def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> 
 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:
-    """Mean and standard deviation of a column over its runs, where it is known; None if it never is."""
+    """Mean and standard deviation of a column over the runs that have a value; None if none has."""
     known = [float(row[column]) for row in table if row[column] is not None]
     return (float(np.mean(known)), float(np.std(known))) if known else None
 
@@ -92,11 +92,11 @@ class Curve:
     rollouts: FloatArray
     """Exploring rollouts before this policy, (G,)"""
     returns: FloatArray
-    """(runs, G), nan after a run's end and where the physics blew up"""
+    """(runs, G), nan after a run's end and where the simulation became unstable"""
 
 
 def curves(sweep: Sweep) -> list[Curve]:
-    """A curve a setting; without those none of whose runs has begun."""
+    """One curve per setting that has a started run."""
     found = []
     for i, setting in enumerate(sweep.settings):
         runs = [run for seed in sweep.seeds if len((run := _curve(sweep.folder(i, seed)))[0])]
@@ -111,7 +111,7 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
     progress, summary = folder.progress(), folder.read_summary() or {}
     rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
     returns = [p.mean_policy_return for p in progress]
-    if progress and summary.get("state") == "finished":  # the evaluation's: after the last update
+    if progress and summary.get("state") == "finished":  # from the evaluation after the last update
         rollouts, returns = [*rollouts, progress[-1].rollouts], [*returns, summary.get("mean_policy_return")]
     values = np.array(returns, dtype=float)
     return np.array(rollouts, dtype=float), np.where(values <= RETURN_FLOOR, np.nan, values)

@@ -1,4 +1,4 @@
-"""A pool that evaluates parameter vectors, for search methods of one's own.
+"""A pool that evaluates parameter vectors, for your own search methods.
 
 import farm
 
@@ -33,13 +33,13 @@ from learner.setup import problem
 
 log = logging.getLogger(__name__)
 
-_GATHER: Final = 256 << 20  # [bytes] of parameters that are given out at a time
+_GATHER: Final = 256 << 20  # [bytes] of parameters that are distributed at a time
 
 
 class Farm:
     """Workers that evaluate parameters of a task's policy: each exactly once, in order, even if workers die.
 
-    Several threads can use it, and take turns. Ctrl-C ends a call; the pool stays usable.
+    Several threads can use it in turn. Ctrl-C ends a call; the pool stays usable.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Farm:
           settings: of task and policy as in `farm.configure`, such as policy="linear", preset, perturb.
 
         Raises:
-          ConfigError: a setting makes no sense.
+          ConfigError: a setting is invalid.
           FarmError: there is no router at `connect`.
         """
         endpoints = (connect,) if isinstance(connect, str) else connect
@@ -80,7 +80,7 @@ class Farm:
             tls=None if tls is None else find(Path(tls), "learner"), scheduler=SchedulerConfig(audit=audit),
         )  # fmt: skip
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
-        self._holder: int | None = None  # the thread whose call it is
+        self._holder: int | None = None  # the thread of the current call
         with ExitStack() as stack:
             link = stack.enter_context(connected(self._place, self._closed.is_set))
             name = f"pool-{secrets.token_hex(4)}"
@@ -130,7 +130,7 @@ class Farm:
     def _as_they_come(self, jobs: Jobs) -> Iterator[tuple[int, float]]:
         with self._turn():
             self._begin(jobs)
-            told = np.full(len(jobs), np.nan)  # a host that is expelled has its answers taken back
+            told = np.full(len(jobs), np.nan)  # the answers of an expelled host are discarded
             for results in self._farm.progress():
                 for index in np.flatnonzero(results.done & (results.returns != told)).tolist():
                     told[index] = results.returns[index]
@@ -149,9 +149,9 @@ class Farm:
         return found
 
     def close(self) -> None:
-        """End the workers that were started; a waiting call gets a RunError. Closing twice does no harm."""
+        """Stop the local workers; a waiting call raises RunError. Closing twice is allowed."""
         self._closed.set()
-        mine = self._holder == threading.get_ident()  # an imap that this thread never takes to its end
+        mine = self._holder == threading.get_ident()  # an unfinished imap of this thread
         if not mine:
             self._taken.acquire()
         try:
@@ -173,7 +173,7 @@ class Farm:
         """Allow one call at a time.
 
         Raises:
-          RunError: this thread's own imap is not over, for which it would wait for ever; or the pool is closed.
+          RunError: this thread has an unfinished imap, for which it would wait forever; or the pool is closed.
         """
         if self._holder == threading.get_ident():
             raise RunError(
@@ -199,10 +199,10 @@ class Farm:
         try:
             given = np.asarray(thetas)
         except (TypeError, ValueError, RuntimeError):  # such as rows of different lengths, or a tensor with a gradient
-            raise ConfigError(f"thetas is a {type(thetas).__name__} that makes no array; {expected}") from None
+            raise ConfigError(f"thetas is a {type(thetas).__name__} that is not an array; {expected}") from None
         if given.shape == (0,):
             return np.empty((0, self.size))
-        if given.dtype.kind not in "biuf":  # text or complex numbers would be turned into others
+        if given.dtype.kind not in "biuf":  # text or complex numbers would be converted
             raise ConfigError(f"thetas is a {type(thetas).__name__} of {given.dtype.name}; {expected}")
         theta = np.ascontiguousarray(given, dtype=np.float64)
         if given.ndim != 2 or given.shape[1] != self.size:

@@ -34,11 +34,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Replay:
-    """One rollout again, at physics rate."""
+    """A repeated rollout at physics rate."""
 
     trajectory: Trajectory
     frames: Mapping[str, FloatArray]
-    """What was measured in each frame, qpos (F, nq) among it"""
+    """Measured values of each frame, including qpos (F, nq)"""
     rollouts: Rollouts
     """One row."""
 
@@ -49,7 +49,7 @@ class LoadedPolicy:
 
     problem: Problem
     generation: int
-    """Updates that led to it."""
+    """Number of updates before it."""
     mu: FloatArray
     """Its parameters, (P,)"""
 
@@ -59,12 +59,12 @@ class LoadedPolicy:
         return self.problem.runner()
 
     def rollout(self, theta: FloatArray | None = None, seed: Seed = None) -> Replay:
-        """One rollout of it, or of other parameters (P,), from the start that a seed gives (None: nominal)."""
+        """One rollout of it, or of other parameters (P,), from the start for a seed (None: nominal)."""
         chosen = self.mu if theta is None else theta
         return self.rollouts(chosen[None], [seed])[0]
 
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
-        """Rollouts of parameters (B, P), from the starts that their seeds give."""
+        """Rollouts of parameters (B, P), from the starts for their seeds."""
         found = self.runner.rollouts(theta, list(seeds), physics=True)
         rows = range(len(theta))
         return [Replay(self.runner.trajectory(found, i), whole(found, i), found.at(slice(i, i + 1))) for i in rows]
@@ -91,9 +91,9 @@ def loaded(
     task: Any = None,  # noqa: ANN401
     average: int | None = None,
 ) -> LoadedPolicy:
-    """The same, with settings of the task as a whole, and the average of so many last means.
+    """Like `load`, with all settings of the task in one object, and the average of this number of last means.
 
-    Without `average`: the run's own for the policy that it ended with, 1 for an earlier generation.
+    Without `average`: the run's own setting for its final policy, 1 for an earlier generation.
 
     Raises:
       ConfigError: it is not stored, or cannot be simulated like that.
@@ -110,7 +110,7 @@ def loaded(
 
 
 def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
-    """What a run searches for, from its checkpoint, with settings of the task as a whole; None for the run's own.
+    """A run's problem from its checkpoint, with all settings of the task in one object; None for the run's own.
 
     Raises:
       ConfigError: it cannot be simulated like that.
@@ -129,19 +129,19 @@ def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  #
 
 
 def seeing(found: Problem, seen: FloatArray) -> Problem:
-    """The problem with the policy's observations normalised by (2, d); as it is where d is 0."""
+    """The problem with the policy's observations normalised by (2, d); unchanged if d is 0."""
     return replace(found, policy=Normalised(found.policy, seen)) if seen.size else found
 
 
 def _files(old: RunConfig, new: RunConfig, kept: Mapping[str, str]) -> dict[str, str]:
-    """The texts that a task with other settings is made of: the run's own, but for those that the settings change."""
+    """Files of a task with other settings: the run's own, except those that depend on the settings."""
     plugin = plugins.find("tasks", old.task)
     before, after = (dict(build_task(plugin, settings.to_dict(c.task_config), None).sources) for c in (old, new))
     return {name: kept[name] if name in kept and text == before.get(name) else text for name, text in after.items()}
 
 
 def _earlier(folder: RunFolder, config: RunConfig, generation: int, last: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A mean before the checkpoint's, and its normaliser; that of generation 0 follows from the configuration."""
+    """An earlier mean and its normaliser; those of generation 0 follow from the configuration."""
     if generation != 0:
         return folder.mean(generation)
     if config.init_from is not None:

@@ -1,4 +1,4 @@
-"""A generation's exploring rollouts again, from their seeds: nothing of them was stored.
+"""Repeats a generation's exploring rollouts from their seeds; the rollouts themselves are not stored.
 
 import farm
 
@@ -35,37 +35,37 @@ class Rewound:
     """The exploring rollouts of a generation, simulated again at control rate; S of them, in the run's order."""
 
     policy: LoadedPolicy
-    """The mean that was explored around, under the run's own settings."""
+    """The mean that the generation explored around, with the run's own settings."""
     seen: FloatArray
     """Mean and standard deviation that its observations were normalised by, (2, d) or (2, 0)"""
     generation: int
-    """Counted from 1, as the lines of progress.jsonl are: its rollouts led to update number `generation`."""
+    """Counted from 1, as in progress.jsonl: its rollouts led to update number `generation`."""
     theta: FloatArray
     """Parameters of each, (S, P)"""
     seeds: Sequence[Seed]
-    """Of each one's start and conditions; None: nominal"""
+    """Seed of each one's start and conditions; None: nominal"""
     rollouts: Rollouts
-    """What came out"""
+    """The results"""
 
     @property
     def returns(self) -> FloatArray:
-        """Of each, (S,): to the last bit those that the run learnt from, before the reward's offset."""
+        """Return of each, (S,): bit for bit those that the run learnt from, before the reward's offset."""
         return self.rollouts.returns
 
     def best(self, count: int) -> list[int]:
-        """The rollouts of the highest returns, the highest first; of equal ones the first."""
+        """Indices of the rollouts with the highest returns, in descending order; of equal ones the first."""
         return np.argsort(-self.returns, kind="stable")[:count].tolist()
 
     def worst(self, count: int) -> list[int]:
-        """The rollouts of the lowest returns, the lowest first; of equal ones the first."""
+        """Indices of the rollouts with the lowest returns, in ascending order; of equal ones the first."""
         return np.argsort(self.returns, kind="stable")[:count].tolist()
 
     def ended(self, count: int) -> list[int]:
-        """The first rollouts that the task ended before their last step, such as by a drop."""
+        """Indices of the first rollouts that the task ended before their last step, for example after a drop."""
         return np.flatnonzero(self.rollouts.ended)[:count].tolist()
 
     def again(self, chosen: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
-        """Some of them at physics rate; with a policy that was loaded with other settings of the task, under those.
+        """Simulate some of them at physics rate, with the task's settings of `policy` if it is given.
 
         Raises:
           ConfigError: there is no such rollout.
@@ -86,19 +86,19 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
     """The exploring rollouts of a generation (None: the last) of the run in a folder.
 
     Raises:
-      ConfigError: the run has no such generation behind it.
+      ConfigError: the run has not done this generation.
     """
     return rewound(RunFolder.open(Path(path)), generation)
 
 
 def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
-    """The same, for an open folder.
+    """Like `rewind`, for an open folder.
 
-    The state before the generation is made of mu and sigma in `parameters` where `ask` looks at nothing else; for
-    other algorithms, and where that generation is not stored, the run is learnt again up to there.
+    If `ask` depends on mu and sigma only, the state before the generation is read from `parameters`. For other
+    algorithms, and if that generation is not stored, the run is learnt again up to there.
 
     Raises:
-      ConfigError: the run has no such generation behind it.
+      ConfigError: the run has not done this generation.
     """
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
@@ -116,13 +116,13 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
 
 
 def under(folder: RunFolder, found: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
-    """The policy of a generation that was found again, with other settings of its task; a ConfigError if not so."""
+    """The policy of a repeated generation with other settings of its task; a ConfigError if that is impossible."""
     problem = restored(folder, checkpoints.load(folder.checkpoint), task)
     return LoadedPolicy(seeing(problem, found.seen), found.policy.generation, found.policy.mu)
 
 
 def _before(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[SearchState, FloatArray]:
-    """The algorithm's state when a generation was drawn, and the normaliser of its observations."""
+    """The algorithm's state before a generation was drawn, and the normaliser of its observations."""
     config, before = folder.read_config(), generation - 1
     algorithm: Any = config.algorithm_config
     fresh = algorithm.init(len(at.state["mu"]))
@@ -138,7 +138,7 @@ def _before(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[SearchS
 
 
 def _pairs(folder: RunFolder, generation: int) -> int:
-    """Pairs of a generation whose number followed from the one before; 0: as the algorithm's settings say."""
+    """Pairs of a generation with --interactions; 0: the number in the algorithm's settings."""
     config = folder.read_config()
     if config.interactions is None:
         return 0
@@ -153,14 +153,14 @@ def _pairs(folder: RunFolder, generation: int) -> int:
 
 
 def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:  # noqa: ANN401
-    """Whether `ask` draws the same from mu and sigma alone, without other state such as a covariance."""
+    """Whether `ask` depends on mu and sigma only, not on other state such as a covariance."""
     bare = replace(fresh, mu=last.mu, sigma=last.sigma, generation=last.generation)
     with_all, without = (algorithm.ask(state, streams.exploration(0, 0)) for state in (last, bare))
     return with_all.tobytes() == without.tobytes()
 
 
 def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[SearchState, FloatArray]:
-    """Learn the run again in this process up to this update: slow, but for any algorithm, and to the same bits."""
+    """Learn the run again in this process up to this update: slow, but works for any algorithm, with the same bits."""
     config = folder.read_config()
     algorithm: Any = config.algorithm_config
     first = start(config, folder.name)[1]
@@ -185,7 +185,7 @@ def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[Search
 
 
 def _compare(folder: RunFolder, found: Rewound) -> None:
-    """Warn if the returns are not the run's: progress.jsonl has their mean, extremes and spread."""
+    """Warn if the returns differ from the run's mean, extremes and spread in progress.jsonl."""
     values = found.returns
     for line in folder.progress():
         if line.generation == found.generation:

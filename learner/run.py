@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _REMEMBERED: Final = 5.0  # [s] for which a router may believe that a killed learner is still there
-_LOOK: Final = 0.3  # [s] between two looks at who else claims a run's name
-_TEND: Final = 0.5  # [s] between two looks at the worker processes
+_LOOK: Final = 0.3  # [s] between two checks for other claims on a run's name
+_TEND: Final = 0.5  # [s] between two checks of the worker processes
 
 
 MOST_WORKERS: Final = 1024
@@ -55,7 +55,7 @@ MOST_WORKERS: Final = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Where a run is on the network and on this machine; no number depends on it."""
+    """Placement of a run on the network and on this machine; does not affect its numbers."""
 
     workers: int = 0
     """Number of local worker processes."""
@@ -72,7 +72,7 @@ class Placement:
     trusted: bool = False
     """Listen to other machines without certificates."""
     mixed: bool = False
-    """Admit workers whose machines round differently, and code that has changed since the run began."""
+    """Admit workers whose machines round differently, and code that has changed since the run started."""
     record: bool = True
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
@@ -80,7 +80,7 @@ class Placement:
     log: tuple[str, ...] = ()
     """Loggers, by name."""
     scheduler: SchedulerConfig = field(default_factory=SchedulerConfig)
-    """How jobs are cut into chunks, and when they are reissued."""
+    """How jobs are split into chunks, and when they are reissued."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ class Run:
     """The local workers."""
     loggers: Loggers
     summary: dict[str, Any] = field(default_factory=dict)
-    """What summary.json says, once it is over."""
+    """The contents of summary.json after the end."""
 
     @property
     def worker_pids(self) -> list[int]:
@@ -108,7 +108,7 @@ class Run:
         return self.recording.uri if self.recording else None
 
     def learn(self) -> Iterator[Report]:
-        """Generations until the run is over, each recorded; then the evaluation. `summary` tells how it ended.
+        """Yield generations until the run is over, each recorded; then evaluate. `summary` has the result.
 
         Raises:
           RunError: the run failed or diverged; everything is saved.
@@ -149,7 +149,7 @@ class Run:
             if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
                 raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
         finally:
-            if state in ("finished", "diverged"):  # otherwise the run may go on
+            if state in ("finished", "diverged"):  # otherwise the run may continue
                 self.publisher.end(self.summary, evaluation, self.learner.best_generation)
 
 
@@ -159,7 +159,7 @@ def learn(
     """Learn with local workers; the folder must not exist yet. `log` are loggers by name, such as "tensorboard".
 
     Raises:
-      ConfigError: the folder exists, or a setting makes no sense.
+      ConfigError: the folder exists, or a setting is invalid.
       RunError: the run failed.
     """
     check_workers(workers)
@@ -169,7 +169,7 @@ def learn(
 
 
 def check_workers(workers: object) -> None:
-    """See that a number of local workers is one (a ConfigError otherwise)."""
+    """Check a number of local workers; raises ConfigError if it is invalid."""
     if type(workers) is not int or not 1 <= workers <= MOST_WORKERS:
         raise ConfigError(f"workers is {workers!r}; expected 1 to {MOST_WORKERS} processes on this machine")
 
@@ -183,7 +183,7 @@ def open_run(
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Run]:
-    """Open everything that a run needs, in an order that leaves nothing behind if a part fails."""
+    """Open all parts of a run, in an order that leaves nothing behind if one fails."""
     folder = RunFolder(path)
     keys.checked("run", folder.name)
     if place.record or place.serve:
@@ -194,9 +194,9 @@ def open_run(
         config = config if resume else fitted(config)
         problem, at = resumed(folder, config, mixed=place.mixed) if resume else start(config, folder.name)
         if place.tls:
-            _ = problem.sources  # says in time what cannot travel
+            _ = problem.sources  # reports early what cannot be sent
         if place.workers:
-            problem.runner().close()  # says in time what no worker could simulate
+            problem.runner().close()  # reports early what no worker could simulate
         link = stack.enter_context(connected(place, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:
@@ -233,7 +233,7 @@ def dispatch(
     generations: int,
     stopped: Callable[[], bool],
 ) -> tuple[Dispatcher, Pool | None]:
-    """Show a problem on the network under a name, and start its local workers; all ends with the stack."""
+    """Publish a problem on the network under a name, and start its local workers; the stack closes all."""
     tend = _Tending(stopped)
     for digest, source in problem.sources.items() if place.tls else ():
         link.answer(keys.code(place.farm, name, digest), partial(_same, source))
@@ -250,7 +250,7 @@ def dispatch(
     )
     if place.workers:
         flags = [*_worker_flags(place, problem), "--backend", place.backend]
-        flags += ["--log-level", "WARNING"]  # what they do, the learner says
+        flags += ["--log-level", "WARNING"]  # the learner reports their state
         tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
     return farm, tend.pool
 
@@ -260,7 +260,7 @@ def _same(source: bytes) -> bytes:
 
 
 class _Tending:
-    """Asked from time to time whether to stop; also looks after the local workers."""
+    """Called repeatedly to ask whether to stop; also restarts local workers."""
 
     def __init__(self, stopped: Callable[[], bool]) -> None:
         self._stopped, self._next = stopped, 0.0
@@ -270,12 +270,12 @@ class _Tending:
         if self.pool and time.monotonic() > self._next:
             self._next = time.monotonic() + _TEND
             if self.pool.tend() and not self.pool.pids:
-                raise RunError("no local worker keeps running; their own messages above say why")
+                raise RunError("no local worker keeps running; see their messages above")
         return self._stopped()
 
 
 def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[], bool]) -> None:
-    """Check that no other learner has this run's name at the same router: they would void each other's work.
+    """Check that no other learner has this run's name at the same router: they would discard each other's work.
 
     If several start together, the first one stays: each claims the name, then looks for other claims.
     """
@@ -288,14 +288,14 @@ def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[]
             raise taken
     mine = f"{time.time_ns():020}-{secrets.token_hex(8)}".encode()
     link.answer(keys.claim(place.farm, run), lambda: mine)
-    for pause in (0.0, _LOOK):  # again, because a claim takes its time through routers
+    for pause in (0.0, _LOOK):  # again, because routers take time to forward a claim
         time.sleep(pause)
         if any(other < mine for other in link.ask_all(keys.claim(place.farm, run), 1.0)):
             raise taken
 
 
 def connected(place: Placement, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
-    """A session as the placement says: one that listens, or one that is connected to a router."""
+    """A session for the placement: one that listens, or one connected to a router."""
     if place.connect:
         return session.connect(place.connect, None, stopped, place.tls)
     return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted)
@@ -309,7 +309,7 @@ def _worker_flags(place: Placement, problem: Problem) -> list[str]:
 
 
 def how_to_join(place: Placement, problem: Problem) -> str:
-    """The command by which workers join."""
+    """The command with which workers join."""
     host = socket.gethostname()  # for an address that means all of them, other machines need the name
     if place.tls and place.tls.hosts and host not in place.tls.hosts:
         host = place.tls.hosts[0]  # another would be refused
@@ -319,7 +319,7 @@ def how_to_join(place: Placement, problem: Problem) -> str:
 
 
 class _LogFile(logging.FileHandler):
-    """Leaves out lines that cannot be written; a full disk is reported elsewhere."""
+    """Drops lines that cannot be written; a full disk is reported elsewhere."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's name
         """Say nothing."""

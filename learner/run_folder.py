@@ -1,4 +1,4 @@
-"""A run's folder: which files there are, and how they are written so that nothing is lost.
+"""A run's folder: its files, and writing them so that nothing is lost.
 
     config.json      the resolved configuration
     checkpoint       everything a resume needs, replaced after every generation
@@ -8,8 +8,8 @@
     run.rrd          the recording;  replay.rrd  the best and the final rollout at physics rate
     log.txt          the messages
 
-docs/files.md describes them. The checkpoint is written last. When the run is resumed, everything newer in the other
-files is cut off, damaged lines of progress.jsonl are left out, and a copy of the damaged file is kept.
+docs/files.md describes them. The checkpoint is written last. When the run is resumed, newer entries of the other
+files are removed, damaged lines of progress.jsonl are dropped, and a copy of the damaged file is kept.
 """
 
 import fcntl
@@ -49,9 +49,9 @@ _SUMMARY: Final = {
     **dict.fromkeys(("seconds", "mean_policy_return", "robust_success_rate", "robust_return"), _NUMBER),
     "mean_policy_success": (bool, type(None)),
 }
-"""Types of what is shown of a summary."""
+"""Types of the displayed values of a summary."""
 _ASIDE: Final = "moved elsewhere, it keeps no run from going on"
-_NONE: Final = np.empty((2, 0))  # the normaliser of observations that are taken as they are
+_NONE: Final = np.empty((2, 0))  # the normaliser if observations are not normalised
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, config: RunConfig) -> "RunFolder":
-        """A new folder with its configuration.
+        """Make a new folder with its configuration.
 
         Raises:
           ConfigError: it exists, or cannot be made.
@@ -100,14 +100,14 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """An existing run's folder; a ConfigError if there is none."""
+        """Open an existing run's folder; a ConfigError if there is none."""
         if not (path / "config.json").is_file():
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         return cls(path)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other processes (by a ConfigError) from working on the run, until this process ends."""
+        """Lock the run until this process ends; a ConfigError if another process has locked it."""
         folder = os.open(self.path, os.O_RDONLY)
         try:
             try:
@@ -121,7 +121,7 @@ class RunFolder:
             os.close(folder)
 
     def discard(self) -> None:
-        """Remove a new run that could not begin."""
+        """Remove a new run that could not start."""
         shutil.rmtree(self.path)
 
     def write_config(self, config: RunConfig) -> None:
@@ -137,7 +137,7 @@ class RunFolder:
         replace_text(self.path / "summary.json", json.dumps(summary, indent=2) + "\n")
 
     def read_summary(self) -> dict[str, Any] | None:
-        """Read summary.json, None when there is no readable one."""
+        """Read summary.json; None if there is no readable one."""
         try:
             summary = json.loads((self.path / "summary.json").read_text("utf-8"))
         except (OSError, ValueError, RecursionError):
@@ -168,16 +168,16 @@ class RunFolder:
                 binary.write(numbers.tobytes())
 
     def progress(self) -> list[GenerationStats]:
-        """Every line of progress.jsonl that can be read, generations rising."""
+        """Every readable line of progress.jsonl, in order of generations."""
         try:
             return [stats for _, stats in self._lines()[0]]
         except OSError:
             return []
 
     def _lines(self) -> tuple[list[tuple[int, GenerationStats]], list[int], bool]:
-        """Lines of progress.jsonl that can be read, by number; numbers of those that cannot; whether the end is torn.
+        """Readable lines of progress.jsonl by number; numbers of unreadable ones; whether the last one is incomplete.
 
-        One line that is damaged costs no other: neither what it holds, nor the generation that it claims.
+        A damaged line never affects other lines, neither by its contents nor by its generation.
         """
         *lines, end = (self.path / "progress.jsonl").read_text("utf-8", "replace").split("\n")
         read = []
@@ -190,15 +190,15 @@ class RunFolder:
         return read, lost, bool(end) and len(lines) + 1 not in known
 
     def every(self, parameters: int, generations: int, observation: int = 0) -> int:
-        """Every how many generations are kept in `parameters`, or would be of a new run."""
+        """Interval of the generations kept in `parameters`, or of a new run's."""
         path = self.path / "parameters"
         return int(_read_head(path)[0]["every"]) if path.exists() else every(parameters, generations, observation)
 
     def parameters(self) -> "np.ndarray[Any, Any]":
-        """Rows of `parameters`: generation, mu (P,), sigma (P,) and, of a run that normalises, normaliser (2, d).
+        """Rows of `parameters`: generation, mu (P,), sigma (P,) and, for a run that normalises, normaliser (2, d).
 
         Raises:
-          ConfigError: the file is missing or not one of this version.
+          ConfigError: the file is missing or of another version.
         """
         path = self.path / "parameters"
         head, offset = _read_head(path)
@@ -214,7 +214,7 @@ class RunFolder:
         """The mean mu after a generation, (P,), and the normaliser of its observations, (2, d) or (2, 0).
 
         Raises:
-          ConfigError: it is not in `parameters`; says what is.
+          ConfigError: it is not in `parameters`; names the generations that are.
         """
         rows = self.parameters()
         kept = rows["generation"]
@@ -225,7 +225,7 @@ class RunFolder:
         return row["mu"], row["normaliser"] if "normaliser" in row.dtype.names else _NONE
 
     def average(self, generation: int, mu: FloatArray, count: int) -> FloatArray:
-        """The average of mu, the mean after a generation, and of those stored of the `count` - 1 before it, (P,)."""
+        """The average of mu, the mean after a generation, and the stored ones among the `count` - 1 before it, (P,)."""
         first = max(1, generation - count + 1)
         if first >= generation:
             return mu
@@ -241,19 +241,19 @@ class RunFolder:
         return np.asarray(np.mean([*before["mu"], mu], axis=0))
 
     def save(self, checkpoint: Checkpoint, *, durable: bool = True) -> None:
-        """Replace the checkpoint; durable: so that a power failure, too, leaves one."""
-        if durable:  # first what it relies on
+        """Replace the checkpoint; durable: also safe against a power failure."""
+        if durable:  # first the files that it relies on
             for name in ("config.json", "progress.jsonl", "parameters"):
                 with suppress(FileNotFoundError), (self.path / name).open("rb") as file:
                     os.fsync(file.fileno())
         checkpoints.save(self.checkpoint, checkpoint, durable=durable)
 
     def settle(self) -> None:
-        """End with one checkpoint that is on the disk."""
+        """Flush the checkpoint to the disk, and delete its copy."""
         checkpoints.settle(self.checkpoint)
 
     def rewind(self, checkpoint: Checkpoint) -> None:
-        """Cut the other files back to a checkpoint.
+        """Remove entries of the other files that are newer than the checkpoint.
 
         Raises:
           CheckpointError: it cannot be used.
@@ -262,14 +262,14 @@ class RunFolder:
         if type(generation) is not int:
             raise CheckpointError(f"{self.checkpoint} holds no generation")
         size = np.asarray(checkpoint.state.get("mu")).size
-        whole = self._parameters_until(generation, size)  # or says why not
+        whole = self._parameters_until(generation, size)  # raises if unusable
         self._rewind_progress(generation)
         if whole is not None:
             with (self.path / "parameters").open("r+b") as file:
                 file.truncate(whole)
 
     def _parameters_until(self, generation: int, size: int) -> int | None:
-        """The bytes of `parameters` up to a generation; None if there are none."""
+        """Size of `parameters` up to a generation [bytes]; None if there are none."""
         path = self.path / "parameters"
         if not path.exists():
             return None
@@ -294,7 +294,7 @@ class RunFolder:
             read, lost, torn = [], [], False
         kept = [stats for _, stats in read if stats.generation <= generation]
         if torn and (not read or read[-1][1].generation < generation):
-            lost.append(path.read_bytes().count(b"\n") + 1)  # else a crash tore off a generation beyond the checkpoint
+            lost.append(path.read_bytes().count(b"\n") + 1)  # else: of a later generation
         if lost:
             copy = _copy(path)
             which = ", ".join(map(str, lost[:10])) + (", ..." if len(lost) > 10 else "")
@@ -306,13 +306,13 @@ class RunFolder:
 
 
 def every(parameters: int, generations: int, observation: int = 0) -> int:
-    """Every how many generations are kept, so that the file stays below PARAMETERS_LIMIT."""
+    """Interval of the generations to keep, so that the file stays below PARAMETERS_LIMIT."""
     size = _row_type(parameters, observation).itemsize * max(generations, 1)
     return max(1, math.ceil(size / PARAMETERS_LIMIT))
 
 
 def _in_the_way(path: Path) -> str:
-    """What is in the place of a folder or of one above it; empty if nothing is."""
+    """What blocks the path of a folder or of one above it; empty if nothing does."""
     for part in (*reversed(path.parents), path):
         if part.is_symlink() and not os.path.isdir(part):  # noqa: PTH112
             return f"{part} is a link to {part.readlink()}, which is no folder"
@@ -328,7 +328,7 @@ def _makes_sense(summary: dict[str, Any]) -> bool:
 
 
 def _rising(numbers: list[int]) -> list[int]:
-    """Positions of a longest rising subsequence, so that a wrong number does not discard the others."""
+    """Positions of a longest ascending subsequence, so that a wrong number does not discard the others."""
     ends: list[int] = []  # of the subsequences of each length, the one that ends lowest
     before: list[int | None] = []
     for i, number in enumerate(numbers):
@@ -343,7 +343,7 @@ def _rising(numbers: list[int]) -> list[int]:
 
 
 def _copy(path: Path) -> Path:
-    """Copy a damaged file beside it; older copies are kept."""
+    """Copy a damaged file next to it; older copies are kept."""
     copies = (path.with_name(f"{path.name}.damaged{n if n > 1 else ''}") for n in itertools.count(1))
     copy = next(each for each in copies if not os.path.lexists(each))
     try:
@@ -355,7 +355,7 @@ def _copy(path: Path) -> Path:
 
 
 def _offer(kept: IntArray, wanted: int) -> str:
-    """Which generations there are instead of the wanted one."""
+    """The available generations, for an error."""
     if not len(kept):
         return "none is"
     nearest = kept[np.abs(kept - wanted).argmin()]

@@ -1,4 +1,4 @@
-"""How a run begins: task and policy from its configuration, its first state, and its workers' specification."""
+"""The start of a run: task and policy from its configuration, its first state, and its workers' specification."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ MESSAGE_LIMIT: Final = 32 << 20
 
 @dataclass(frozen=True)
 class Problem:
-    """What a run searches for: parameters of a policy for a task."""
+    """A run's search problem: parameters of a policy for a task."""
 
     config: RunConfig
     task: Task
@@ -40,7 +40,7 @@ class Problem:
 
     @cached_property
     def scene(self) -> Scene:
-        """What there is to draw."""
+        """The scene to draw."""
         return Scene(self.task.model)
 
     def specification(self, run: str) -> Spec:
@@ -60,7 +60,7 @@ class Problem:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files that its classes come from, which workers must be allowed to serve."""
+        """Files of its classes, which workers must be allowed to serve."""
         return tuple(dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None))
 
     @cached_property
@@ -68,7 +68,7 @@ class Problem:
         """Those files as they were imported, by SHA-256, for workers that accept code.
 
         Raises:
-          ConfigError: one is too large to travel.
+          ConfigError: one is too large to be sent.
         """
         files = [each for each in self._plugins.values() if each.file is not None]
         for each in files:
@@ -81,7 +81,7 @@ class Problem:
 
     @cached_property
     def code(self) -> dict[str, str]:
-        """Digests of the code that decides its numbers."""
+        """Digests of the code that determines its numbers."""
         parts = {name: plugin.digest() for name, plugin in self._plugins.items()}
         return parts | {"simulation": plugins.code_digest(rollouts.SIMULATION)}
 
@@ -93,10 +93,10 @@ class Problem:
 def problem(
     config: RunConfig, constants: Mapping[str, FloatArray] | None = None, files: Mapping[str, str] | None = None
 ) -> Problem:
-    """Task and policy of a configuration, with a run's constants and texts; by default new ones are drawn and read.
+    """Task and policy of a configuration, with a run's constants and files; by default new ones are drawn and read.
 
     Raises:
-      ConfigError: the task is not to be had here, or the policy is larger than a message.
+      ConfigError: the task is not available here, or the policy is larger than a message.
     """
     task = build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), files)
     spec = task.spec()
@@ -117,7 +117,7 @@ def _check_size(found: Problem) -> None:
     """Check that a mean fits into a message.
 
     Raises:
-      ConfigError: it does not; says the largest size that does.
+      ConfigError: it does not; names the largest size that does.
     """
     size, most = found.policy.size, MESSAGE_LIMIT // 8
     if size > most:
@@ -130,15 +130,15 @@ def _check_size(found: Problem) -> None:
 
 
 def fitted(config: RunConfig) -> RunConfig:
-    """The configuration with the kernel's width h and the first sigma worked out, if it wants them fitted.
+    """The configuration with the kernel's width h and the first sigma computed, if --start is fitted.
 
-    A Gaussian kernel of many numbers is zero nearly everywhere. Here the first mean mu acts a little at the nominal
-    start x0 (d,), and a sample moves the exponent by about one:
+    A Gaussian kernel of many numbers is zero nearly everywhere. With these values the first mean mu has a small output
+    at the nominal start x0 (d,), and a sample changes the exponent by about one:
 
         |mu - x0|^2 / (2 h^2) = 2,   d sigma^2 / (2 h^2) = 1:    h = |mu - x0| / 2,   sigma = h sqrt(2 / d)
 
     Raises:
-      ConfigError: policy or algorithm have no such settings, mu is x0, or the task is not to be had here.
+      ConfigError: policy or algorithm have no such settings, mu is x0, or the task is not available here.
     """
     if config.start != "fitted":
         return config
@@ -171,7 +171,7 @@ def start(config: RunConfig, run: str) -> tuple[Problem, Checkpoint]:
     """A run before its first generation.
 
     Raises:
-      ConfigError: the task is not to be had here, or the run to start from cannot be used.
+      ConfigError: the task is not available here, or the run to start from cannot be used.
     """
     other = None if config.init_from is None else _other(config)
     begun = problem(config, other.constants if other else None)
@@ -189,11 +189,11 @@ def start(config: RunConfig, run: str) -> tuple[Problem, Checkpoint]:
 
 
 def resumed(folder: RunFolder, config: RunConfig, *, mixed: bool = False) -> tuple[Problem, Checkpoint]:
-    """A run as its checkpoint saved it.
+    """A run as saved in its checkpoint.
 
     Raises:
-      CheckpointError: it cannot be used, belongs to another configuration, or the code that decides the run's numbers
-        is another now and `mixed` does not allow it.
+      CheckpointError: it cannot be used, belongs to another configuration, or the code that determines the run's
+        numbers has changed and `mixed` does not allow it.
     """
     at = checkpoints.load(folder.checkpoint)
     for name, old, new in configs.other(configs.from_dict(at.config, str(folder.checkpoint)), config):
@@ -213,7 +213,7 @@ def resumed(folder: RunFolder, config: RunConfig, *, mixed: bool = False) -> tup
 
 
 def _other(config: RunConfig) -> Checkpoint:
-    """The run to start from, if its parameters mean the same."""
+    """The run to start from, if its parameters have the same meaning."""
     folder = RunFolder.open(Path(str(config.init_from)))
     theirs = folder.read_config()
     same: tuple[tuple[Any, Any], ...] = (

@@ -1,4 +1,4 @@
-"""Runs side by side: several learners share one set of workers, so that a pool of any size is kept busy.
+"""Simultaneous runs: several learners share one set of workers, so that a pool of any size is kept busy.
 
 A generation of 15 pairs cannot keep many workers busy, but the generations of four learners can. Each learner is a
 separate process, `farm learner`, and all are connected to one router. Their numbers are those of runs one after
@@ -39,21 +39,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_LOOK: Final = 0.1  # [s] between two looks at the learners
-_GRACE: Final = 20.0  # [s] that learners have to save and leave
-_OVER: Final = ("finished", "diverged")  # states that running again would not change
+_LOOK: Final = 0.1  # [s] between two checks of the learners
+_GRACE: Final = 20.0  # [s] for learners to save and leave
+_OVER: Final = ("finished", "diverged")  # states that another run would not change
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sharing(Settings):
-    """Where runs side by side are done; no number depends on it."""
+    """Placement of simultaneous runs; does not affect their numbers."""
 
     parallel: int = setting(4, least=1, most=256)
-    """Learners at a time."""
+    """Number of simultaneous learners."""
     workers: int | None = setting(None, least=0, most=1024)
     """Local worker processes; by default one per core, with --connect none."""
     backend: str = "cpu"
-    """What they simulate with: a name (farm tasks lists them), or FILE.py:CLASS."""
+    """Simulation backend of these workers: a name (farm tasks lists them), or FILE.py:CLASS."""
     connect: tuple[str, ...] = ()
     """Use the workers of a farm: its router, repeatable."""
     tls: Path | None = None
@@ -84,7 +84,7 @@ class Sharing(Settings):
 
 @dataclass
 class _Learner:
-    """A learner's process, and what it said last."""
+    """A learner's process, and its last message."""
 
     path: Path
     process: "subprocess.Popen[str]"
@@ -98,12 +98,12 @@ class _Learner:
 
 
 def todo(runs: Iterable[Path]) -> list[Path]:
-    """Those of these run folders whose runs are not over, in their order."""
+    """The run folders whose runs are not over, in the same order."""
     return [path for path in runs if (RunFolder(path).read_summary() or {}).get("state") not in _OVER]
 
 
 def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: "Runs", stopped: Callable[[], bool]) -> bool:
-    """Do those runs that are not over, in their order, each in its folder; return whether all are over now.
+    """Do the runs that are not over, in order, each in its folder; return whether all are over then.
 
     Raises:
       RunError: no local worker keeps running.
@@ -126,7 +126,7 @@ def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: "Runs", stopped
                 running.remove(learner)
                 _conclude(learner, shown)
             if pool and pool.tend() and not pool.pids:
-                raise RunError("no local worker keeps running; their own messages above say why")
+                raise RunError("no local worker keeps running; see their messages above")
             time.sleep(_LOOK)
         end([learner.process for learner in running], _GRACE)
         for learner in running:
@@ -146,7 +146,7 @@ def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
 
 
 def _workers(sharing: Sharing, flags: Sequence[str], runs: Iterable[RunConfig], stack: ExitStack) -> Pool | None:
-    """Local workers, which may serve the files that these runs come from."""
+    """Local workers, which may serve the files of these runs."""
     if not sharing.processes:
         return None
     chosen = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
@@ -163,7 +163,7 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], sho
         sys.executable, "-P", "-m", "learner.sweep", "--config", str(plan), "--out", str(path.parent),
         "--name", path.name, "--resume-existing", "--json", "--log-level", "WARNING", *flags,
     ]  # fmt: skip
-    # Standard input is a pipe that nobody writes to: it closes when this process ends, however it ends.
+    # Standard input is a pipe that is never written to: it closes when this process ends, however it ends.
     # A session of its own keeps the terminal's Ctrl-C away: this process ends its learners.
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
@@ -177,7 +177,7 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], sho
 
 
 def _listen(learner: _Learner, shown: "Runs") -> None:
-    """Pass on what a learner says; a thread that ended would leave it stuck at a full pipe."""
+    """Forward a learner's output; if this thread ended, the learner would block on a full pipe."""
     assert learner.process.stdout
     generations = 0
     for line in learner.process.stdout:
@@ -209,7 +209,7 @@ def _conclude(learner: _Learner, shown: "Runs") -> None:
 
 
 def _learn(words: Sequence[str]) -> int:
-    """`farm learner`, ended as by SIGTERM when the process that started it is gone."""
+    """`farm learner`, which ends as after SIGTERM when the process that started it is gone."""
     from farm.__main__ import main
 
     def watch() -> None:

@@ -1,1 +1,1 @@
-"""Who simulates: a worker joins the farm, takes pairs, runs them, answers."""
+"""Workers: a worker joins the farm, receives jobs, simulates them, and returns the results."""

@@ -13,7 +13,7 @@ from farm.errors import ConfigError, FarmError, printable
 from workers.worker import WorkerConfig, work
 
 BROKEN = 70
-"""Exit status after an error of the software itself, as sysexits.h has it: whoever started this may start another."""
+"""Exit status after an error of the software itself, as in sysexits.h; the parent may start another worker."""
 
 
 @dataclass(frozen=True, kw_only=True)

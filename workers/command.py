@@ -15,10 +15,10 @@ from workers.worker import WorkerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerCommand(Settings):
-    """Workers alone: they serve whichever learners they find, until stopped."""
+    """Start workers on this machine; they serve every learner of their farm until stopped."""
 
     worker: WorkerConfig = field(default_factory=WorkerConfig)
-    """Where they work."""
+    """Settings of every worker process."""
     processes: int | None = setting(None, least=1, most=4096)
     """Worker processes; by default one per core."""
     log_level: str = "INFO"
@@ -35,13 +35,13 @@ def main(words: Sequence[str]) -> int:
             ended = pool.tend()
             if ended and not pool.pids:
                 if max(ended) == 2:
-                    raise ConfigError("the workers could not start; they say why above")
-                raise FarmError("no worker is left; they say why above")
+                    raise ConfigError("the workers could not start; see their messages above")
+                raise FarmError("no worker is left; see their messages above")
     return 0
 
 
 def _flags(command: WorkerCommand) -> list[str]:
-    """The same for each process."""
+    """Command-line arguments of each worker process."""
     config = command.worker
     flags = [word for endpoint in config.connect for word in ("--connect", endpoint)]
     flags += ["--farm", config.farm, "--name", config.name, "--backend", config.backend]

@@ -23,11 +23,11 @@ _FEATURES: Final = {"features": 300}
 _SETTINGS: Final[Mapping[str, Mapping[str, Any]]] = {
     "direct": _FEATURES, "projected": _FEATURES, "cosine": _FEATURES, "mlp": {"layers": (16, 8)},
 }  # fmt: skip
-"""Of policies whose own defaults are not what is wanted here."""
+"""Settings of policies whose defaults would be too large here."""
 
 
 class Canary(Task):
-    """Two fingers that knock a ball about."""
+    """Two fingers that push a ball."""
 
     xml = """
 <mujoco>
@@ -54,7 +54,7 @@ class Canary(Task):
             sim.expand("geom_friction")[row] *= rng.uniform(0.8, 1.2)
 
     def reward(self, sim: Sim, action: FloatArray) -> FloatArray:
-        """Anything that depends on everything."""
+        """Depends on the whole state, the constraint forces and the action."""
         squares = (sim.qpos * sim.qpos).sum(axis=1) + (sim.qfrc_constraint * sim.qfrc_constraint).sum(axis=1)
         reward: FloatArray = np.sqrt(squares) - 0.1 * (action * action).sum(axis=1)
         return reward
@@ -62,7 +62,7 @@ class Canary(Task):
 
 @cache
 def digest() -> str:
-    """SHA-256 of what the rollouts gave; takes less than a tenth of a second, once per process."""
+    """SHA-256 of the rollouts' results; takes less than a tenth of a second, once per process."""
     said = hashlib.sha256()
     task = Canary(TaskConfig())
     spec, runner = task.spec(), None
@@ -82,7 +82,7 @@ def digest() -> str:
 
 
 def _numbers(shape: tuple[int, ...]) -> FloatArray:
-    """Spread over (-1, 1), the same everywhere: multiples of the golden ratio, in whole numbers."""
+    """Values spread over (-1, 1), computed in integers so that every machine gets the same ones."""
     count = int(np.prod(shape))
     whole = (np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(12)
     return (whole.astype(np.float64) / 2.0**51 - 1.0).reshape(shape)

@@ -1,7 +1,7 @@
-"""A process that runs one run's code which came over the network: `python -m workers.runner_process SOCKET`.
+"""A process that executes one run's code received over the network: `python -m workers.runner_process SOCKET`.
 
 It has no session and no certificate; its worker (`workers.subprocess_runner`) sends it jobs over a socket and reads
-what they gave. What such a process can reach all the same: docs/protocol.md, "Code that travels".
+the results. For what such a process can still access see docs/protocol.md, "Code that travels".
 """
 
 import ctypes
@@ -24,7 +24,7 @@ from farm.net.messages import Spec
 from farm.net.work import Jobs, Results
 from farm.rollouts import Runner, served
 
-_MOST: Final = 4 * codec.MAX_BYTES  # of a mean, a chunk, a normaliser and what stands around them
+_MOST: Final = 4 * codec.MAX_BYTES  # [bytes] of a mean, a chunk, a normaliser and their headers
 _LENGTH: Final = struct.Struct("<Q")
 _PARENT_DIED: Final = 1  # prctl's PR_SET_PDEATHSIG (linux/prctl.h)
 _NO_NEW_PRIVILEGES: Final = 38  # and its PR_SET_NO_NEW_PRIVS
@@ -32,11 +32,11 @@ _NO_NEW_PRIVILEGES: Final = 38  # and its PR_SET_NO_NEW_PRIVS
 
 @dataclass(frozen=True, kw_only=True)
 class Begin:
-    """What the process is for; its first message."""
+    """The run that the process executes; its first message."""
 
     spec: Spec
     files: tuple[str, ...]
-    """Paths of the files whose classes it may serve."""
+    """Paths of the files whose classes it may load."""
     backend: str
 
 
@@ -52,36 +52,36 @@ class Order:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What became of the last message."""
+    """The reply to the last message."""
 
     size: int = 0
-    """Parameters of the policy; after Begin."""
+    """Number of policy parameters; in the reply to Begin."""
     results: Results | None = None
-    """After an Order; of no run and no worker, which is not this process' business."""
+    """In the reply to an Order; without the names of run and worker, which this process does not know."""
     error: str = ""
     served: bool = True
-    """False: no job of this run can be run here."""
+    """False: this process can run no job of this run."""
     traceback: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that what goes on to the learner can be shown: the process may say anything."""
+        """Check that the traceback can be displayed by the learner: the process is not trusted."""
         if len(self.traceback) > 40 or not all(len(line) <= 1000 and line.isprintable() for line in self.traceback):
             raise ValueError("a traceback of more than 40 lines, long lines, or unprintable ones")
 
 
 def send(link: socket.socket, message: object, seconds: float | None = None) -> None:
-    """Send a message, in time; a TimeoutError or another OSError where that cannot be."""
+    """Send a message within the time; raises TimeoutError or another OSError if that fails."""
     payload = codec.encode(message)
     link.settimeout(seconds)
     link.sendall(_LENGTH.pack(len(payload)) + payload)
 
 
 def receive(link: socket.socket, kind: type[M], seconds: float | None = None) -> M:
-    """The next message, in time.
+    """Receive the next message.
 
     Raises:
-      OSError: it did not come in time (TimeoutError), or the other side is gone.
-      MessageError: it is not of that kind.
+      OSError: none arrived in time (TimeoutError), or the connection is closed.
+      MessageError: it is of another kind.
     """
     until = None if seconds is None else time.monotonic() + seconds
     (length,) = _LENGTH.unpack(_exactly(link, _LENGTH.size, until))
@@ -102,13 +102,13 @@ def _exactly(link: socket.socket, count: int, until: float | None) -> bytearray:
 
 
 def serve(link: socket.socket) -> None:
-    """Do what the worker says until it hangs up."""
+    """Build the task and run jobs until the worker closes the connection."""
     begin = receive(link, Begin)
     try:
         files = tuple(Path(path) for path in begin.files)
         own = rollouts.backend(begin.backend)
         runner = Runner(*served(begin.spec, files), own.engine, exact=rollouts.exact(own))
-    except Exception as error:  # whatever the code may raise
+    except Exception as error:  # the code may raise anything
         send(link, _failed(error, begin.files))
         return
     send(link, Answer(size=runner.size))
@@ -127,13 +127,13 @@ def _failed(error: Exception, files: tuple[str, ...]) -> Answer:
     if isinstance(plugins.root(error), FileNotFoundError):
         text += "; files beside a class do not travel, but texts that its files() reads do"
     lines = plugins.author_traceback(error)
-    for path in files:  # the author knows the file, not where it lies here
+    for path in files:  # the author knows the file by its name, not by its path here
         text, lines = text.replace(path, Path(path).name), tuple(line.replace(path, Path(path).name) for line in lines)
     return Answer(error=brief(text), served=not isinstance(error, UnservedError), traceback=lines)
 
 
 def main() -> None:
-    """Give up what is not needed, then serve on the socket that was passed on."""
+    """Drop privileges, then serve on the inherited socket."""
     kernel = ctypes.CDLL(None)
     kernel.prctl(_PARENT_DIED, signal.SIGKILL, 0, 0, 0)
     kernel.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""Code that came over the network, run in a process of its own: the worker's side of `workers.runner_process`."""
+"""Runs code received over the network in a separate process: the worker's side of `workers.runner_process`."""
 
 import logging
 import os
@@ -18,16 +18,16 @@ from workers.runner_process import Answer, Begin, Order, receive, send
 log = logging.getLogger(__name__)
 
 _BEGIN: Final = 60.0  # [s] to import the code and build the task
-_JOBS: Final = 300.0  # [s] for a chunk: the worker does nothing else meanwhile
+_JOBS: Final = 300.0  # [s] for a chunk: the worker waits meanwhile
 _KEPT: Final = (
     *("PATH", "PYTHONPATH", "PYTHONHOME", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TZ"),
     *("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),
 )
-"""Variables that the process is told; no other, which may be a secret."""
+"""Environment variables passed to the process; the rest may hold secrets."""
 
 
 class RunnerProcess:
-    """A process that has imported the farm and waits to be told what to run; nobody's code so far."""
+    """A process that has imported the farm and waits for a run; it has executed no received code yet."""
 
     def __init__(self, folder: Path) -> None:
         """Start it in a folder."""
@@ -42,18 +42,18 @@ class RunnerProcess:
         self.pid = self._process.pid
 
     def ask(self, message: Begin | Order, seconds: float) -> Answer:
-        """Send a message and wait for what became of it.
+        """Send a message and wait for the reply.
 
         Raises:
           FarmError: the code raised, with its traceback, or the process died.
-          UnservedError: the run cannot be served, or nothing came in time.
+          UnservedError: the run cannot be served, or no reply arrived in time.
         """
         try:
             send(self._link, message, seconds)
             answer = receive(self._link, Answer, seconds)
         except TimeoutError:
             self.close()
-            raise UnservedError(f"its code did not answer within {seconds:g} s and was ended") from None
+            raise UnservedError(f"its code did not answer within {seconds:g} s and was stopped") from None
         except (OSError, MessageError) as error:
             self.close()
             kind = UnservedError if isinstance(message, Begin) else FarmError
@@ -70,7 +70,7 @@ class RunnerProcess:
         return self._process.poll() is not None
 
     def close(self) -> None:
-        """End the process and what it started."""
+        """Kill the process and its children."""
         if not self.ended:
             with suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGKILL)
@@ -79,25 +79,25 @@ class RunnerProcess:
 
 
 class SubprocessRunner:
-    """Runs one run's jobs as `farm.rollouts.Runner` does, in a process that is begun again where it dies."""
+    """Runs one run's jobs as `farm.rollouts.Runner` does, in a process that is restarted if it dies."""
 
     def __init__(self, begin: Begin, folder: Path, process: RunnerProcess | None = None) -> None:
-        """Have the task built there.
+        """Build the task in the process.
 
         Args:
           begin: what the run simulates.
-          folder: where its processes run; an empty one.
-          process: that waits already.
+          folder: working directory of its processes; an empty one.
+          process: one that is already waiting.
 
         Raises:
-          FarmError: the task cannot be built; says why, with the traceback where the code raised.
+          FarmError: the task cannot be built; with the reason, and the traceback if the code raised.
         """
         self._begin, self._folder = begin, folder
         if process is not None and process.ended:
             process.close()
             process = None
         self.size = self._start(process or RunnerProcess(folder))
-        """Parameters of the policy, P."""
+        """Number of policy parameters, P."""
 
     @property
     def pid(self) -> int:
@@ -111,14 +111,14 @@ class SubprocessRunner:
 
         Raises:
           FarmError: the code raised, with its traceback, or its process died.
-          UnservedError: it does not answer, or cannot be begun again.
+          UnservedError: it does not answer, or cannot be restarted.
         """
         if self._process.ended:
             self._process.close()
             self._start(RunnerProcess(self._folder))
         found = self._process.ask(Order(jobs=jobs, traces=traces, mu=mu, normaliser=normaliser), _JOBS).results
         if found is None:
-            raise FarmError("the process that runs the run's code answered with no results")
+            raise FarmError("the process that runs the run's code returned no results")
         return Simulated(found.returns, found.flags, found.steps, found.traces, found.trajectories, found.moments)
 
     def close(self) -> None:

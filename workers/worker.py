@@ -1,7 +1,7 @@
-"""A worker: joins a farm, takes jobs of whichever runs are there, answers, leaves cleanly.
+"""A worker: joins a farm, runs the jobs of all its learners, returns the results, and leaves cleanly.
 
-One thread owns everything; subscriptions only fill its queue. A worker belongs to the farm,
-not to a run: it builds each run's task from its specification and serves runs in turn.
+One thread owns all state; subscriptions only fill its queue. A worker belongs to the farm,
+not to a run: it builds each run's task from its specification and serves the runs in turn.
 """
 
 import hashlib
@@ -37,44 +37,44 @@ from workers.subprocess_runner import RunnerProcess, SubprocessRunner
 log = logging.getLogger(__name__)
 
 IDLE: Final = 1.0
-"""A worker without work of a run for so long says so, and again every time [s]."""
+"""A worker that has had no work of a run for this long reports it, and repeats the report at this interval [s]."""
 
 _ASK: Final = 1.0  # [s] for an answer to a query
 _FETCH: Final = 10.0  # [s] for a source, up to 1 MB
-_KEEP: Final = 32  # runs whose tasks are kept built: as many learners may share us
-_PROCESSES: Final = 8  # of code that came over the network; some 80 MB each
-_RUNS: Final = 1000  # that are served side by side
-_HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below
-_CREDITS: Final = 4  # times as many jobs of one run are held as were asked for: jobs are sent again, and cross others
-_TELL: Final = 1000  # different lines that are said once
+_KEEP: Final = 32  # built tasks that are kept: this many learners can share a worker
+_PROCESSES: Final = 8  # that execute received code; about 80 MB each
+_RUNS: Final = 1000  # that are served at the same time
+_HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below it
+_CREDITS: Final = 4  # jobs held per job requested, of one run: jobs may be sent twice, or while a request is on its way
+_TELL: Final = 1000  # different messages that are logged once
 _MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
-_LOOK: Final = 10.0  # [s] without a learner of our farm, after which we look for others
-_MUTE: Final = 9.0  # times as long as a question stayed without an answer no other is asked
+_LOOK: Final = 10.0  # [s] without a learner on our farm, after which we look for other farms
+_MUTE: Final = 9.0  # after an unanswered query, the next is sent this many times its duration later
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerConfig(Settings):
-    """A worker and where it works."""
+    """A worker's settings."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
+    """Where a learner or a router listens, repeatable; by default tcp/127.0.0.1:7447."""
     farm: str = "farm"
     """Name of the farm: learners and workers of one name work together."""
     name: str = ""
-    """Name of this worker; without one: the host's, with --tls the certificate's."""
+    """Name of this worker; by default the host's, with --tls the certificate's."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed to connect to tls/HOST:PORT."""
     timeout: float | None = setting(None, least=0.0)
-    """Give up when nobody answers for so long at the start [s]; by default keep trying."""
+    """Give up if no learner or router answers for this long at the start [s]; by default keep trying."""
     backend: str = "cpu"
-    """What simulates: a name (farm tasks lists them), or FILE.py:CLASS; its class says whether it needs --mixed."""
+    """Simulation backend: a name (farm tasks lists them), or FILE.py:CLASS."""
     allow_file: tuple[Path, ...] = ()
     """Serve runs whose task or policy is a class in this file, repeatable; the learner's must be the same file."""
     accept_code: bool = False
     """Serve runs whose task or policy is a class in a file that the learner sends; with --tls."""
 
     def __post_init__(self) -> None:
-        """Check every value, and put in the host's name."""
+        """Check every value, and fill in the name and the endpoint."""
         super().__post_init__()
         bundle = self.bundle
         if bundle is not None:
@@ -90,7 +90,7 @@ class WorkerConfig(Settings):
         keys.checked("worker", self.name)
         rollouts.backend(self.backend)
         if self.accept_code and self.tls is None:
-            raise ConfigError("--accept-code needs --tls: without certificates anybody could send code")
+            raise ConfigError("--accept-code needs --tls: without certificates anyone could send code")
         for path in self.allow_file:
             if not path.is_file():
                 raise ConfigError(f"--allow-file {path}: there is no such file")
@@ -103,23 +103,23 @@ class WorkerConfig(Settings):
 
 @dataclass
 class _Served:
-    """What a worker knows of one run."""
+    """A worker's state for one run."""
 
     header: RoundHeader | None = None
     chunks: deque[Chunk] = field(default_factory=deque)
     busy: float = field(default_factory=time.monotonic)
-    """When it last had work, or we said that it has none [s]."""
+    """When it last had work, or when we last reported that it has none [s]."""
     there: bool = False
-    """Its learner's token has been seen."""
+    """Whether its learner's token has been seen."""
     mute: float = 0.0
-    """Until then its learner is asked nothing, because it did not answer [s]."""
+    """No queries to its learner before this time, because it did not answer [s]."""
 
 
 def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
     """Serve the farm until stopped.
 
     Raises:
-      FarmError: nobody answered within the timeout.
+      FarmError: no learner or router answered within the timeout.
     """
     with connect(config.connect, config.timeout, stopped, config.bundle) as session:
         worker = Worker(config, session)
@@ -136,32 +136,32 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
 
 
 class Worker:
-    """The state of a worker and what it does with each event."""
+    """The state of a worker and its reaction to each event."""
 
     def __init__(self, config: WorkerConfig, session: Session) -> None:
-        """Choose an identity that no other process has."""
+        """Choose a unique identity."""
         self.id = f"{config.name}/{os.getpid()}-{secrets.token_hex(3)}"
         self._config = config
         self._session = session
         self._runs: OrderedDict[str, _Served] = OrderedDict()
         self._runners: OrderedDict[str, Runner | SubprocessRunner | Exception] = OrderedDict()
         self._sources = SourceCache()
-        self._spare: RunnerProcess | None = None  # begun beforehand: imports take half a second
+        self._spare: RunnerProcess | None = None  # started in advance: imports take half a second
         self._backend = rollouts.backend(config.backend)
         self._canary = fingerprint.digest() if rollouts.exact(self._backend) else ""
         self._credits = 2 * self._backend.capacity
-        self._mute = 0.0  # as _Served.mute, for all runs whose token was not seen
+        self._mute = 0.0  # like _Served.mute, for all runs whose token was not seen
         self._spoke = time.monotonic()
         self._told: set[str] = set()
         self._look = time.monotonic() + _LOOK
         self._ignored: Counter[str] = Counter()
 
     def join(self) -> None:
-        """Subscribe, then show up: in that order, or the first jobs are lost."""
+        """Subscribe, then declare the token: in that order, or the first jobs are lost."""
         farm = self._config.farm
         if self._config.accept_code:
             self._spare = RunnerProcess(self._sources.empty)
-        # A header needs nothing done until its jobs are here, a moment later: one wake-up instead of two.
+        # A header alone needs no action; its jobs arrive a moment later: one wake-up instead of two.
         self._session.subscribe("generation", keys.generation(farm, "*"), wake=False)
         self._session.subscribe("inbox", keys.inbox(farm, self.id))
         self._session.subscribe("refused", keys.refused(farm, self.id))
@@ -169,7 +169,7 @@ class Worker:
         self._session.token(keys.worker_token(farm, self.id))
 
     def turn(self) -> None:
-        """Take in what came, then run one chunk or wait for more."""
+        """Handle the events that arrived, then run one chunk or wait for more."""
         for event in self._events():
             try:
                 self._take(event)
@@ -183,11 +183,11 @@ class Worker:
             self._run(chunk)
 
     def leave(self) -> None:
-        """Hand back everything that is not done; what is done arrives before."""
+        """Return all unfinished jobs; finished results arrive first."""
         self._want(idle=tuple(self._runs), credits=0)
 
     def close(self) -> None:
-        """End the processes that run others' code, and delete that."""
+        """Stop the processes that execute received code, and delete the code."""
         for runner in self._runners.values():
             if not isinstance(runner, Exception):
                 runner.close()
@@ -196,7 +196,7 @@ class Worker:
         self._sources.close()
 
     def _events(self) -> list[Event]:
-        """What is waiting, headers first; waits a little when there is nothing to do."""
+        """The queued events, headers first; waits briefly if there is nothing to do."""
         working = any(run.chunks for run in self._runs.values())
         events = self._session.events.waiting(0.0 if working else 0.2)
         return sorted(events, key=lambda event: event.topic == "inbox")
@@ -213,21 +213,21 @@ class Worker:
             self._learner(keys.run_in(event.key, keys.learner_token(self._config.farm, "")), there=event.alive)
 
     def _learner(self, run: str, *, there: bool) -> None:
-        """A run's learner came or went."""
+        """A run's learner joined or left."""
         if not there:
             gone = self._runs.pop(run, None)
             made = self._runners.get(gone.header.spec) if gone and gone.header else None
             if gone and gone.header and isinstance(made, SubprocessRunner):
-                made.close()  # it begins again should the learner come back
+                made.close()  # it is restarted if the learner comes back
                 del self._runners[gone.header.spec]
             return
         self._served(run).there = True
         self._want(idle=())
 
     def _tell_idle(self) -> None:
-        """Say of which runs we have nothing: other runs' work does not make up for what got lost on the way.
+        """Report the runs that have left us without jobs, so that their learners reissue lost ones.
 
-        Without any work say that we are here: a learner whose token was missed hears it as well.
+        Without any work, announce ourselves: this also reaches a learner whose token we missed.
         """
         now, working = time.monotonic(), any(run.chunks for run in self._runs.values())
         idle = [name for name, run in self._runs.items() if not run.chunks and now - run.busy >= IDLE]
@@ -237,7 +237,7 @@ class Worker:
             self._want(idle=tuple(idle))
 
     def _look_around(self) -> None:
-        """Say once which farms are there when ours has had no learner for a while: --farm may be another there."""
+        """If our farm has had no learner for a while, log once which farms have one: --farm may be wrong."""
         if self._runs or time.monotonic() < self._look:
             return
         self._look = math.inf
@@ -247,14 +247,14 @@ class Worker:
             self._tell(logging.WARNING, text)
 
     def _tell(self, level: int, text: str) -> None:
-        """Say something once."""
+        """Log a message once."""
         text = brief(text)
         if text not in self._told and len(self._told) < _TELL:
             self._told.add(text)
             log.log(level, "%s", text)
 
     def _begin(self, header: RoundHeader, *, asked: bool = False) -> None:
-        """A new round: work of older ones is void. What was asked for holds, whatever was published before."""
+        """Start a new round and drop work of older ones. A header that we asked for overrides published ones."""
         run = self._served(header.run)
         old = run.header
         if old and old.incarnation == header.incarnation:
@@ -282,7 +282,7 @@ class Worker:
         run.chunks.append(chunk)
 
     def _ask(self, run: _Served, key: str, seconds: float = _ASK) -> bytes | None:
-        """An answer of a run's learner; one that does not come costs at most a tenth of our time."""
+        """The answer of a run's learner, or None; waiting for missing answers takes at most a tenth of our time."""
         begun = time.monotonic()
         if begun < (run.mute if run.there else self._mute):
             return None
@@ -293,10 +293,10 @@ class Worker:
         return payload
 
     def _served(self, run: str) -> _Served:
-        """What we know of a run.
+        """Our state for a run, created on first use.
 
         Raises:
-          MessageError: that is no name, or there are more runs than anybody honest has.
+          MessageError: the name is malformed, or there are too many runs.
         """
         try:
             keys.checked("run", run)
@@ -307,10 +307,10 @@ class Worker:
         return self._runs.setdefault(run, _Served())
 
     def _make_room(self, message: RoundHeader | Chunk) -> None:
-        """See that there is memory for it: what was kept longest for other runs goes, and is asked for again.
+        """Make sure that a message fits into memory: drop other runs' messages, oldest first; they are requested again.
 
         Raises:
-          MessageError: with what its own run keeps it is more than anybody honest sends.
+          MessageError: its own run alone holds too much.
         """
         sizes = {
             name: sum(map(_bytes, [*run.chunks, *([run.header] if run.header else [])]))
@@ -351,11 +351,11 @@ class Worker:
         jobs = chunk.take(np.argsort(chunk.indices).tolist())
         try:
             self._do(chunk, runner, header, jobs)
-        except UnservedError as error:  # nor any other job
+        except UnservedError as error:  # concerns every job of the run
             runner.close()
             self._runners[header.spec] = error
             self._fail(chunk, None, error)
-        except Exception:  # whatever it was, others may be able to, and the learner decides
+        except Exception:  # other workers may succeed: the learner decides
             log.exception("a chunk of run %s failed; trying its jobs one by one", chunk.run)
             for at, index in enumerate(jobs.indices.tolist()):
                 try:
@@ -365,17 +365,17 @@ class Worker:
         self._runs[chunk.run].busy = time.monotonic()
 
     def _do(self, chunk: Chunk, runner: Runner | SubprocessRunner, header: RoundHeader, jobs: Jobs) -> None:
-        """Run some of a chunk's jobs and say what they gave."""
+        """Run some of a chunk's jobs and publish the results."""
         given = runner.run(header.mu, jobs, header.traces, header.normaliser)
         head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
         self._answer(chunk, Results.carrying(given, jobs, **head))
 
     def _runner(self, header: RoundHeader) -> Runner | SubprocessRunner | Exception | None:
-        """The run's task, built once; an error if it cannot be; None if its specification is not to be had."""
+        """The run's task, built once; an exception if that failed; None if its specification is unavailable."""
         if header.spec not in self._runners:
             payload = self._ask(self._runs[header.run], keys.spec(self._config.farm, header.run))
             if payload is None or hashlib.sha256(payload).hexdigest() != header.spec:
-                self._tell(logging.WARNING, f"run {header.run} does not tell what it simulates; its jobs wait")
+                self._tell(logging.WARNING, f"run {header.run} does not send its specification; its jobs wait")
                 return None
             try:
                 made = self._made(header.run, codec.decode(payload, Spec))
@@ -383,17 +383,17 @@ class Worker:
                     return None
                 self._runners[header.spec] = made
                 log.info("serving run %s", header.run)
-            except Exception as error:  # the learner is told, and decides
+            except Exception as error:  # reported to the learner, which decides
                 log.error("cannot serve run %s: %s", header.run, error, exc_info=not isinstance(error, FarmError))
                 if not isinstance(error, FarmError):
-                    return error  # short of memory, say: another time it may go
+                    return error  # perhaps short of memory: it may work later
                 self._runners[header.spec] = error
             self._let_go()
         self._runners.move_to_end(header.spec)
         return self._runners[header.spec]
 
     def _let_go(self) -> None:
-        """Keep the newest tasks only, and fewer of those that are processes."""
+        """Keep only the newest tasks, and fewer of those that are processes."""
         processes = [digest for digest, each in self._runners.items() if isinstance(each, SubprocessRunner)]
         for digest in {*processes[:-_PROCESSES], *list(self._runners)[:-_KEEP]}:
             oldest = self._runners.pop(digest)
@@ -401,7 +401,7 @@ class Worker:
                 oldest.close()
 
     def _made(self, run: str, spec: Spec) -> Runner | SubprocessRunner | None:
-        """What runs a run's jobs; None if a source of it is not to be had."""
+        """The runner of a run's jobs; None if a source file is unavailable."""
         files = list(self._config.allow_file)
         here = {(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file()}
         named = {(plugins.named_file(spec.task), spec.code.get("task", "")),
@@ -420,7 +420,7 @@ class Worker:
                     return None
                 self._sources.keep(name, digest, source)
             files.insert(0, path)
-            log.info("run %s: %s (SHA-256 %s) came from its learner; a process of its own runs it", run, name, digest)
+            log.info("run %s: received %s (SHA-256 %s) from its learner; a separate process runs it", run, name, digest)
         begin = Begin(spec=spec, files=tuple(map(str, files)), backend=self._config.backend)
         process, self._spare = self._spare, None
         try:

@@ -465,7 +465,7 @@ _QUESTIONS: Final = [
     Experiment(
         name="objects-between",
         title="Other objects, with the thumb between the fingers",
-        question="Can the gait be learnt on other objects within 1500 rollouts when the thumb stands between the "
+        question="Can the gait be learnt on other objects within 1500 rollouts when the thumb is between the "
         "fingers (`--pose between`) and the start fits the size of the state, and does a policy work on objects it has "
         "never held?",
         curves={name: f"between-{name}-fitted" for name in OBJECTS},

@@ -131,7 +131,7 @@ def _issue(
     roster: dict[str, list[str]],
     hosts: tuple[str, ...] | None = None,
 ) -> None:
-    """Make bundles, all or none, update the list of admitted names, and say what was made."""
+    """Make bundles, all or none, update the list of admitted names, and print the new folders."""
     with ExitStack() as undo:
         made = []
         for role, name in wanted:
@@ -180,7 +180,7 @@ def _hosts(folder: Path) -> tuple[str, ...]:
         present = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
         names = present.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (OSError, ValueError, x509.ExtensionNotFound):
-        raise ConfigError(f"no certificate in {folder} to renew: say its names by --learner HOST") from None
+        raise ConfigError(f"no certificate in {folder} to renew: give its host names with --learner HOST") from None
     return tuple(str(name.value) for name in names)
 
 
@@ -206,7 +206,7 @@ def _check_host(host: str) -> None:
     if len(host) > 253 or not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdecimal():
         hint = "" if host.isascii() else "; names of other letters have a form in ASCII, xn--..."
         raise ConfigError(
-            f"--learner {host[:100]!r} is no host; expected a name like learner.lab, or an address like 10.0.0.7, "
+            f"--learner {host[:100]!r} is not a host; expected a name like learner.lab, or an address like 10.0.0.7, "
             f"without port{hint}"
         )
 

@@ -21,15 +21,15 @@ class RouterCommand:
     listen: str | None = None
     """Where it listens; by default tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447."""
     connect: tuple[str, ...] = ()
-    """Join another router, repeatable: for a site with a router of its own."""
+    """Connect to another router, repeatable: for a site with its own router."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it): the router uses the learner's bundle."""
     trust_network: bool = False
-    """Listen to other machines without certificates: anybody there may read everything and pose as a worker."""
+    """Listen to other machines without certificates: everyone there can read everything and pose as a worker."""
     farm: str = "farm"
     """Name of the farm that access control is for."""
     print_config: bool = False
-    """Print the configuration for a zenohd of the same release, and end."""
+    """Print the configuration for a zenohd of the same release, and exit."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -55,7 +55,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _nested(settings: dict[str, object]) -> dict[str, Any]:
-    """Settings by path as the tree that zenohd reads."""
+    """Convert settings by path to the tree that zenohd reads."""
     tree: dict[str, Any] = {}
     for path, value in settings.items():
         *parents, leaf = path.split("/")

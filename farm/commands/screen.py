@@ -14,11 +14,11 @@ from rich.text import Text
 
 from farm.errors import printable
 
-_WIDE: Final = 240  # columns of a file or a pipe, where nothing need be folded
+_WIDE: Final = 240  # columns of a file or a pipe, so that no lines are folded
 
 
 def display() -> bool:
-    """Whether a window can be opened; only Linux says."""
+    """Whether a window can be opened; assumed to be possible on systems other than Linux."""
     return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
@@ -34,7 +34,7 @@ def compact(title: str | None = None) -> Table:
 
 
 def plain(text: object) -> Text:
-    """Text as it is: a name in brackets is not a style, and control characters do not move the cursor."""
+    """Literal text: brackets are not styles, and control characters do not move the cursor."""
     return Text(printable(str(text)))
 
 

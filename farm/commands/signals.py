@@ -24,8 +24,8 @@ def stop_flag(doing: str = "ending") -> Iterator[threading.Event]:
             raise KeyboardInterrupt
         if not flag.is_set():
             flag.set()
-            # On a thread of its own: this one may be in the middle of writing a message.
-            # The space keeps it off the ^C that a terminal shows.
+            # On a separate thread: this one may be in the middle of writing a message.
+            # The space separates it from the ^C that a terminal shows.
             threading.Thread(target=log.warning, args=(" %s: %s", said[signal.Signals(number)], doing)).start()
 
     before = {number: signal.signal(number, handle) for number in said}

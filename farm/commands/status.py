@@ -1,4 +1,4 @@
-"""`farm status`: shows the runs and workers of a farm, and how they are doing."""
+"""`farm status`: shows the runs and workers of a farm, and their state."""
 
 import dataclasses
 import json
@@ -26,10 +26,10 @@ _ANSWER = 1.0  # [s] that learners have to answer
 
 @dataclass(frozen=True, kw_only=True)
 class StatusCommand:
-    """Shows the runs and workers of a farm, and how they are doing; on a terminal refreshed until Ctrl-C."""
+    """Shows the runs and workers of a farm, and their state; on a terminal refreshed until Ctrl-C."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
+    """Where a learner or a router listens, repeatable; by default tcp/127.0.0.1:7447."""
     farm: str = "farm"
     """Name of the farm."""
     tls: Path | None = None
@@ -82,7 +82,7 @@ def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> N
 
 
 def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
-    """What the farm's learners say, by run, or one run's; a FarmError where all that answer are of another release."""
+    """The state of all runs, or of one, by name; a FarmError if all learners that answer are of another release."""
     runs, foreign = [], None
     for payload in session.ask_all(keys.status(farm, run), _ANSWER):
         try:
@@ -90,7 +90,7 @@ def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
         except MessageError as error:
             foreign = foreign or error
     if foreign and not runs:
-        raise FarmError(f"a learner answers, but what it says cannot be read: {foreign}")
+        raise FarmError(f"a learner answers, but its message cannot be read: {foreign}")
     return sorted(runs, key=lambda run: run.run)
 
 

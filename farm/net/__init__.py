@@ -1,1 +1,1 @@
-"""How learner and workers speak: bytes, keys, certificates, messages."""
+"""Communication between learner and workers: encoding, keys, certificates, messages."""

@@ -1,8 +1,8 @@
-"""Dataclasses to bytes and back, checked; the only door to msgpack.
+"""Encodes dataclasses as bytes and decodes them with checks; the only module that uses msgpack.
 
-Structure is msgpack; an array is an extension of dtype, shape and raw bytes. What a field may
-hold follows from its annotation; arrays say dtype and number of dimensions by `array(...)`.
-Decoding never raises anything but MessageError, whatever the bytes.
+The structure is msgpack; an array is an extension with dtype, shape and raw bytes. A field's annotation
+defines its valid values; for arrays, `array(...)` gives dtype and number of dimensions.
+Decoding raises nothing but MessageError, whatever the bytes.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from farm.arrays import AnyArray
 from farm.errors import MessageError
 
 SCHEMA: Final = 5
-"""Version of everything on the wire; stands in every message."""
+"""Version of all messages; included in each of them."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024
 """Larger messages are refused unread."""
@@ -28,7 +28,7 @@ MAX_BYTES: Final = 64 * 1024 * 1024
 _ARRAY: Final = 1  # msgpack's extension code
 _DTYPES: Final = ("<f8", "<f4", "<i8", "|b1")
 _LENGTH: Final = 10_000  # items of one list or map
-_ITEMS: Final = 500_000  # of all lists and maps of a message: outside of arrays there is little to say
+_ITEMS: Final = 500_000  # of all lists and maps of a message: most data is in arrays
 
 _TEXT: Final = 1000  # characters of a name or a line
 
@@ -51,11 +51,17 @@ def encode(message: object, schema: int | None = None) -> bytes:
 
 
 def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int | None = None) -> M:
-    """The message of that type in these bytes, at most so many; a file may have more than a message.
+    """Decode a message of that type.
+
+    Args:
+      payload: the bytes.
+      kind: the message's type.
+      schema: expected version, by default SCHEMA.
+      most: maximum size [bytes], by default MAX_BYTES; files may be larger than messages.
 
     Raises:
-      MessageError: oversized ("large"), not msgpack or of the wrong shape ("bad"), another type
-        ("bad") or another schema version ("version").
+      MessageError: oversized ("large"), not msgpack, of the wrong shape or of another type
+        ("bad"), or of another schema version ("version").
     """
     most = MAX_BYTES if most is None else most
     if len(payload) > most:
@@ -63,7 +69,7 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int |
     try:
         structure = msgpack.Unpacker(max_buffer_size=max(len(payload), 1))
         structure.feed(payload)
-        structure.skip()  # every length it announces is there: nothing is allocated for a promise
+        structure.skip()  # check that all announced bytes are there before anything is allocated
         items = _Items()
         body = msgpack.unpackb(
             payload, ext_hook=_unpack, list_hook=items.count, object_hook=items.count, strict_map_key=True,
@@ -78,7 +84,7 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int |
     version, name, ours = body.get("schema"), body.get("type"), SCHEMA if schema is None else schema
     if type(version) is not int or version != ours:
         raise MessageError(
-            f"schema version {_brief(version)}, this side speaks {ours}: run the same release on both", "version"
+            f"schema version {_brief(version)}, this side has {ours}: run the same release on both", "version"
         )
     if type(name) is not str or name != kind.__name__:
         raise MessageError(f"a {_brief(name)} where a {kind.__name__} was expected")
@@ -106,16 +112,16 @@ def _pack(value: object) -> object:
 
 
 class _Items:
-    """Keeps an unpacked message's memory within its bytes: a list of empty lists takes 60 times its own."""
+    """Limits an unpacked message's memory: a list of empty lists takes 60 times as much as its bytes."""
 
     def __init__(self) -> None:
         self._left = _ITEMS
 
     def count(self, container: C) -> C:
-        """A list or map that is complete.
+        """Count a complete list or map, and return it.
 
         Raises:
-          MessageError: too much in all.
+          MessageError: the message has too many items in total.
         """
         self._left -= 1 + len(container)
         if self._left < 0:
@@ -125,7 +131,7 @@ class _Items:
 
 @functools.lru_cache(1000)
 def _head(dtype: str, shape: tuple[int, ...]) -> bytes:
-    """What stands before an array's bytes: its own length in a byte, dtype and shape."""
+    """The header before an array's bytes: its own length as one byte, dtype and shape."""
     head = bytes(msgpack.packb([dtype, shape]) or b"")
     return bytes([len(head)]) + head
 
@@ -143,7 +149,7 @@ def _unpack(code: int, payload: bytes) -> AnyArray:
 
 @functools.lru_cache(1000)
 def _announced(head: bytes) -> tuple["np.dtype[Any]", tuple[int, ...], int]:
-    """What an array's head promises: dtype, shape, and size [bytes]."""
+    """Read an array's header: dtype, shape, and size [bytes]."""
     dtype, shape = msgpack.unpackb(head, max_array_len=16)
     if dtype not in _DTYPES or not all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape) or len(shape) > 4:
         raise MessageError("an array of an unknown kind")
@@ -152,7 +158,7 @@ def _announced(head: bytes) -> tuple["np.dtype[Any]", tuple[int, ...], int]:
 
 
 def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
-    """A dataclass from a map, every field checked."""
+    """Make a dataclass from a map, with every field checked."""
     if not isinstance(value, dict):
         raise MessageError(f"a {type(value).__name__} where a {kind.__name__} was expected")
     fields = _fields(kind)
@@ -169,12 +175,12 @@ def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
 
 
 Check = Callable[[Any], Any]
-"""Gives back what a field shall hold, or raises MessageError."""
+"""Returns a field's checked value, or raises MessageError."""
 
 
 @functools.cache
 def _fields(kind: type) -> dict[str, Check]:
-    """What each field may hold: working that out takes longer than reading a message."""
+    """The check for each field; cached because making it takes longer than reading a message."""
     hints = typing.get_type_hints(kind)
     return {
         field.name: _check(f"{kind.__name__}.{field.name}", hints[field.name], field.metadata)
@@ -184,13 +190,13 @@ def _fields(kind: type) -> dict[str, Check]:
 
 @functools.cache
 def _optional(kind: type) -> frozenset[str]:
-    """Fields that may be missing, as they are where an older release wrote a file: they have a default."""
+    """Fields with a default; these may be missing, as in files of older releases."""
     fields, none = dataclasses.fields(kind), dataclasses.MISSING
     return frozenset(f.name for f in fields if f.default is not none or f.default_factory is not none)
 
 
 def _check(name: str, hint: Any, metadata: Mapping[str, Any]) -> Check:  # noqa: ANN401
-    """How to check a field of that annotation."""
+    """The check for a field with that annotation."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if "dtype" in metadata:
         return functools.partial(_array, name, metadata["dtype"], metadata["ndim"])
@@ -231,7 +237,7 @@ def _mismatch(name: str, hint: Any, value: object) -> MessageError:  # noqa: ANN
 
 
 def _brief(value: object) -> str:
-    """What to say of a value in an error; never the text of something big or deep."""
+    """A short description of a value for an error; for containers only the type."""
     return str(value)[:40] if value is None or isinstance(value, (str, int, float)) else type(value).__name__
 
 

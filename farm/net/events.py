@@ -1,4 +1,4 @@
-"""What subscriptions brought, in a queue: callbacks on other threads put, whoever owns the state gets."""
+"""A queue of received samples: callbacks on other threads put them in, the thread that owns the state takes them."""
 
 import queue
 import threading
@@ -6,28 +6,28 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-_AT_ONCE: Final = 10_000  # events that are taken in before anything else is done
-_BACKLOG: Final = 256 * 1024 * 1024  # [bytes] of events that wait; what comes on top is lost, as on a bad network
-_OVERHEAD: Final = 500  # [bytes] that an event takes besides its payload
+_AT_ONCE: Final = 10_000  # events taken from the queue at a time
+_BACKLOG: Final = 256 * 1024 * 1024  # [bytes] of queued events; further ones are dropped, as on a bad network
+_OVERHEAD: Final = 500  # [bytes] of an event besides its payload
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that came over a subscription."""
+    """A sample received by a subscription."""
 
     topic: str
-    """Which subscription, as named by its maker."""
+    """Name of the subscription."""
     key: str
     payload: bytes
     """Empty for liveliness."""
     alive: bool = True
-    """For liveliness: whether the token appeared or went."""
+    """For liveliness: whether the token appeared (or disappeared)."""
 
 
 class Events:
-    """What came in, first come first served; a flood is dropped rather than kept.
+    """A first-in, first-out queue of limited size; further events are dropped.
 
-    No SimpleQueue: where a signal comes just before its time is over, Python 3.11's may wait for ever.
+    Not a SimpleQueue: if a signal arrives just before the timeout, Python 3.11's may wait forever.
     """
 
     def __init__(self) -> None:
@@ -36,9 +36,9 @@ class Events:
         self._bytes = self.dropped = 0
 
     def put(self, event: Event, *, wake: bool = True) -> None:
-        """Append an event, unless those that wait take up too much.
+        """Append an event unless the queue is full.
 
-        There is twice the room for who comes and goes: nobody would say that again.
+        Liveliness events have twice the room, because they are never repeated.
         """
         size = _size(event)
         with self._came:
@@ -54,14 +54,14 @@ class Events:
         """The next event.
 
         Raises:
-          queue.Empty: none came in time [s].
+          queue.Empty: none arrived in time [s].
         """
         for event in self._take(1, timeout):
             return event
         raise queue.Empty
 
     def waiting(self, timeout: float) -> list[Event]:
-        """What waits, after waiting for the first [s]."""
+        """All queued events; waits for the first one for at most the timeout [s]."""
         return self._take(_AT_ONCE, timeout)
 
     def _take(self, most: int, timeout: float) -> list[Event]:
@@ -73,7 +73,7 @@ class Events:
         return events
 
     def __len__(self) -> int:
-        """How many wait."""
+        """Number of queued events."""
         return len(self._events)
 
 

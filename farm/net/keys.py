@@ -1,17 +1,17 @@
-"""The key space of a farm, in one place. Pure.
+"""The key space of a farm. Pure functions.
 
 <farm>/live/worker/<worker>        liveliness token of a worker, <worker> = <name>/<instance>
 <farm>/live/learner/<run>          liveliness token of a learner
 <farm>/want/<worker>               a worker's credits
 <farm>/pairs/<worker>              a worker's inbox: chunks of jobs
-<farm>/run/<run>/claim             queryable: when the run's learner began
+<farm>/run/<run>/claim             queryable: when the run's learner started
 <farm>/run/<run>/spec              queryable: what is simulated
-<farm>/run/<run>/code/<digest>     queryable: the source of a class that lies in a file; by TLS only
-<farm>/run/<run>/generation        published and queryable: the round that is on
+<farm>/run/<run>/code/<digest>     queryable: the source of a class in a file; only with TLS
+<farm>/run/<run>/generation        published and queryable: the current round
 <farm>/run/<run>/result/<worker>   results
-<farm>/run/<run>/status            queryable: how it is doing
-<farm>/run/<run>/report            published: a generation that is over
-<farm>/run/<run>/history           queryable, ?from=<generation>: reports so far; published, empty, when the run is over
+<farm>/run/<run>/status            queryable: state of the run
+<farm>/run/<run>/report            published: a finished generation
+<farm>/run/<run>/history           queryable, ?from=<generation>: past reports; published, empty, when the run is over
 <farm>/refused/<worker>            why a learner gives a worker no jobs
 """
 
@@ -20,14 +20,14 @@ from typing import Final
 
 from farm.errors import ConfigError, MessageError
 
-_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,100}")  # dots alone would be a folder above
+_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,100}")  # only dots would be a parent folder
 
 
 def checked(kind: str, name: str) -> str:
-    """The name, if it can be one part of a key.
+    """Return the name if it can be one part of a key.
 
     Raises:
-      ConfigError: it has other characters than letters, digits, `_`, `.` and `-`.
+      ConfigError: it has characters other than letters, digits, `_`, `.` and `-`.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(f"{kind} {name!r} is not a name; expected 1 to 100 letters, digits, '_', '.' or '-'")
@@ -45,7 +45,7 @@ def learner_token(farm: str, run: str) -> str:
 
 
 def want(farm: str, worker: str) -> str:
-    """Where a worker says how much it wants; `**` for all."""
+    """Where a worker requests jobs; `**` for all."""
     return f"{farm}/want/{worker}"
 
 
@@ -55,22 +55,22 @@ def inbox(farm: str, worker: str) -> str:
 
 
 def claim(farm: str, run: str) -> str:
-    """Where learners that start under one name find each other."""
+    """Where learners that start under the same name find each other."""
     return f"{farm}/run/{run}/claim"
 
 
 def spec(farm: str, run: str) -> str:
-    """Where a run's specification is answered."""
+    """Where a run's specification can be queried."""
     return f"{farm}/run/{run}/spec"
 
 
 def code(farm: str, run: str, digest: str) -> str:
-    """Where a run's learner answers the source with this SHA-256; run and digest `*` for all."""
+    """Where the source with this SHA-256 can be queried; run and digest `*` for all."""
     return f"{farm}/run/{run}/code/{digest}"
 
 
 def generation(farm: str, run: str) -> str:
-    """Where the round that is on is published and answered; run `*` for all."""
+    """Where the current round is published and can be queried; run `*` for all."""
     return f"{farm}/run/{run}/generation"
 
 
@@ -80,17 +80,17 @@ def result(farm: str, run: str, worker: str) -> str:
 
 
 def status(farm: str, run: str) -> str:
-    """Where a learner answers how its run is doing; run `*` for all."""
+    """Where the state of a run can be queried; run `*` for all."""
     return f"{farm}/run/{run}/status"
 
 
 def report(farm: str, run: str) -> str:
-    """Where a learner publishes each generation that is over."""
+    """Where a learner publishes each finished generation."""
     return f"{farm}/run/{run}/report"
 
 
 def history(farm: str, run: str) -> str:
-    """Where a learner answers what it reported so far; something is published there when the run is over."""
+    """Where a learner's past reports can be queried; an empty message is published there when the run is over."""
     return f"{farm}/run/{run}/history"
 
 
@@ -103,7 +103,7 @@ def worker_in(key: str, prefix: str) -> str:
     """The worker, <name>/<instance>, that follows the prefix in a key: `worker_in(key, want(farm, ""))`.
 
     Raises:
-      MessageError: something else follows it; a sender that publishes on a pattern speaks for nobody.
+      MessageError: something else follows it; a message published on a pattern has no sender.
     """
     return _tail(key, prefix, 2)
 
@@ -118,7 +118,7 @@ def run_in(key: str, prefix: str) -> str:
 
 
 def _tail(key: str, prefix: str, parts: int) -> str:
-    names = key.removeprefix(prefix).split("/", parts)  # no more: a key may be 64 kB of names
+    names = key.removeprefix(prefix).split("/", parts)  # a key may have 64 kB
     if not key.startswith(prefix) or len(names) != parts or not all(map(_NAME.fullmatch, names)):
         raise MessageError("a key without a name", "foreign")
     return "/".join(names)

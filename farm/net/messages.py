@@ -1,7 +1,7 @@
-"""Who takes part and what is simulated, as learner and workers tell each other. Pure; bytes by `farm.net.codec`.
+"""Messages about workers and about the run's specification. Pure data, encoded by `farm.net.codec`.
 
-Everything on the wire is soft state: any message may be lost, doubled or late. Whatever belongs to work
-(`farm.net.work`) carries (run, incarnation, round): the run's name, which start of its learner, which batch of jobs.
+All messages are soft state: any of them may be lost, duplicated or late. Messages about work (`farm.net.work`)
+carry (run, incarnation, round): the run's name, an id of its learner's start, and the number of the batch of jobs.
 """
 
 from dataclasses import dataclass, field
@@ -9,13 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
-_SHORT: Final = 250  # characters; names have up to 100, a worker's is two of them
-_KINDS: Final = 20  # of messages that a worker ignores
-_RUNS: Final = 1000  # that a worker serves
+_SHORT: Final = 250  # characters; names have up to 100, a worker's has two of them
+_KINDS: Final = 20  # kinds of ignored messages
+_RUNS: Final = 1000  # runs that a worker serves
 
 
 def check_counts(ignored: dict[str, int]) -> None:
-    """See that messages which did not count are a few numbers by kind; else a ValueError."""
+    """Check that the counts of ignored messages are a few numbers by kind; raises ValueError otherwise."""
     kinds = len(ignored) <= _KINDS and all(type(kind) is str for kind in ignored)
     if not kinds or any(len(kind) > _SHORT or type(n) is not int for kind, n in ignored.items()):
         raise ValueError("ignored messages that are not a few numbers by kind")
@@ -23,26 +23,26 @@ def check_counts(ignored: dict[str, int]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkRequest:
-    """A worker's credits, worker to learners."""
+    """A worker's request for jobs, worker to learners."""
 
     worker: str
     """<name>/<instance>"""
     credits: int
-    """Jobs of one run it is willing to hold at a time."""
+    """Number of jobs of one run that it accepts at a time."""
     idle: tuple[str, ...]
-    """Runs that it holds nothing of, and has not for a while: what their learners believe it holds is lost."""
+    """Runs of which it has had no jobs for a while: jobs that their learners believe it has are lost."""
     version: str
     """Release of the worker's software."""
     canary: str
-    """Digest of the numbers its machine gives; empty for a device, whose numbers are not to be had again."""
+    """Fingerprint of its machine's numbers; empty for a device, whose results are not reproducible."""
     host: str
     cores: int
-    """That its machine has."""
+    """Number of processor cores of its machine."""
     ignored: dict[str, int] = field(default_factory=dict)
-    """Messages that did not count, by kind."""
+    """Number of ignored messages by kind."""
 
     def __post_init__(self) -> None:
-        """Check the number, and that what is remembered of a worker is short."""
+        """Check the numbers, and that the texts are short."""
         for said in (self.worker, self.version, self.canary, self.host):
             if len(said) > _SHORT or not said.isprintable():
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
@@ -55,7 +55,7 @@ class WorkRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Spec:
-    """What a run simulates; sent once, kept by workers under its digest. It names code, it never carries any."""
+    """What a run simulates; sent once, kept by workers under its digest. It names code but never contains any."""
 
     run: str
     task: str
@@ -71,25 +71,25 @@ class Spec:
     policy_release: str = ""
     """The same for the policy's."""
     task_release: str = ""
-    """Of what the task itself is made with, as its TaskSpec says."""
+    """Of the package that simulates the task, as in its TaskSpec."""
     files: dict[str, str] = field(default_factory=dict)
-    """Texts that the task is made of, by name: models, objects."""
+    """Files of the task by name: models, objects."""
     constants: dict[str, Any] = field(default_factory=dict)
-    """Arrays that the policy is made of, by name."""
+    """Constant arrays of the policy by name."""
 
     def __post_init__(self) -> None:
-        """Check the tables that hold more than settings."""
+        """Check texts and constants."""
         for table in (self.code, self.files):
             if any(type(name) is not str or type(text) is not str for name, text in table.items()):
-                raise ValueError("a text that is none")
+                raise ValueError("a text that is not a string")
         for name, values in self.constants.items():
             if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f8") or not np.isfinite(values).all():
-                raise ValueError(f"constant {str(name)[:40]!r} that is no array of finite float64")
+                raise ValueError(f"constant {str(name)[:40]!r} that is not an array of finite float64")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refusal:
-    """Why a run gives a worker no jobs, learner to worker."""
+    """The reason why a run gives a worker no jobs, learner to worker."""
 
     run: str
     reason: str

@@ -1,9 +1,9 @@
-"""Zenoh sessions as the farm uses them; the only door to zenoh.
+"""Zenoh sessions as the farm uses them; the only module that uses zenoh.
 
-What is set here was measured: see docs/protocol.md. Every subscription has a callback, on a thread
-of its own, that moves samples into the application's queue, so that the link is always drained;
-whoever reads the queue owns all state and does all the publishing. (Zenoh's channels would do as
-well, but who waits for one wakes up ten times a second.)
+The settings here were measured: see docs/protocol.md. Every subscription has a callback, on its own
+thread, that moves samples into the application's queue, so that the link is always drained. The
+thread that reads the queue owns all state and does all the publishing. (Zenoh's channels would work
+too, but a thread that waits for one wakes up ten times per second.)
 """
 
 import ipaddress
@@ -26,13 +26,13 @@ from farm.net.tls import Bundle, access_control
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
-_TOKENS: Final = 65_536  # that one question for them may bring; a router takes 4096 sessions
+_TOKENS: Final = 65_536  # most tokens in one query's answer; a router accepts 4096 sessions
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _DESCRIPTORS: Final = 65_536
-_FEWEST: Final = 64  # files and connections of a run with two workers, and some more
+_FEWEST: Final = 64  # enough files and connections for a run with two workers
 _OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
-_REMIND: Final = 60.0  # [s] between two lines about the same trouble
+_REMIND: Final = 60.0  # [s] between two messages about the same problem
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -53,14 +53,14 @@ _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), *
 
 
 def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
-    """The host of an endpoint, if it has the form Zenoh takes (it accepts some nonsense silently).
+    """Check an endpoint's form, and return its host (Zenoh silently accepts some malformed ones).
 
     Args:
       endpoint: tcp/HOST:PORT, or tls/HOST:PORT with certificates.
       encrypted: whether there are certificates.
 
     Raises:
-      ConfigError: another form, or certificates and protocol do not go together.
+      ConfigError: it is malformed, or certificates and protocol do not match.
     """
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
@@ -69,12 +69,12 @@ def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
     if protocol == "tls" and not encrypted:
         raise ConfigError(f"endpoint {endpoint} needs certificates: give their folder with --tls")
     if protocol == "tcp" and encrypted:
-        raise ConfigError(f"endpoint {endpoint} is not encrypted, but --tls is given: take tls/{address}")
+        raise ConfigError(f"endpoint {endpoint} is not encrypted, but --tls is given: use tls/{address}")
     return host
 
 
 def _reachable(host: str) -> bool:
-    """Whether other machines may be able to reach what listens there."""
+    """Whether other machines may be able to connect to a listener on this host."""
     try:
         return not ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -82,11 +82,11 @@ def _reachable(host: str) -> bool:
 
 
 LISTEN: Final = "tcp/127.0.0.1:7447"
-"""Where a learner listens unless told otherwise."""
+"""A learner's default endpoint."""
 
 
 def free_endpoint() -> str:
-    """An endpoint on this machine with a port that nobody uses."""
+    """An endpoint on this machine with an unused port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -96,16 +96,16 @@ class Session:
     """An open session; use `listen` or `connect`."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        """Take an open zenoh session."""
+        """Wrap an open zenoh session."""
         self._session = session
         self.events = Events()
-        """Whatever subscriptions bring."""
+        """Everything received by subscriptions."""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
         self._over: list[threading.Event] = []  # of their callbacks
         self._tokens: list[zenoh.LivelinessToken] = []
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
-        """Send bytes to whoever subscribed to the key; without block a stuck receiver loses them."""
+        """Send bytes to the subscribers of the key; without `block` a receiver that is stuck loses them."""
         self._session.put(
             key,
             payload,
@@ -114,32 +114,32 @@ class Session:
         )
 
     def subscribe(self, topic: str, key: str, *, wake: bool = True) -> None:
-        """Everything published on the key goes into `events` under the topic's name.
+        """Put everything published on the key into `events` under the topic's name.
 
-        Without `wake`, a thread that waits for events goes on waiting, and finds it with the next one that wakes it.
+        Without `wake`, a thread that waits for events is not woken; it gets the event with the next one.
         """
         self._declared.append(self._session.declare_subscriber(key, self._callback(self._put(topic, wake=wake))))
 
     def watch(self, topic: str, key: str) -> None:
-        """Liveliness tokens that are there, come or go, into `events`."""
+        """Put existing, new and disappearing liveliness tokens into `events`."""
         callback = self._callback(self._put(topic))
         self._declared.append(self._session.liveliness().declare_subscriber(key, callback, history=True))
 
     def token(self, key: str) -> None:
-        """Show that we are here, until the session closes. Declare it after everything else."""
+        """Declare our liveliness token until the session closes. Do this after all other declarations."""
         self._tokens.append(self._session.liveliness().declare_token(key))
 
     def outlet(self, key: str) -> "Outlet":
-        """A key that is published on again and again, and may have nobody listening."""
+        """A publisher for a key that is used repeatedly and may have no subscribers."""
         publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         return Outlet(publisher)
 
     def answer(self, key: str, reply: Callable[[], bytes]) -> None:
-        """Answer every query on the key with what `reply` gives (called on another thread)."""
+        """Answer every query on the key with the result of `reply` (called on another thread)."""
         self.answer_asked(key, lambda _: reply())
 
     def answer_asked(self, key: str, reply: Callable[[str], bytes]) -> None:
-        """The same, where `reply` takes what the asker wrote behind the key and a question mark."""
+        """Like `answer`, where `reply` takes the query's parameters (the text after the key and a question mark)."""
 
         def serve(query: zenoh.Query) -> None:
             with query, suppress(zenoh.ZError):
@@ -148,30 +148,30 @@ class Session:
         self._declared.append(self._session.declare_queryable(key, self._callback(serve)))
 
     def present(self, key: str, timeout: float) -> bool:
-        """Whether a liveliness token of the key is there, as far as is known in time [s]."""
+        """Whether a liveliness token of the key is found within the timeout [s]."""
         return bool(self.tokens(key, timeout))
 
     def tokens(self, key: str, timeout: float) -> list[str]:
-        """The liveliness tokens of the key that are there, as far as is known in time [s]."""
-        # A router knows them all and gives them before `get` returns: with room for fewer it would wait for ever.
+        """The liveliness tokens of the key that are found within the timeout [s]."""
+        # A router delivers all of them before `get` returns: with room for fewer it would wait forever.
         room = zenoh.handlers.FifoChannel(_TOKENS)
         replies = self._session.liveliness().get(key, room, timeout=timeout)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def ask(self, key: str, timeout: float) -> bytes | None:
-        """One answer to a query on the key, None when there is none in time [s]."""
+        """One answer to a query on the key, None if there is none within the timeout [s]."""
         return next(self.ask_all(key, timeout), None)
 
     def ask_all(self, key: str, timeout: float) -> Iterator[bytes]:
-        """Every answer to a query on the key that comes in time [s]."""
+        """Every answer to a query on the key that arrives within the timeout [s]."""
         with suppress(zenoh.ZError):
-            # Not consolidated: two that answer on one key are two answers.
+            # Not consolidated: two answers on the same key are both kept.
             for reply in self._session.get(key, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE):
                 if reply.ok is not None:
                     yield reply.ok.payload.to_bytes()
 
     def close(self) -> None:
-        """Take everything back and wait for the callbacks: one that is left in Rust aborts the interpreter's exit."""
+        """Undeclare everything and wait for the callbacks: one left running in Rust aborts the interpreter's exit."""
         for token in self._tokens:
             token.undeclare()
         for declared in self._declared:
@@ -193,7 +193,7 @@ class Session:
 
 
 class Outlet:
-    """A key to publish on; a receiver that is stuck loses what is said."""
+    """A publisher for one key; a receiver that is stuck loses messages."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         """Made by `Session.outlet`."""
@@ -201,26 +201,26 @@ class Outlet:
 
     @property
     def heard(self) -> bool:
-        """Whether anybody subscribed; asking costs 2 us."""
-        status: Any = self._publisher.matching_status  # its stub says bool, which the object always is
+        """Whether there are subscribers; the check takes 2 us."""
+        status: Any = self._publisher.matching_status  # its stub says bool, but a bool is always true here
         return bool(status.matching)
 
     def publish(self, payload: bytes) -> None:
-        """Send bytes to whoever subscribed."""
+        """Send bytes to the subscribers."""
         self._publisher.put(payload)
 
 
 def router_settings(
     endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False, routers: tuple[str, ...] = ()
 ) -> dict[str, object]:
-    """Zenoh's settings for a session that others connect to, by the paths of its configuration.
+    """Zenoh's settings for a session that accepts connections, by configuration path.
 
     Args:
       endpoint: where it listens.
       farm: name of the farm, for access control.
-      bundle: the learner's certificates; with them only those on its roster get in.
+      bundle: the learner's certificates; with them only machines on its roster are accepted.
       trusted: listen to other machines without certificates.
-      routers: other ones that it joins, as soon and as often as they are there.
+      routers: other routers that it connects to, and reconnects to after a loss.
 
     Raises:
       ConfigError: an endpoint is malformed, or open to other machines without certificates.
@@ -229,7 +229,7 @@ def router_settings(
     if bundle is None and _reachable(host) and not trusted:
         raise ConfigError(
             f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
-            "--trust-network if everybody on that network may read everything and pose as a worker"
+            "--trust-network if everyone on that network may read everything and pose as a worker"
         )
     secured = {} if bundle is None else {**bundle.listening(), "access_control": access_control(farm, bundle.roster())}
     settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
@@ -242,7 +242,7 @@ def router_settings(
 def listen(
     endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = ()
 ) -> Iterator[Session]:
-    """A session that is the farm's rendezvous itself; for the arguments see `router_settings`.
+    """A session that workers connect to; for the arguments see `router_settings`.
 
     Raises:
       ConfigError: an endpoint is malformed, open to other machines without certificates, or its port in use.
@@ -259,10 +259,10 @@ def listen(
 
 
 def _raise_descriptors() -> None:
-    """Let this process have as many connections as the system allows it: the usual 1024 end at 1000 workers.
+    """Raise the limit of open files to the system's maximum: the usual 1024 suffice for 1000 workers only.
 
     Raises:
-      FarmError: they are too few for any: Zenoh would abort the process.
+      FarmError: the maximum is so low that Zenoh would abort the process.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
@@ -277,16 +277,16 @@ def _raise_descriptors() -> None:
 def connect(
     endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None
 ) -> Iterator[Session]:
-    """A session that connects a learner or a router, and keeps trying.
+    """A session connected to a learner or a router; keeps trying until one answers.
 
     Args:
-      endpoints: where to connect; any one that answers will do.
+      endpoints: where to connect; the first that answers is used.
       bundle: our certificates, for tls endpoints.
-      timeout: give up after [s]; None for never.
-      stopped: asked between tries, true ends them.
+      timeout: give up after this time [s]; None: never.
+      stopped: called between attempts; true ends them.
 
     Raises:
-      FarmError: nobody answered in time; Interrupted: it was stopped.
+      FarmError: no answer in time; Interrupted: it was stopped.
     """
     for endpoint in endpoints:
         check_endpoint(endpoint, encrypted=bundle is not None)
@@ -300,7 +300,7 @@ def connect(
 def _try(
     settings: Mapping[str, object], where: str, timeout: float | None, stopped: Callable[[], bool]
 ) -> zenoh.Session:
-    # A refused handshake looks like nobody: Zenoh does not say why.
+    # A refused handshake looks like no answer: Zenoh gives no reason.
     hint = (
         "; the learner may refuse our certificate: same authority, still valid, on its roster?"
         if "tls/" in where
@@ -316,11 +316,11 @@ def _try(
                 raise Interrupted(f"stopped before {where} answered") from None
             if timeout is not None and now - begun > timeout:
                 raise FarmError(
-                    f"nobody answers at {where} after {timeout:g} s: start a learner there, or check --connect{hint}"
+                    f"no answer from {where} after {timeout:g} s: start a learner there, or check --connect{hint}"
                 ) from None
             if now - told >= _REMIND or told == begun:
                 told = now
-                log.warning("nobody answers at %s yet, trying again (%s)%s", where, _first_line(error), hint)
+                log.warning("no answer from %s yet, trying again (%s)%s", where, _first_line(error), hint)
             time.sleep(0.1)  # zenoh itself waits up to _OPEN_S for an address that does not refuse
 
 
@@ -343,6 +343,6 @@ def _closing(session: zenoh.Session) -> Iterator[Session]:
 
 
 def _first_line(error: Exception) -> str:
-    """What zenoh says, without where in its sources."""
+    """Zenoh's message without the location in its sources."""
     lines = str(error).splitlines() or [type(error).__name__]
     return lines[0].partition(" at /")[0][:120]

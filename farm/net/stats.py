@@ -1,4 +1,4 @@
-"""What is known of a generation that is over; one line of progress.jsonl. Pure."""
+"""Statistics of a finished generation: one line of progress.jsonl. Pure data."""
 
 from dataclasses import dataclass, fields
 from typing import Any, Final, cast
@@ -12,7 +12,7 @@ class GenerationStats:
     """One generation. Returns, rates and counts are over its 2N exploring rollouts."""
 
     generation: int
-    """Updates done, this one included: 1, 2, ..."""
+    """Number of updates so far including this one: 1, 2, ..."""
     rollouts: int
     """Exploring rollouts of the run so far."""
     return_mean: float
@@ -30,9 +30,9 @@ class GenerationStats:
     mean_policy_return: float
     """Return of the mean policy that the generation explored around, unperturbed."""
     mean_policy_success: bool | None
-    """Whether that rollout succeeded, None where the task knows no success."""
+    """Whether that rollout succeeded, None if the task does not define success."""
     success_rate: float | None
-    """Part of the rollouts that succeeded, None where the task knows no success."""
+    """Fraction of rollouts that succeeded, None if the task does not define success."""
     sigma_mean: float
     """Mean of sigma after the update."""
     sigma_min: float
@@ -44,23 +44,23 @@ class GenerationStats:
     ended: int
     """Rollouts that the task ended before their last step."""
     failed: int
-    """Rollouts whose physics blew up."""
+    """Rollouts whose simulation became unstable."""
     clamped: int
     """Rollouts whose return overflowed and was clamped."""
     reissued: int
-    """Jobs given out again since the run's start (lost workers, stragglers, idle workers)."""
+    """Jobs reissued since the run's start (lost workers, stragglers, idle workers)."""
     workers: int
-    """Workers at the generation's end."""
+    """Number of workers at the end of the generation."""
     seconds: float
-    """Wall time of the run so far, resumed parts added up [s]."""
+    """Wall time of the run so far, including the time before it was resumed [s]."""
 
     def to_dict(self) -> dict[str, Any]:
-        """As it stands in progress.jsonl."""
+        """As a record of progress.jsonl."""
         return {"version": VERSION, **vars(self)}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "GenerationStats":
-        """Read a line back.
+        """Make it from a record of progress.jsonl.
 
         Raises:
           ValueError: another version, or a field is missing or of another type.

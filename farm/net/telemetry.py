@@ -1,4 +1,4 @@
-"""What learners tell observers: how a run is doing, and what was recorded of it. Pure, as `farm.net.messages`."""
+"""Messages from learners to observers: a run's state and its reports. Pure data like `farm.net.messages`."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,19 +10,19 @@ from farm.net.work import WireTrajectory
 
 
 def _check_plain(values: Any) -> None:  # noqa: ANN401
-    """See that a table is as JSON has it: an array in it would be compared element by element. Else a ValueError."""
+    """Check that a table has only JSON's types: arrays compare element by element. Raises ValueError otherwise."""
     for name, value in values.items() if type(values) is dict else enumerate(values):
         if type(values) is dict and type(name) is not str:
             raise ValueError(f"a name that is a {type(name).__name__}")
         if type(value) in (dict, list, tuple):
             _check_plain(value)
         elif not isinstance(value, str | int | float | None):
-            raise ValueError(f"a {type(value).__name__} where JSON has none")
+            raise ValueError(f"a {type(value).__name__} in a JSON table")
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerStatus:
-    """How a worker is doing, as a learner sees it."""
+    """A worker's state as seen by a learner."""
 
     worker: str
     host: str
@@ -30,13 +30,13 @@ class WorkerStatus:
     version: str
     canary: str
     rollouts: int
-    """It has brought so many."""
+    """Number of rollouts that it has returned."""
     rate: float
-    """Rollouts a second, over the last ten."""
+    """Rollouts per second over the last ten seconds."""
     seen: float
-    """Since it was last heard of [s]."""
+    """Time since its last message [s]."""
     ignored: dict[str, int] = field(default_factory=dict)
-    """Messages that it ignored, by kind."""
+    """Number of messages that it ignored, by kind."""
 
     def __post_init__(self) -> None:
         """Check the counts."""
@@ -45,7 +45,7 @@ class WorkerStatus:
 
 @dataclass(frozen=True, kw_only=True)
 class RunStatus:
-    """How a run is doing, answered by its learner."""
+    """A run's state, sent by its learner on request."""
 
     run: str
     generation: int
@@ -53,12 +53,12 @@ class RunStatus:
     return_mean: float | None
     mean_policy_return: float | None
     open: int
-    """Jobs of this round that are not done."""
+    """Unfinished jobs of this round."""
     reissued: int
     refused: int
-    """Workers that were refused."""
+    """Refused workers with the reasons."""
     ignored: dict[str, int]
-    """Messages that did not count, by kind."""
+    """Number of ignored messages by kind."""
     workers: tuple[WorkerStatus, ...]
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class Line:
     """A line of the learner's log."""
 
     level: str
-    """A name of the standard library's."""
+    """Name of the level in the standard library."""
     text: str
 
 
@@ -80,7 +80,7 @@ class Trace:
     """Traces of some of a generation's rollouts."""
 
     name: str
-    """`best` and `worst` are of one rollout, `all` of all."""
+    """`best` and `worst` hold one rollout, `all` holds all."""
     values: AnyArray = array("<f4", 3)
     """(R, T, N)"""
 
@@ -94,7 +94,7 @@ class Trace:
 
 @dataclass(frozen=True, kw_only=True)
 class RunReport:
-    """A generation that is over, learner to recorders."""
+    """Report of a finished generation, learner to recorders."""
 
     run: str
     incarnation: str
@@ -102,16 +102,16 @@ class RunReport:
     progress: dict[str, Any]
     """Its line of progress.jsonl."""
     rate: float
-    """Exploring rollouts a second."""
+    """Exploring rollouts per second."""
     lines: tuple[Line, ...] = ()
-    """Of the log, since the report before."""
+    """Lines of the log since the previous report."""
     traces: tuple[Trace, ...] = ()
     sample: WireTrajectory | None = None
     """The mean policy's rollout at control rate."""
     replay: WireTrajectory | None = None
-    """The best rollout so far at physics rate, once there is a new one."""
+    """The best rollout so far at physics rate, if there is a new one."""
     replay_generation: int = 0
-    """The generation that one came from."""
+    """The generation of the best rollout."""
 
     def __post_init__(self) -> None:
         """Check the table."""
@@ -120,16 +120,16 @@ class RunReport:
 
 @dataclass(frozen=True, kw_only=True)
 class RunEnd:
-    """A run that is over for good: nothing more will be reported."""
+    """The last report of a run."""
 
     summary: dict[str, Any]
     """As in summary.json."""
     lines: tuple[Line, ...]
-    """Of the log, since the last report."""
+    """Lines of the log since the previous report."""
     best: WireTrajectory | None
     """The best rollout of the run at physics rate."""
     best_generation: int
-    """The generation it came from."""
+    """The generation of the best rollout."""
     mean: WireTrajectory | None
     """The final mean policy's rollout at physics rate; None where the run diverged."""
 
@@ -140,20 +140,20 @@ class RunEnd:
 
 @dataclass(frozen=True, kw_only=True)
 class RunHistory:
-    """What a run is, and what it reported from a generation on: a page of it."""
+    """A run's description, and one page of its reports from a given generation on."""
 
     run: str
     incarnation: str
     recording: str
-    """Name that the run began with, the id of its recording."""
+    """The run's original name, the id of its recording."""
     config: dict[str, Any]
     """As in config.json."""
     files: dict[str, str]
-    """Texts that its task is made of."""
+    """Files of its task by name."""
     generation: int
-    """Generations that are over; where the last report is an earlier one, ask on from there."""
+    """Number of finished generations; if the last report is of an earlier one, query again from there."""
     reports: tuple[RunReport, ...]
-    """In order; older ones without rollouts and traces."""
+    """In order; older ones have no rollouts and traces."""
     end: RunEnd | None
 
     def __post_init__(self) -> None:

@@ -1,14 +1,14 @@
-"""Who may do what on a farm with certificates: bundles on disk, and Zenoh's configuration of them.
+"""Access rights on a farm with certificates: bundles on disk, and the Zenoh configuration for them.
 
 `farm certificates` makes a folder of bundles; each holds what one machine needs:
 
-    certs/ca/            cert.pem  key.pem  roster.json, which stay
+    certs/ca/            cert.pem  key.pem  roster.json; must not be copied
     certs/learner/       ca.pem  cert.pem  key.pem  identity.json  roster.json
     certs/worker-NAME/   ca.pem  cert.pem  key.pem  identity.json
 
-Both sides show a certificate of the farm's own CA. Access control lives where sessions meet, in
-the learner or in a router: a worker may speak only under its own name, the common name of its
-certificate, whatever it calls itself; a viewer may only look.
+Both sides of a connection show a certificate of the farm's own CA. The learner or router that
+accepts the connection enforces the access rights: a worker may publish only under the common name
+of its certificate; a viewer may only read.
 """
 
 import json
@@ -28,7 +28,7 @@ _FILES: Final = ("ca.pem", "cert.pem", "key.pem", "identity.json")
 
 @dataclass(frozen=True)
 class Roster:
-    """Common names of everybody who may take part."""
+    """Common names of all machines that may take part."""
 
     learners: tuple[str, ...]
     workers: tuple[str, ...]
@@ -37,17 +37,17 @@ class Roster:
 
 @dataclass(frozen=True)
 class Bundle:
-    """One machine's certificate, its key, and the CA that vouches for the others."""
+    """One machine's certificate, its key, and the CA that signed all certificates of the farm."""
 
     folder: Path
     role: Role
     name: str
     """Common name of the certificate."""
     hosts: tuple[str, ...] = ()
-    """Names and addresses that the learner's certificate is for; empty where the bundle does not tell."""
+    """Host names and addresses in the learner's certificate; empty if the bundle does not list them."""
 
     def listening(self) -> dict[str, object]:
-        """Zenoh's settings for a session that listens."""
+        """Zenoh's settings for a session that accepts connections."""
         return {
             "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
             "transport/link/tls/listen_certificate": str(self.folder / "cert.pem"),
@@ -67,24 +67,24 @@ class Bundle:
         }
 
     def roster(self) -> Roster:
-        """Who may take part; the learner's and a router's bundle know it.
+        """The machines that may take part; in the bundles of the learner and of routers.
 
         Raises:
-          ConfigError: this bundle does not, or its list is damaged.
+          ConfigError: this bundle has no such list, or it is damaged.
         """
         path = self.folder / "roster.json"
         try:
             values = json.loads(path.read_text("utf-8"))
             return Roster(*(tuple(map(str, values[part])) for part in ("learners", "workers", "viewers")))
         except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError(f"{path} does not say who may take part; listen with the learner's bundle") from None
+            raise ConfigError(f"{path} has no list of machines; listen with the learner's bundle") from None
 
 
 def find(folder: Path, role: Role, name: str = "") -> Bundle:
-    """The bundle for this role in a folder: the folder itself, or the one of that role and name below it.
+    """Find the bundle for this role: the folder itself, or its subfolder of that role and name.
 
     Raises:
-      ConfigError: there is none, several fit, or it is for another role.
+      ConfigError: there is none, several match, or it is for another role.
     """
     if not os.access(folder, os.R_OK | os.X_OK):
         why = "this user may not read it" if folder.exists() else "there is no such folder"
@@ -129,15 +129,15 @@ def _read(folder: Path, role: Role) -> Bundle:
 
 
 def private(key: Path) -> None:
-    """See that nobody else can read a key of ours; as ssh does, a ConfigError refuses it."""
+    """Check that other users cannot read one of our keys; raises ConfigError otherwise, like ssh."""
     found = key.stat()
     if found.st_uid == os.getuid() and found.st_mode & 0o077:
         mode = stat.S_IMODE(found.st_mode)
-        raise ConfigError(f"{key} can be read by others (mode {mode:04o}), and serves nobody then: chmod 600 {key}")
+        raise ConfigError(f"{key} can be read by other users (mode {mode:04o}): chmod 600 {key}")
 
 
 def access_control(farm: str, roster: Roster) -> dict[str, Any]:
-    """Zenoh's access control for the session that others connect to: all is denied that is not said here."""
+    """Zenoh's access control for a session that accepts connections: everything not listed is denied."""
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -171,7 +171,7 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 
 
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
-    """What a worker may send, and what it may be sent."""
+    """What a worker may send and receive."""
     own, told = f"{name}/**", keys.generation(farm, "*")
     asked = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), told]
     sent = [keys.inbox(farm, own), keys.refused(farm, own), told]
@@ -184,14 +184,14 @@ def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
         ("egress", ["put"], sent),
         ("egress", ["reply", "declare_queryable"], asked),
         ("egress", _TOKENS, [keys.learner_token(farm, "*")]),
-        # The learners' own wildcard subscriptions, or the worker would see nobody to send to.
+        # The learners' own wildcard subscriptions; without them the worker would see no receivers.
         ("egress", ["declare_subscriber"], [keys.want(farm, "**"), keys.result(farm, "*", "**")]),
         ("egress", _WATCHES, [keys.worker_token(farm, "**")]),
     ]
 
 
 def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
-    """A viewer sees which learners and workers there are, what runs are about, and what they report."""
+    """A viewer may see learners, workers, the runs' descriptions and their reports."""
     told = [keys.generation(farm, "*"), keys.report(farm, "*"), keys.history(farm, "*")]
     asked = [keys.spec(farm, "*"), keys.generation(farm, "*"), keys.status(farm, "*"), keys.history(farm, "*")]
     tokens = [keys.learner_token(farm, "*"), keys.worker_token(farm, "**")]
@@ -206,6 +206,6 @@ def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
 
 
 def _learner(farm: str) -> list[tuple[str, list[str], list[str]]]:
-    """A learner behind a router may do everything on its farm."""
+    """A learner connected to a router may do everything on its farm."""
     every = ["put", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS, *_WATCHES]
     return [(flow, every, [f"{farm}/**"]) for flow in ("ingress", "egress")]

@@ -1,4 +1,4 @@
-"""Work on its way: rounds and jobs to workers, results back. Arrays all the way; pure; bytes by `farm.net.codec`."""
+"""Messages about work: rounds and jobs to workers, results back. Pure data in arrays, encoded by `farm.net.codec`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,26 +12,26 @@ from farm.net.codec import array
 from farm.sim.trajectory import Trajectory
 
 RATES: Final = ("none", "control", "physics")
-"""How much of a rollout a job wants to see, besides its figures: nothing, or a trajectory at that rate."""
+"""What a job returns besides its numbers: nothing, or a trajectory at that rate."""
 
 TRACES: Final = ("none", "extremes", "all")
-"""Traces that results bring: none, of the best and the worst exploring rollout of each message, of all of them.
+"""Traces in results: none, those of the best and the worst exploring rollout of each message, or all.
 
-The best rollout of a round (of equals the first) is the best of the message that brings it: with `extremes` its trace
-is never missed, whichever jobs travel together.
+The best rollout of a round (the first of equal ones) is also the best of its message: with `extremes` its trace is
+always included, however jobs are grouped.
 """
 
 NOT_NORMALISED: Final = np.empty((2, 2, 0))
-"""What a RoundHeader has where observations are taken as they are."""
+"""A RoundHeader's normaliser if observations are not normalised."""
 
-_LINE: Final = 1000  # characters
-_LINES: Final = 40  # of a traceback
-_CHANNELS: Final = 100  # of a trajectory
+_LINE: Final = 1000  # characters of a line
+_LINES: Final = 40  # lines of a traceback
+_CHANNELS: Final = 100  # channels of a trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
 class RoundHeader:
-    """A round that begins: the mean that its jobs explore around."""
+    """Start of a round, with the mean that its jobs explore around."""
 
     run: str
     incarnation: str
@@ -40,15 +40,15 @@ class RoundHeader:
     spec: str
     """Digest of the Spec's bytes."""
     traces: str
-    """Which traces results bring, one of TRACES."""
+    """Which traces the results contain, one of TRACES."""
     mu: FloatArray = array("<f8", 1)
     """(P,)"""
     normaliser: FloatArray = array("<f8", 3, NOT_NORMALISED)
     """Mean and standard deviation (2, d) of observations, twice: of all jobs, and of a job at physics rate that is not
-    around the mean, which is a rollout of an earlier generation. d is 0 where observations are taken as they are."""
+    around the mean, which is a rollout of an earlier generation. d is 0 if observations are not normalised."""
 
     def __post_init__(self) -> None:
-        """Check the name, and that what is divided by is positive."""
+        """Check the name of the traces, and that the standard deviations are positive."""
         if self.traces not in TRACES:
             raise ValueError(f"traces {self.traces[:40]!r}")
         if self.normaliser.shape[:2] != (2, 2) or not (self.normaliser[:, 1] > 0.0).all():
@@ -60,10 +60,10 @@ class Jobs:
     """Jobs as one table. A job is one rollout or a mirrored pair: origin + sign * eps for each of its signs."""
 
     table: IntArray = array("<i8", 2)
-    """(J, 10): index; whether the origin is the mean (or zero); whether there are eps; place of the rate in RATES;
+    """(J, 10): index; whether the origin is the mean (or zero); whether the job has eps; index of the rate in RATES;
     two signs, the second 0 for a single rollout; four words of the rollouts' seed, -1 for nominal conditions"""
     eps: FloatArray = array("<f8", 2)
-    """Of those jobs that have some, one after the other (K, P)"""
+    """Of the K jobs that have eps, in order (K, P)"""
 
     @staticmethod
     def exploring(eps: FloatArray, signs: tuple[int, ...], seeds: Sequence[tuple[int, ...]] | None) -> "Jobs":
@@ -71,8 +71,8 @@ class Jobs:
 
         Args:
           eps: (N, P).
-          signs: of each.
-          seeds: N of four words; None for nominal conditions.
+          signs: the signs of each job.
+          seeds: N seeds of four words; None for nominal conditions.
         """
         table = _table(len(eps), around=True, explores=True, rate="none", signs=signs)
         if seeds is not None:
@@ -81,7 +81,7 @@ class Jobs:
 
     @staticmethod
     def mean(rate: str, seeds: Sequence[tuple[int, ...] | None]) -> "Jobs":
-        """Rollouts of the mean itself, one for each seed (None: nominal conditions)."""
+        """Rollouts of the mean itself, one per seed (None: nominal conditions)."""
         table = _table(len(seeds), around=True, explores=False, rate=rate, signs=(1,))
         table[:, _SEED] = np.array([_NOMINAL if seed is None else seed for seed in seeds], dtype="<i8").reshape(-1, 4)
         return Jobs(table=table, eps=np.empty((0, 0)))
@@ -95,19 +95,19 @@ class Jobs:
 
     @staticmethod
     def joined(parts: Sequence["Jobs"]) -> "Jobs":
-        """Jobs behind each other, with the indices 0, 1, ..."""
+        """Concatenate jobs, with the new indices 0, 1, ..."""
         table = np.concatenate([part.table for part in parts])
         table[:, _INDEX] = np.arange(len(table))
         eps = [part.eps for part in parts if part.eps.size]
         return Jobs(table=table, eps=np.concatenate(eps) if len(eps) > 1 else (*eps, np.empty((0, 0)))[0])
 
     def __len__(self) -> int:
-        """How many jobs."""
+        """Number of jobs."""
         return len(self.table)
 
     @property
     def indices(self) -> IntArray:
-        """Of each job, (J,)."""
+        """Index of each job, (J,)."""
         return self.table[:, _INDEX]
 
     @property
@@ -117,7 +117,7 @@ class Jobs:
 
     @cached_property
     def rollouts(self) -> IntArray:
-        """How many each job has, (J,)."""
+        """Number of rollouts of each job, (J,)."""
         return np.count_nonzero(self.table[:, _SIGN], axis=1)
 
     @property
@@ -127,16 +127,16 @@ class Jobs:
 
     @property
     def seen(self) -> BoolArray:
-        """Which jobs want a trajectory, (J,)."""
+        """Which jobs return a trajectory, (J,)."""
         return self.table[:, _RATE] != RATES.index("none")
 
     @property
     def physics(self) -> BoolArray:
-        """Which jobs want it at physics rate, (J,)."""
+        """Which jobs return a trajectory at physics rate, (J,)."""
         return self.table[:, _RATE] == RATES.index("physics")
 
     def seeds(self) -> list[tuple[int, ...] | None]:
-        """Of each rollout, S; None for nominal conditions."""
+        """Seed of each of the S rollouts; None for nominal conditions."""
         words = [None if seed[0] < 0 else tuple(seed) for seed in self.table[:, _SEED].tolist()]
         return [seed for seed, count in zip(words, self.rollouts.tolist(), strict=True) for _ in range(count)]
 
@@ -148,17 +148,17 @@ class Jobs:
         signs = signs[signs != 0]
         out = origin[rows]
         explores = self.table[rows, _EXPLORES] != 0
-        if explores.all():  # as they do in most chunks
+        if explores.all():  # the usual case
             out += signs[:, None] * self.eps[rows]
             return out
         if not explores.any():  # eps may have no columns then
             return out
-        at = np.cumsum(self.table[:, _EXPLORES]) - 1  # of each job's eps
+        at = np.cumsum(self.table[:, _EXPLORES]) - 1  # row of each job's eps
         out[explores] += signs[explores, None] * self.eps[at[rows[explores]]]
         return out
 
     def take(self, chosen: Sequence[int]) -> "Jobs":
-        """Some of these jobs, by their places here; views where they lie side by side."""
+        """Select jobs by position; views of the arrays if the positions are consecutive."""
         first, end = chosen[0], chosen[-1] + 1
         if list(chosen) == list(range(first, end)):
             return Jobs(table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]])
@@ -167,7 +167,7 @@ class Jobs:
 
     @cached_property
     def _before(self) -> list[int]:
-        """How many rows of eps come before each job's, and how many there are, J + 1."""
+        """Number of rows of eps before each job's, and the total, J + 1."""
         return [0, *np.cumsum(self.table[:, _EXPLORES]).tolist()]
 
 
@@ -180,7 +180,7 @@ class Chunk(Jobs):
     round: int
 
     def __post_init__(self) -> None:
-        """Check that there are such jobs."""
+        """Check that the jobs are valid."""
         table, seeds = self.table, self.table[:, _SEED]
         if not table.size or table.shape[1] != _COLUMNS:
             raise ValueError(f"jobs in a table of shape {table.shape}")
@@ -190,13 +190,13 @@ class Chunk(Jobs):
             raise ValueError("a job twice")
         nominal = seeds < 0
         if nominal.any() and (nominal.any(axis=1) != nominal.all(axis=1)).any():
-            raise ValueError("half a seed")
+            raise ValueError("a seed that is partly -1")
         if len(self.eps) != table[:, _EXPLORES].sum():
-            raise ValueError(f"{len(self.eps)} rows of eps of {table[:, _EXPLORES].sum()} jobs")
+            raise ValueError(f"{len(self.eps)} rows of eps for {table[:, _EXPLORES].sum()} jobs that have eps")
 
     @classmethod
     def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
-        """At least one job, ready to send; not checked, as they are the sender's own: that takes as long as sending."""
+        """A message with these jobs, at least one; unchecked, because a check takes as long as sending."""
         chunk = object.__new__(cls)
         vars(chunk).update(run=run, incarnation=incarnation, round=round, table=jobs.table, eps=jobs.eps)
         return chunk
@@ -204,7 +204,7 @@ class Chunk(Jobs):
 
 @dataclass(frozen=True)
 class Simulated:
-    """What jobs gave: S rollouts, in the jobs' order."""
+    """Results of jobs: S rollouts, in the jobs' order."""
 
     returns: FloatArray
     """(S,)"""
@@ -213,20 +213,20 @@ class Simulated:
     steps: IntArray
     """Control steps, (S,)"""
     traces: AnyArray
-    """Of those rollouts that `traced` names, float32, (K, T, N)"""
+    """Of the K rollouts selected by `traced`, float32, (K, T, N)"""
     trajectories: "tuple[WireTrajectory, ...]"
-    """Of the jobs that are seen, in their order: of the first rollout of each"""
+    """The first rollout of each job that returns a trajectory, in the jobs' order"""
     moments: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros of rollouts that failed or are seen. (0, 0) where
-    observations are not normalised"""
+    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or return a trajectory.
+    (0, 0) if observations are not normalised"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What a chunk gave, worker to learner: one array of each kind over the rollouts of all its jobs.
+    """Results of a chunk, worker to learner: one array of each kind over the rollouts of all its jobs.
 
-    How many rollouts a job has, and which have a trajectory or a trace, the receiver derives from the jobs it issued
-    (`traced`). A map for each job would take the learner ten times as long to read.
+    The receiver derives each job's number of rollouts, and which of them have a trajectory or a trace, from the jobs
+    that it issued (`traced`). One map per job would take the learner ten times as long to read.
     """
 
     run: str
@@ -234,9 +234,9 @@ class Results:
     round: int
     worker: str
     trajectories: "tuple[WireTrajectory, ...]"
-    """Of the jobs that are seen, in their order."""
+    """Of the jobs that return one, in their order."""
     jobs: IntArray = array("<i8", 1)
-    """Indices, rising (J,)"""
+    """Indices, ascending (J,)"""
     returns: FloatArray = array("<f8", 1)
     """(S,)"""
     flags: BoolArray = array("|b1", 2)
@@ -244,25 +244,25 @@ class Results:
     steps: IntArray = array("<i8", 1)
     """Control steps, (S,)"""
     traces: AnyArray = array("<f4", 3)
-    """Traces that are wanted, (K, T, N)"""
+    """The requested traces, (K, T, N)"""
     moments: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Of the observations (S, 1 + 2 d), or (0, 0)"""
 
     def __post_init__(self) -> None:
-        """Check that all speak of as many rollouts, at least one a job."""
+        """Check that all arrays have the same number of rollouts, at least one per job."""
         if not 1 <= len(self.jobs) <= len(self.returns):
-            raise ValueError(f"{len(self.jobs)} jobs of {len(self.returns)} rollouts")
+            raise ValueError(f"{len(self.jobs)} jobs with {len(self.returns)} rollouts")
         jobs = self.jobs.tolist()
         if jobs != sorted(set(jobs)):
-            raise ValueError("jobs that do not rise")
+            raise ValueError("job indices that are not ascending")
         if self.flags.shape != (len(self.returns), 4):
-            raise ValueError(f"flags of shape {self.flags.shape} of {len(self.returns)} rollouts")
+            raise ValueError(f"flags of shape {self.flags.shape} for {len(self.returns)} rollouts")
         if len(self.steps) != len(self.returns):
-            raise ValueError(f"steps of {len(self.steps)} of {len(self.returns)} rollouts")
+            raise ValueError(f"{len(self.steps)} step counts for {len(self.returns)} rollouts")
         if self.moments.shape != (0, 0):
             half = self.moments.shape[1] // 2 + 1
             if len(self.moments) != len(self.returns) or self.moments.shape[1] % 2 == 0:
-                raise ValueError(f"moments of shape {self.moments.shape} of {len(self.returns)} rollouts")
+                raise ValueError(f"moments of shape {self.moments.shape} for {len(self.returns)} rollouts")
             if (self.moments[:, :1] < 0.0).any() or (self.moments[:, half:] < 0.0).any():
                 raise ValueError("moments that are negative")
 
@@ -270,7 +270,7 @@ class Results:
     def carrying(
         cls, given: Simulated, jobs: Jobs, *, run: str, incarnation: str, round: int, worker: str
     ) -> "Results":
-        """What jobs gave, ready to send; the jobs' indices rise."""
+        """A message with the results of jobs, whose indices are ascending."""
         return cls(
             run=run, incarnation=incarnation, round=round, worker=worker, jobs=np.ascontiguousarray(jobs.indices),
             returns=given.returns, flags=given.flags, steps=given.steps, traces=given.traces,
@@ -279,12 +279,12 @@ class Results:
 
 
 def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
-    """Which rollouts of a message have a trace, rising (K,).
+    """Indices of a message's rollouts that have a trace, ascending (K,).
 
     Args:
       traces: one of TRACES.
       returns: (S,).
-      exploring: which are of jobs that have no trajectory and so explore, (S,).
+      exploring: which rollouts explore, that is belong to jobs without a trajectory, (S,).
     """
     among = np.flatnonzero(exploring)
     if traces == "all":
@@ -297,21 +297,21 @@ def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """A job that could not be run: an exception, not a bad rollout. Or a worker that does not serve the run at all."""
+    """A job that raised an exception (not a bad rollout), or a worker that cannot serve the run at all."""
 
     run: str
     incarnation: str
     round: int
     worker: str
     index: int | None
-    """None where it is not the job: no job of this run can be run there."""
+    """The job; None if the worker can run no job of this run."""
     error: str
     """One line."""
     traceback: tuple[str, ...] = ()
-    """Where the error is not in the farm's own code: lines for who wrote that."""
+    """Lines for the author of the code if the error is outside the farm's own code."""
 
     def __post_init__(self) -> None:
-        """Check that it can be shown."""
+        """Check that it can be displayed."""
         if len(self.traceback) > _LINES:
             raise ValueError(f"a traceback of {len(self.traceback)} lines")
         for line in (self.error, *self.traceback):
@@ -321,26 +321,26 @@ class Failure:
 
 @dataclass(frozen=True, kw_only=True)
 class WireTrajectory:
-    """A Trajectory on its way; float32 but for times and figures."""
+    """A Trajectory as it is sent: float32 except for times and scalars."""
 
     value: float
     success: bool | None
     channels: dict[str, Any]
-    """Arrays (F, ...) by channel."""
+    """Arrays (F, ...) by channel; F frames."""
     times: FloatArray = array("<f8", 1)
     bodies: AnyArray = array("<f4", 3)
     actions: AnyArray = array("<f4", 2)
     terms: AnyArray = array("<f4", 2)
 
     def __post_init__(self) -> None:
-        """Check that all have as many frames, at rising times; how wide each is, the run's task says."""
+        """Check that all arrays have the same number of frames, at ascending times; their widths depend on the task."""
         if not len(self.times) or self.times[0] != 0.0 or (np.diff(self.times) <= 0.0).any():
-            raise ValueError(f"{len(self.times)} frames that do not begin at 0 and rise")
+            raise ValueError(f"{len(self.times)} frames whose times do not start at 0 and ascend")
         if len(self.channels) > _CHANNELS:
             raise ValueError(f"{len(self.channels)} channels")
         for name, values in self._arrays().items():
             if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f4"):
-                raise ValueError(f"{str(name)[:40]} that is no array of float32")
+                raise ValueError(f"{str(name)[:40]} that is not an array of float32")
             if not values.ndim or values.shape[0] != len(self.times) or not np.isfinite(values).all():
                 raise ValueError(f"{str(name)[:40]} of shape {values.shape} in {len(self.times)} frames, or not finite")
 
@@ -349,12 +349,12 @@ class WireTrajectory:
         return own | {f"channels/{name}": values for name, values in self.channels.items()}
 
     def fits(self, shapes: Mapping[str, tuple[int, ...]]) -> bool:
-        """Whether there are just these arrays, and a frame of each has its shape."""
+        """Whether it has exactly these arrays with these shapes per frame."""
         return {name: values.shape[1:] for name, values in self._arrays().items()} == dict(shapes)
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> "WireTrajectory":
-        """Make ready to send."""
+        """Convert for sending."""
         return cls(
             value=trajectory.value, success=trajectory.success, times=trajectory.times,
             bodies=_shrunk(trajectory.bodies), actions=_shrunk(trajectory.actions), terms=_shrunk(trajectory.terms),
@@ -362,7 +362,7 @@ class WireTrajectory:
         )  # fmt: skip
 
     def trajectory(self) -> Trajectory:
-        """As it was, to float32's precision."""
+        """Convert back, with float32's precision."""
         return Trajectory(
             times=self.times, bodies=self.bodies.astype(float), actions=self.actions.astype(float),
             terms=self.terms.astype(float), value=self.value, success=self.success,

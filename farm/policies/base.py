@@ -1,4 +1,4 @@
-"""What a policy is: parameters and observations to actions."""
+"""The base class of policies, which map parameters and observations to actions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

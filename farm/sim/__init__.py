@@ -1,1 +1,1 @@
-"""Simulation and pictures of it; knows no task."""
+"""Simulation and rendering; independent of tasks."""

@@ -1,4 +1,4 @@
-"""What a rollout shows in addition to its bodies, and where it is seen from. Pure."""
+"""Channels, the data that a rollout shows in addition to its bodies, and cameras. Pure data."""
 
 import math
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ class Channel:
     """Something that a rollout shows in addition to its bodies: n curves, pictures, arrows or points in each frame."""
 
     name: str
-    """Its place in recordings, for example `contacts/force`."""
+    """Its path in recordings, for example `contacts/force`."""
     kind: Kind
-    """What a frame holds, with the shape that goes with it:
+    """The kind of data in a frame, with the shape:
 
     scalars (n,)        curves
     flags   (n,)        0 or 1, drawn as lanes
@@ -27,18 +27,18 @@ class Channel:
     points  (n, 4)      position [m], and value [unit]
     """
     shape: tuple[int, ...]
-    """Of a frame."""
+    """Shape of a frame."""
     labels: tuple[str, ...] = ()
-    """Names of the n; without: their numbers."""
+    """Names of the n values; by default their numbers."""
     unit: str = ""
     top: float = 1.0
     """Value drawn in the brightest colour (images, points, painted geometries) [unit]."""
     colours: tuple[tuple[int, int, int], ...] = ()
-    """Red, green, blue of each of the n, 0 to 255; without: a palette's."""
+    """Red, green, blue of each of the n, 0 to 255; by default from a palette."""
     bodies: tuple[str, ...] = ()
-    """Bodies in whose frames the n arrows, points or places are; without: the world's."""
+    """Bodies in whose frames the n arrows, points or places are; by default the world's frame."""
     places: FloatArray | None = None
-    """Where an image's pixels lie on its body [m], (n, h * w, 3)."""
+    """Positions of an image's pixels on its body [m], (n, h * w, 3)."""
     length: float = 0.01
     """An arrow's length [m/unit]."""
     longest: float = 0.1
@@ -46,7 +46,7 @@ class Channel:
     geoms: tuple[str, ...] = ()
     """Geometries that a video paints by these n scalars: white at 0, their colour from `top` on."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Least and greatest value that is allowed, by label: constant lines beside those scalars [unit]."""
+    """Smallest and largest allowed value by label: drawn as constant lines with those scalars [unit]."""
     trace: bool = False
     """Whether its values are sent with results: of the best and the worst rollout of a generation, or of all."""
 
@@ -85,7 +85,7 @@ class Channel:
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A point of view, as MuJoCo's free camera has it."""
+    """A point of view, in the parameters of MuJoCo's free camera."""
 
     lookat: tuple[float, float, float]
     """[m]"""

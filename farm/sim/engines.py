@@ -1,4 +1,4 @@
-"""MuJoCo on this machine's processor: many simulations in mujoco.batch, or one in an MjData."""
+"""MuJoCo on the CPU: many simulations in mujoco.batch, or one in an MjData."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,18 +11,18 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.sim.sim import Rebound, failed_rows, own_value
 
 CAPACITY = 64
-"""Rollouts that are stepped together."""
+"""Number of rollouts that are stepped together."""
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that the next step depends on, as mujoco.batch keeps it."""
 
 
 class BatchEngine:
-    """Simulations of one model in mujoco.batch; their numbers are those of a plain `mj_step` loop."""
+    """Simulations of one model in mujoco.batch, with the same numbers as a plain `mj_step` loop."""
 
     def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
         """Make room for `size` rows; the physics runs on `threads`."""
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # what has blown up stays so
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # unstable states stay unstable
         self.model, self.size, self._threads = model, size, threads
         self._batch = mujoco.batch.Batch(model, size, threads)
         self._fields: dict[str, AnyArray] = {}
@@ -59,7 +59,7 @@ class BatchEngine:
 
     @contextmanager
     def _surviving(self) -> Iterator[None]:
-        """Rows in which MuJoCo itself raised an error count as blown up; the other rows continue."""
+        """Advance rows; those in which MuJoCo itself raised an error count as unstable, the others continue."""
         try:
             yield
         except mujoco.batch.SimulationError as error:
@@ -75,7 +75,7 @@ class BatchEngine:
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Forces of contacts on every body of rows, (n, nbody, 6)."""
-        if self._data is None:  # each row needs an MjData of its own, which is left as the last step left it
+        if self._data is None:  # each row needs its own MjData, in the state after its last step
             self._data = mujoco.MjData(self.model)
             self._batch = mujoco.batch.Batch(self.model, self.size, self._threads, persistent=True)
             self._fields.clear()
@@ -108,9 +108,9 @@ class DataEngine:
         self.model = model
         self.data = mujoco.MjData(model)
         self.pace: Callable[[], bool] | None = None
-        """Advances it by a physics step, and says whether to continue; without it: `mj_step`."""
+        """Advances it by a physics step, and returns whether to continue; by default `mj_step`."""
         self.over = False
-        """Whether `pace` said that it is enough."""
+        """Whether `pace` asked to stop."""
 
     def field(self, name: str) -> AnyArray:
         """A live array of one row."""
@@ -134,7 +134,7 @@ class DataEngine:
                 return
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:  # noqa: ARG002
-        """Advance it, unseen, by one physics step for each of its controls."""
+        """Advance it by one physics step per control, without showing it."""
         for control in controls[0]:
             self.data.ctrl[:] = control
             mujoco.mj_step(self.model, self.data)
@@ -144,7 +144,7 @@ class DataEngine:
         mujoco.mj_forward(self.model, self.data)
 
     def copy(self, sources: IntArray) -> None:
-        """There is one row."""
+        """Nothing to copy: there is only one row."""
 
     def blown_up(self, ids: IntArray) -> BoolArray:  # noqa: ARG002
         """Whether its state is no longer a reasonable number."""

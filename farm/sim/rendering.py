@@ -1,6 +1,6 @@
-"""Pictures of a rollout by MuJoCo's own renderer, without a window; a door to mujoco.
+"""Pictures of a rollout by MuJoCo's own renderer, without a window.
 
-Where there is no display, MUJOCO_GL (osmesa or egl) has to be set before MuJoCo is imported.
+Without a display, MUJOCO_GL (osmesa or egl) has to be set before MuJoCo is imported.
 """
 
 import copy
@@ -23,10 +23,10 @@ BACKGROUND: Final = (0.94, 0.95, 0.96)
 
 _AMBIENT: Final = (0.45, 0.45, 0.45)
 _DIFFUSE: Final = (0.55, 0.55, 0.55)
-_FOG: Final = (3.0, 6.0)  # where fog begins and is complete, in distances of the camera from what it looks at
-_WALL: Final = 7.0  # where the background's wall stands: in complete fog
-_PAINT: Final = (213, 94, 0)  # of channels without colours
-_SMOOTH: Final = 2  # drawn so much larger, for smooth edges
+_FOG: Final = (3.0, 6.0)  # where fog begins and is complete, in distances from the camera to its target
+_WALL: Final = 7.0  # distance of the background's wall: in complete fog
+_PAINT: Final = (213, 94, 0)  # for channels without colours
+_SMOOTH: Final = 2  # factor of the size drawn, for smooth edges
 
 
 def pictures(
@@ -38,21 +38,21 @@ def pictures(
     channels: Sequence[Channel] = (),
     values: Mapping[str, FloatArray] | None = None,
 ) -> Iterator[Picture]:
-    """Draw moments of a rollout.
+    """Draw states of a rollout.
 
     Args:
       model: of the physics; it is not changed.
       qpos: (F, nq) positions.
       size: width and height [pixels].
-      camera: where the pictures are taken from; None: from beside what moves.
+      camera: point of view; None: from the side of the moving bodies.
       channels: of the task; geometries that scalars name in `geoms` are painted by their values.
       values: of these channels, by name, (F, n).
 
     Yields:
-      (height, width, 3), one for each moment.
+      (height, width, 3), one per state.
 
     Raises:
-      RunError: nothing can be drawn here.
+      RunError: MuJoCo cannot draw on this machine.
     """
     camera = camera or beside(Scene(model))
     painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
@@ -70,7 +70,7 @@ def pictures(
 
 
 def beside(scene: Scene) -> Camera:
-    """The camera of a scene without one: beside what moves, or at the middle of the scene if nothing does."""
+    """The default camera: looks at the moving bodies, or at the middle of the scene if nothing moves."""
     x, y, z = scene.model.stat.center.tolist() if scene.mover is None else scene.mover.centre
     return Camera(lookat=(x, y, z), distance=AWAY * scene.radius, azimuth=BESIDE[0], elevation=BESIDE[1])
 
@@ -78,7 +78,7 @@ def beside(scene: Scene) -> Camera:
 def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)) -> mujoco.MjModel:
     """A copy of a model with bright light, and fog of the background's colour; its physics is the same.
 
-    For a camera at that distance from what it looks at [m], and pictures of that size [pixels].
+    For a camera at that distance from its target [m], and pictures of that size [pixels].
     """
     model = copy.copy(model)
     look = model.vis
@@ -96,9 +96,9 @@ def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0
 def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # GLFW warns, and then fails
+            warnings.simplefilter("ignore")  # GLFW warns before it fails
             return mujoco.Renderer(model, size[1] * _SMOOTH, size[0] * _SMOOTH)
-    except Exception as error:  # each way of drawing fails in a way of its own
+    except Exception as error:  # each backend fails in its own way
         why = " ".join(str(error).split())[:60]
         raise RunError(
             f"MuJoCo cannot draw here ({type(error).__name__}: {why} ...): without a display, install libosmesa6 or "
@@ -126,7 +126,7 @@ def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
     mujoco.mjv_initGeom(
         wall, mujoco.mjtGeom.mjGEOM_BOX, sides, np.array(view.pos) + away * ahead, turned.ravel(), colour
     )
-    wall.category = mujoco.mjtCatBit.mjCAT_DECOR  # these throw no shadow
+    wall.category = mujoco.mjtCatBit.mjCAT_DECOR  # these cast no shadow
 
 
 def _paint(model: mujoco.MjModel, channel: Channel, values: FloatArray) -> None:
@@ -139,13 +139,13 @@ def _paint(model: mujoco.MjModel, channel: Channel, values: FloatArray) -> None:
 
 
 def _glow(share: float, colour: tuple[int, int, int]) -> list[float]:
-    """RGBA of a painted geometry, in [0, 1]: white at a share of 0, its colour from 1 on; the least above 0 shows."""
+    """RGBA of a painted geometry, in [0, 1]: white at share 0, its colour from 1 on; any share above 0 is visible."""
     mix = 0.45 + 0.55 * min(share, 1.0) if share > 0 else 0.0
     return [*((1.0 - mix) * 0.95 + mix * value / 255 for value in colour), 1.0]
 
 
 def _halved(picture: Picture) -> Picture:
-    """Each pixel the mean of those drawn for it."""
+    """Reduce a picture to its size: each pixel is the mean of those drawn for it."""
     height, width, _ = picture.shape
     parts = picture.reshape(height // _SMOOTH, _SMOOTH, width // _SMOOTH, _SMOOTH, 3)
     return np.asarray(parts.mean(axis=(1, 3)), dtype=np.uint8)

@@ -15,7 +15,7 @@ BESIDE: Final = (106.0, -25.0)
 """Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots walk along x."""
 
 AWAY: Final = 3.5
-"""Distance from which it is seen, in radii of what moves."""
+"""Distance from which it is seen, in radii of the moving part."""
 
 _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
@@ -26,8 +26,8 @@ _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
-_GROUPS: Final = 3  # MuJoCo's viewers hide the groups from this one on: mostly what only collides
-_UNPAINTED: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geometry that was given none
+_GROUPS: Final = 3  # MuJoCo's viewers hide the groups from this one on: mostly collision geometries
+_UNPAINTED: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geometry
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,19 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Mover:
-    """What moves in a scene, in the model's initial pose."""
+    """The moving part of a scene, in the model's initial pose."""
 
     centre: tuple[float, float, float]
     """Middle of the box around all that moves [m]."""
     radius: float
     """Half the box's diagonal [m]."""
     body: str
-    """The first body of it: the others mostly hang on it."""
+    """Its first body: the others are mostly attached to it."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled model, and what of it is drawn."""
+    """A compiled model, and its drawn parts."""
 
     model: mujoco.MjModel
 
@@ -98,7 +98,7 @@ class Scene:
 
     @property
     def radius(self) -> float:
-        """Radius of what moves, or of the whole scene if nothing does [m]."""
+        """Radius of the moving part, or of the whole scene if nothing moves [m]."""
         return float(self.model.stat.extent) if self.mover is None else self.mover.radius
 
     @cached_property
@@ -121,10 +121,10 @@ class Scene:
         return self.bodies.index(name)
 
     def poses(self, qpos: FloatArray) -> FloatArray:
-        """Where the drawn bodies are.
+        """Poses of the drawn bodies.
 
         Args:
-          qpos: (F, nq) positions, one row a frame.
+          qpos: (F, nq) positions, one row per frame.
 
         Returns:
           (F, B, 7): position [m] and quaternion wxyz of each of `bodies`, in the world.
@@ -142,7 +142,7 @@ class Scene:
         bodies = dict(zip(self._drawn, self.bodies, strict=True))
         model = self.model
         known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
-        shown = [i for i in known if model.geom_group[i] < _GROUPS] or known  # rather the hidden ones than nothing
+        shown = [i for i in known if model.geom_group[i] < _GROUPS] or known  # draw the hidden ones rather than nothing
         geoms = [model.geom(i) for i in shown]
         return [
             Geometry(
@@ -170,7 +170,7 @@ class Scene:
         }
 
     def _colour(self, i: int) -> FloatArray:
-        """A geometry's own colour, else its material's, as MuJoCo's renderer has it (4,)."""
+        """A geometry's own colour, or its material's, as in MuJoCo's renderer (4,)."""
         own, material = self.model.geom_rgba[i], int(self.model.geom_matid[i])
         if material < 0 or not np.allclose(own, _UNPAINTED) or (self.model.mat_texid[material] >= 0).any():
             return own
@@ -190,13 +190,13 @@ def compiled(mjcf: str, name: str) -> mujoco.MjModel:
     """Compile an MJCF text that needs no other file.
 
     Raises:
-      ConfigError: MuJoCo refuses it; `name` says in the message whose it is.
+      ConfigError: MuJoCo refuses it; `name` names the model in the message.
     """
     try:
         model = mujoco.MjModel.from_xml_string(mjcf)
     except (ValueError, mujoco.FatalError) as error:
         raise ConfigError(f"{name}: MuJoCo refuses the model: {brief(str(error))}") from None
-    # A state that has blown up stays visible, so that its rollout is reported as failed.
+    # An unstable state is not reset, so that its rollout is reported as failed.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
 
@@ -204,7 +204,7 @@ def compiled(mjcf: str, name: str) -> mujoco.MjModel:
 def quiet() -> None:
     """Keep MuJoCo's warnings from the terminal and from a MUJOCO_LOG.TXT in the user's folder.
 
-    A rollout whose physics blows up is reported as failed; process-wide, as MuJoCo's setting is.
+    A rollout whose simulation becomes unstable is reported as failed; MuJoCo's setting is process-wide.
     """
     config = mujoco.MjLogConfig.get()
     config.logto_console = config.logto_file = False

@@ -1,11 +1,11 @@
-"""A batch of simulations as named live arrays: all that a task sees of a simulator.
+"""A batch of simulations as named live arrays: a task's only access to the simulator.
 
-    sim.qpos          (B, nq), sim.sensordata, sim.xpos ... as MjData names them, of the rollouts still going
-    sim.own["goal"]   (B, ...), what the task remembers of each of them
+    sim.qpos          (B, nq), sim.sensordata, sim.xpos ... with MjData's names, of the active rollouts
+    sim.own["goal"]   (B, ...), the task's own memory for each of them
     sim.t             control steps done
-    sim.expand("geom_friction")   a field of the model with values of its own for each rollout
+    sim.expand("geom_friction")   a field of the model with separate values for each rollout
 
-While a rollout is brought to its start the arrays are views that can be written; afterwards they are read-only.
+While a rollout is prepared the arrays are writable views; afterwards they are read-only.
 """
 
 from collections.abc import Callable
@@ -18,28 +18,28 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
 
 LIMIT = 1e8
-"""A state beyond it has blown up, finite or not."""
+"""States beyond this count as unstable, finite or not."""
 
 
 class Rebound(Exception):  # noqa: N818  not an error
-    """An output of the simulator was asked for the first time: the batch begins again, now with its values."""
+    """An output of the simulator was requested for the first time: the batch is restarted, now with its values."""
 
 
 class Engine(Protocol):
-    """What simulates: rows of states of one model. A backend makes it, or a task brings its own."""
+    """Simulates rows of states of one model. Made by a backend, or by the task itself."""
 
     model: mujoco.MjModel
     size: int
     """Rows."""
 
     def field(self, name: str) -> AnyArray:
-        """A live array over all rows, (size, ...), by its name in MjData; read-only where it is an output.
+        """A live array over all rows, (size, ...), by its name in MjData; outputs are read-only.
 
-        Raises Rebound where its values are there only after the next call, AttributeError where there is none.
+        Raises Rebound if its values exist only after the next call, AttributeError if there is no such array.
         """
 
     def reset(self, ids: IntArray) -> None:
-        """Bring rows to the model's own start."""
+        """Reset rows to the model's initial state."""
 
     def step(self, ids: IntArray, count: int) -> None:
         """Advance rows by physics steps."""
@@ -57,7 +57,7 @@ class Engine(Protocol):
         """Rows whose state is no longer a reasonable number, (n,)."""
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
-        """MuJoCo's cfrc_ext of rows as their last step left it, (n, nbody, 6); may raise Rebound as `field` does."""
+        """MuJoCo's cfrc_ext of rows after their last step, (n, nbody, 6); may raise Rebound like `field`."""
 
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row, live, (size, ...)."""
@@ -66,19 +66,19 @@ class Engine(Protocol):
         """Update derived constants after writes to expanded fields."""
 
     def close(self) -> None:
-        """Give back what it holds."""
+        """Release its resources."""
 
 
 class Backend(Protocol):
-    """What a worker simulates with, made without arguments: engines for models."""
+    """Makes a worker's engines for models; constructed without arguments."""
 
     capacity: ClassVar[int]
-    """Rollouts that are worth having at a time."""
+    """Number of rollouts that are worth simulating at a time."""
     exact: ClassVar[bool]
     """Whether its numbers are those of the backend `cpu` to the last bit; true where a class does not say."""
 
     def engine(self, model: mujoco.MjModel) -> Engine:
-        """Make room for a model's simulations."""
+        """Make an engine for this many simulations of a model."""
 
 
 _ATTRIBUTES = ("engine", "own", "t")
@@ -90,10 +90,10 @@ class Sim:
     """A batch of rollouts in an engine."""
 
     def __init__(self, engine: Engine) -> None:
-        """Take an engine; `begin` comes next."""
+        """Use an engine; call `begin` next."""
         self.engine = engine
         self.own: dict[str, AnyArray] = {}
-        """What the task remembers of each rollout, (B, ...); rows stay with their rollouts when other rollouts end."""
+        """The task's memory for each rollout, (B, ...); rows stay with their rollouts when other rollouts end."""
         self.t = 0
         """Control steps done."""
         self._ids: IntArray = np.arange(0)
@@ -120,7 +120,7 @@ class Sim:
             return known
         values = self.engine.field(name)
         if self._live:
-            if not values.flags.writeable and not self._stepped:  # somebody may have written states
+            if not values.flags.writeable and not self._stepped:  # states may have been written
                 self._constants()
                 self.engine.forward(self._ids)
             return values[: len(self)]
@@ -129,7 +129,7 @@ class Sim:
 
     def __setattr__(self, name: str, value: object) -> None:
         if name not in _ATTRIBUTES and not name.startswith("_"):
-            raise AttributeError(f"sim.{name} is written in place: sim.{name}[:] = ...; memory belongs in sim.own")
+            raise AttributeError(f"sim.{name} is written in place: sim.{name}[:] = ...; keep your values in sim.own")
         super().__setattr__(name, value)
 
     def _rows(self, values: AnyArray) -> AnyArray:
@@ -152,16 +152,16 @@ class Sim:
         self._dirty = bool(self._expanded)
 
     def start(self, sources: IntArray) -> None:
-        """End the preparation: B rollouts, each from where the prepared one of number sources[i] stands.
+        """End the preparation: B rollouts; rollout i starts in the state of the prepared one sources[i].
 
         Raises:
-          TaskError: what the task remembers is no array of them.
+          TaskError: an entry of `own` is not an array with one row per rollout.
         """
         for name, values in self.own.items():
             if not isinstance(values, np.ndarray) or np.shape(values)[:1] != (len(self),):
                 got = f"shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
                 raise TaskError(f"sim.own[{name!r}] is {got}; expected an array of shape ({len(self)}, ...)")
-        self._dirty = bool(self._expanded)  # somebody may have written since outputs were read
+        self._dirty = bool(self._expanded)  # states may have been written since outputs were read
         shared = len(sources) != len(self._ids) or (sources != self._ids).any()
         if not (shared and self._stepped):
             self._constants()
@@ -205,7 +205,7 @@ class Sim:
         self.engine.play(self._ids, np.broadcast_to(controls, (len(self), *controls.shape)))
 
     def contact_forces(self) -> FloatArray:
-        """Forces of contacts on every body as the last physics step left them (MuJoCo's cfrc_ext), (B, nbody, 6)."""
+        """Contact forces on every body after the last physics step (MuJoCo's cfrc_ext), (B, nbody, 6)."""
         known = self._now.get("contact_forces")
         if known is None:
             known = self._now["contact_forces"] = self.engine.contact_forces(self._ids)
@@ -227,7 +227,7 @@ class Sim:
         return self.engine.blown_up(self._ids)
 
     def keep(self, going: BoolArray) -> None:
-        """Let go of the rollouts that are over, (B,)."""
+        """Remove the finished rollouts, (B,)."""
         self._ids, self._now = self._ids[going], {}
         self.own = {name: values[going] for name, values in self.own.items()}
 

@@ -1,4 +1,4 @@
-"""One rollout as it is shown: where everything was, what was done and what was felt, frame by frame. Pure."""
+"""One rollout as it is displayed: poses, actions, rewards and channels, frame by frame. Pure data."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ class Trajectory:
     """
 
     times: FloatArray
-    """Since the start [s], (F,)"""
+    """Time since the start [s], (F,)"""
     bodies: FloatArray
     """Position [m] and quaternion wxyz of each drawn body in the world, (F, B, 7)"""
     actions: FloatArray
@@ -26,7 +26,7 @@ class Trajectory:
     terms: FloatArray
     """Reward terms of the control step that led there, (F, K); zero at the start"""
     channels: Mapping[str, FloatArray]
-    """What the task's channels show, by name, (F, *shape)"""
+    """Values of the task's channels by name, (F, *shape)"""
     value: float
     """The rollout's return"""
     success: bool | None

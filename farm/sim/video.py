@@ -12,7 +12,7 @@ from farm.errors import ConfigError, writing
 from farm.sim.rendering import Picture
 
 FRAMES: Final = 30
-"""Pictures a second, about: a gif counts time in hundredths of a second."""
+"""Approximate pictures per second: a gif counts time in hundredths of a second."""
 
 SIZE: Final = (480, 360)
 """Width and height [pixels]."""
@@ -22,7 +22,7 @@ _COLOURS: Final = 256  # of a gif
 
 
 def check(path: Path) -> None:
-    """Check that a video can be written there: a ConfigError says what of suffix, package or folder is wrong."""
+    """Check suffix, package and folder of a video; raises ConfigError if it cannot be written."""
     if path.suffix not in _NEEDS:
         raise ConfigError(f"--video {path}: expected a name that ends in {' or '.join(_NEEDS)}")
     package, name = _NEEDS[path.suffix]
@@ -37,7 +37,7 @@ def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:
 
     Args:
       times: of the frames [s], rising, evenly spaced.
-      speed: seconds of the rollout in a second of the video.
+      speed: seconds of the rollout per second of the video.
       rest: how long the last frame stays [s].
     """
     span = times[-1] - times[0]
@@ -47,7 +47,7 @@ def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:
 
 
 def tiled(pictures: Sequence[Picture]) -> Picture:
-    """Pictures of one size in a grid that is as wide as high or one wider, row by row; what is left over is white."""
+    """Pictures of one size in a grid, row by row, as wide as high or one wider; unused cells are white."""
     wide = math.ceil(math.sqrt(len(pictures)))
     white = [np.full_like(pictures[0], 255)] * (-len(pictures) % wide)
     cells = [*pictures, *white]
@@ -69,12 +69,12 @@ def _gif(path: Path, pictures: list[Picture]) -> None:
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
-    # One palette for all, made of pictures from the whole video: colours do not flicker, and what rests costs nothing.
+    # One palette for all pictures: colours do not flicker, and parts that do not change take no space.
     some = images[:: max(1, len(images) // 8)]
     sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
     for i, image in enumerate(some):
         sheet.paste(image, (0, i * image.height))
-    # Half of its colours are the frequent ones, half are chosen so that rare ones, a painted geometry's, are there.
+    # Half of it are frequent colours; the other half covers rare ones, such as a painted geometry's.
     ways = (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)
     halves = [(sheet.quantize(_COLOURS // 2, way).getpalette() or [])[: 3 * (_COLOURS // 2)] for way in ways]
     palette = Image.new("P", (1, 1))

@@ -34,11 +34,11 @@ def watch(
     Args:
       model: what is simulated; its look may be changed.
       play: runs one rollout in a simulation that is shown, and returns the control steps it lasted.
-      wait: sleeps so many seconds; true when it is time to end.
-      say: told how the first rollout went.
-      camera: where it is seen from; without: MuJoCo's own.
+      wait: sleeps this number of seconds; true when it is time to end.
+      say: called with a message after the first rollout.
+      camera: point of view; by default MuJoCo's own.
       speed: 1 is real time.
-      hold: how long the scene rests after a rollout [s].
+      hold: pause after a rollout [s].
 
     Returns:
       control steps played.
@@ -60,7 +60,7 @@ def watch(
         while clock.going:
             steps = play(Sim(engine))
             if not played:
-                say(f"the first rollout is over after {steps} control steps, others follow")
+                say(f"the first rollout ended after {steps} control steps, and is repeated")
             played += steps
             for _ in range(round(hold / model.opt.timestep)):
                 if not clock.step():
@@ -71,7 +71,7 @@ def watch(
 
 
 class _Clock:
-    """Steps the physics at the speed that is wanted, with the mouse's pushes."""
+    """Steps the physics at the requested speed, with forces from the mouse."""
 
     def __init__(
         self, viewer: mujoco.viewer.Handle, data: mujoco.MjData, wait: Callable[[float], bool], period: float
@@ -95,7 +95,7 @@ class _Clock:
 
 
 def _check_window() -> None:
-    """Check that a window can be opened: the viewer's own thread would fail without a word."""
+    """Check that a window can be opened: the viewer's own thread would fail silently."""
     import glfw
 
     with warnings.catch_warnings(record=True) as said:
@@ -109,4 +109,4 @@ def _check_window() -> None:
             glfw.terminate()
     if not window:
         why = f": {' '.join(str(said[-1].message).split())}" if said else ""
-        raise RunError(f"cannot open a window{why}. Look at DISPLAY, or draw without one: farm replay RUN --video")
+        raise RunError(f"cannot open a window{why}. Check DISPLAY, or draw without one: farm replay RUN --video")

@@ -1,1 +1,1 @@
-"""Tasks: what is simulated, what a policy sees and does, and what that is worth."""
+"""Tasks: the simulation, the policy's observations and actions, and the reward."""

@@ -1,4 +1,4 @@
-"""What a task is: one class in one file, and what everybody else may know of it."""
+"""The base class of tasks, and the specification that other code knows of a task."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class TaskConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TaskSpec:
-    """What both sides must know of a task before anything is simulated."""
+    """What learner and workers must know of a task before anything is simulated."""
 
     observation: int
     """Length d of the observation x."""
@@ -47,13 +47,13 @@ class TaskSpec:
     period: float
     """A control step [s]."""
     terms: tuple[str, ...] = ("reward",)
-    """What a reward is made of."""
+    """Names of the reward's terms."""
     success: bool = False
     """Whether a rollout can succeed; otherwise there are only returns."""
     channels: tuple[Channel, ...] = ()
-    """What a rollout shows."""
+    """Channels that a rollout shows."""
     release: str = ""
-    """Release of the package that the task comes from; empty for the farm's own and for files."""
+    """Release of the task's package; empty for the farm's own and for files."""
 
     def shapes(self, bodies: int) -> dict[str, tuple[int, ...]]:
         """Shape of a frame of each of a trajectory's arrays, by the names of `Trajectory.arrays`."""
@@ -78,18 +78,18 @@ class Record:
     frames: Mapping[str, FloatArray]
     """What `Task.measure` gave after each step, (B, T, ...)"""
     start: Mapping[str, FloatArray]
-    """And at the start, (B, ...)"""
+    """The same at the start, (B, ...)"""
     actions: FloatArray
     """(B, T, A)"""
     steps: IntArray
-    """Control steps each lasted, its last included, (B,)"""
+    """Control steps of each including its last, (B,)"""
     failed: BoolArray
-    """Whether the physics blew up in the last of them, (B,)"""
+    """Whether the simulation became unstable in the last of them, (B,)"""
 
 
 @dataclass(frozen=True)
 class Score:
-    """What rollouts are worth."""
+    """Scores of whole rollouts."""
 
     terms: FloatArray
     """Reward terms, zero after the end, (B, T, K)"""
@@ -117,15 +117,15 @@ class Task:
     channels: tuple[Channel, ...] = ()
     """What a rollout shows in addition to bodies, actions and reward terms."""
     camera: Camera | None = None
-    """Where pictures are taken from; without: from beside what moves."""
+    """Point of view of pictures; by default from the side of the moving bodies."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"default": {}}
     """Settings that runs start from, by preset and flag; the first preset is the default."""
     return_scale: float = 1.0
     """Factor of the return."""
     parts: tuple[int, ...] = ()
-    """Sizes of the observation's parts where they differ in kind; empty: it is one."""
+    """Sizes of the observation's parts if they differ in kind; empty: one part."""
     ends: tuple[str, str] | None = None
-    """Names of where rollouts begin and of where they should end; with `reached` and `lost` they can be chained."""
+    """Names of the states in which rollouts begin and should end; with `reached` and `lost` policies can be chained."""
     ending: ClassVar[str] = "ended"
     """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` if it is "dropped"."""
     takes: ClassVar[str] = ""
@@ -142,7 +142,7 @@ class Task:
         self.sources: Mapping[str, str] = self.files() if files is None else files
         self._model: mujoco.MjModel | None = None
 
-    # What is simulated
+    # Simulation
 
     def files(self) -> dict[str, str]:
         """Texts that decide numbers and are sent with a run, by name."""
@@ -168,21 +168,21 @@ class Task:
         return self.sources["model.xml"]
 
     def engine(self, backend: "MakeEngine") -> "Engine":
-        """What simulates: the backend's engine for the model, unless the task brings one."""
+        """The simulation engine: the backend's for the model, unless the task has its own."""
         return backend(self.model)
 
     def setup(self, sim: "Sim") -> None:
-        """Simulate what all rollouts need and none changes, once, before the first of them."""
+        """Compute once, before the first rollout, what all rollouts need and none changes."""
 
     # A rollout
 
     def prepare(self, sim: "Sim", rngs: Sequence[np.random.Generator | None]) -> None:
-        """Bring every rollout of the batch to its start; one generator each, None for nominal conditions."""
+        """Prepare the start of every rollout of the batch; one generator each, None for nominal conditions."""
         for row, rng in enumerate(rngs):
             self.reset(sim, row, rng)
 
     def reset(self, sim: "Sim", row: int, rng: np.random.Generator | None) -> None:
-        """Bring one rollout to its start, from the model's own; `rng` is its own, None for nominal conditions."""
+        """Prepare one rollout's start from the model's initial state; `rng` is its own, None for nominal conditions."""
 
     def observe(self, sim: "Sim") -> FloatArray:
         """What the policy sees, (B, d); qpos and qvel unless overridden."""
@@ -206,7 +206,7 @@ class Task:
         return None
 
     def reached(self, sim: "Sim") -> BoolArray:
-        """In which rollouts the end that `ends` names is there now, (B,): the next policy of a chain may act."""
+        """Which rollouts have reached the end named in `ends`, (B,): the next policy of a chain may act."""
         raise NotImplementedError
 
     def lost(self, sim: "Sim") -> BoolArray:
@@ -214,7 +214,7 @@ class Task:
         raise NotImplementedError
 
     def measure(self, sim: "Sim") -> dict[str, FloatArray]:  # noqa: ARG002
-        """What is kept of every frame, (B, ...) each: values of channels, or what `score` and `show` need."""
+        """Values kept of every frame, (B, ...) each: those of channels, or those that `score` and `show` need."""
         return {}
 
     # Whole rollouts
@@ -231,7 +231,7 @@ class Task:
         """What an exported policy needs in addition to model, policy and start: arrays, numbers and texts, by name."""
         return {}
 
-    # What others know of it
+    # What other code knows of it
 
     @property
     def limits(self) -> tuple[FloatArray, FloatArray]:
@@ -246,20 +246,20 @@ class Task:
         return float(self.model.opt.timestep) * self.substeps
 
     def spec(self) -> TaskSpec:
-        """What both sides must know; found by looking at one rollout's start unless overridden."""
+        """The task's specification; found from one rollout's start unless overridden."""
         from farm.tasks.loop import probe
 
         return probe(self)
 
 
 def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Raw actions (B, A) between limits: -1 is the least, 1 the greatest; beyond is clipped, nan is the middle."""
+    """Scale raw actions (B, A) to the limits: -1 is the lowest, 1 the highest; clipped beyond, nan is the middle."""
     part = np.minimum(np.maximum(action, -1.0), 1.0)
     part[np.isnan(part)] = 0.0
     return low + (high - low) * (0.5 * (part + 1.0))
 
 
 def flat(channels: Sequence[Channel], values: Mapping[str, AnyArray]) -> AnyArray:
-    """Channels' values (..., *shape) side by side as float32, (..., K): a trace."""
+    """Concatenate the channels' values (..., *shape) as float32, (..., K): a trace."""
     parts = [values[c.name].reshape(*values[c.name].shape[: -len(c.shape)], -1) for c in channels]
     return np.concatenate(parts, axis=-1).astype("<f4")

@@ -1,7 +1,7 @@
-"""MuJoCo environments of Gymnasium as tasks, by name: `--task gym:Swimmer-v5`. A door to gymnasium.
+"""MuJoCo environments of Gymnasium as tasks, by name: `--task gym:Swimmer-v5`.
 
-Only registered names are taken: one that names a module to import (`module:Name-v0`) is refused. An environment
-steps its own simulation, so this task brings an engine of its own; those of `gymnasium_batched.py` are stepped in a
+Only registered names are accepted: a name with a module to import (`module:Name-v0`) is refused. An environment
+steps its own simulation, so this task has its own engine; environments in `gymnasium_batched.py` are stepped in a
 batch by the backend, with the same numbers.
 """
 
@@ -116,7 +116,7 @@ class Environment(Task):
         return make(self.variant, **self.config.arguments)
 
     def _horizon(self) -> int:
-        wanted, _ = self.config.steps, self._first  # made first: it says what is wrong with the name
+        wanted, _ = self.config.steps, self._first  # made first: it reports errors in the name
         import gymnasium
 
         own = gymnasium.spec(self.variant).max_episode_steps
@@ -157,19 +157,19 @@ class Environment(Task):
         )  # fmt: skip
 
     def engine(self, backend: MakeEngine) -> Engine:
-        """The backend's engine, or one of environments that step themselves."""
+        """The backend's engine, or an engine of environments that step themselves."""
         if self.batched is not None:
             return backend(self.model)
         return EnvironmentEngine(self.variant, **self.config.arguments)
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
-        """Reset each environment with a seed of its own."""
+        """Reset each environment with its own seed."""
         for row, rng in enumerate(rngs):
             seed = reset_seed(rng)
             if self.batched is None:
                 assert isinstance(sim.engine, EnvironmentEngine)
                 sim.engine.seed(row, seed)
-            else:  # Gymnasium makes its generators so
+            else:  # as in Gymnasium
                 sim.qpos[row], sim.qvel[row] = self.batched.start(np.random.default_rng(seed))
 
     def observe(self, sim: Sim) -> FloatArray:
@@ -188,11 +188,11 @@ class Environment(Task):
         if self.batched is None:
             values: FloatArray = sim.reward
             return values
-        with np.errstate(all="ignore"):  # of a state that has blown up
+        with np.errstate(all="ignore"):  # of an unstable state
             return self.batched.reward(sim, sim.own["before"])
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where the environment terminated, (B,)."""
+        """Which environments terminated, (B,)."""
         return np.asarray(sim.terminated) if self.batched is None else self.batched.ended(sim)
 
 
@@ -210,12 +210,12 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
     quiet()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there is a newer version, mostly
+            warnings.simplefilter("ignore")  # mostly about newer versions
             env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **arguments)
-            if arguments:  # a value that it cannot do with shows when it acts
+            if arguments:  # an unusable value may fail only in a step
                 env.reset(seed=NOMINAL)
                 env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
-    except Exception as error:  # whatever an environment may raise
+    except Exception as error:  # an environment may raise anything
         raise ConfigError(f"task gym:{name}: {' '.join(str(error).split())}") from None
     space, actions = env.observation_space, env.action_space
     if not isinstance(env.unwrapped, MujocoEnv):
@@ -229,7 +229,7 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
 
 
 class EnvironmentEngine:
-    """Environments side by side, one for each row; each steps its own simulation."""
+    """One environment per row; each steps its own simulation."""
 
     def __init__(self, name: str, **arguments: Any) -> None:  # noqa: ANN401  whatever an environment takes
         """Make the first environment; more are made as they are needed."""
@@ -295,11 +295,11 @@ class EnvironmentEngine:
                 self.seed(row, seed)
 
     def blown_up(self, ids: IntArray) -> BoolArray:
-        """Where the physics blew up, or a number is not finite."""
+        """Which simulations became unstable or have a number that is not finite."""
         return self._bad[ids]
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
-        """An environment observes them itself."""
+        """Not available: an environment observes them itself."""
         raise NotImplementedError
 
     def expand(self, name: str) -> AnyArray:
@@ -307,7 +307,7 @@ class EnvironmentEngine:
         raise NotImplementedError(name)
 
     def set_const(self, ids: IntArray) -> None:
-        """There are no derived constants."""
+        """Nothing to do: there are no derived constants."""
 
     def close(self) -> None:
         """Close the environments."""

@@ -1,9 +1,9 @@
 """Starts, observations, rewards and ends of Gymnasium's MuJoCo environments, for a batch of rollouts at once.
 
-The environment itself steps one simulation at a time. Where its model is stepped in a batch instead, this is what it
-adds to the physics. Settings are read from an environment that was made with the run's arguments. Each class does what
-the environment of its name does in release 5 (gymnasium/envs/mujoco/NAME_v5.py, Farama Foundation), in its order and
-precision: actions count in single precision. Its sines, cosines and lengths may differ in the last bit.
+An environment steps one simulation at a time. Here the backend steps its model in a batch, and these classes compute
+the rest. Settings are read from an environment made with the run's arguments. Each class computes the same as the
+environment of its name in release 5 (gymnasium/envs/mujoco/NAME_v5.py, Farama Foundation), in its order and
+precision: actions are in single precision. Sines, cosines and lengths may differ in the last bit.
 """
 
 from collections.abc import Mapping
@@ -17,14 +17,14 @@ from farm.sim.sim import Sim
 
 
 class Batched:
-    """What an environment adds to its physics; B rollouts."""
+    """An environment without its physics; B rollouts."""
 
     hidden = 0
     """Positions that an observation leaves out by default."""
     most = np.inf
     """Limit of the observed velocities."""
     normal = False
-    """Whether first velocities are normal; else uniform."""
+    """Whether initial velocities are drawn from a normal distribution, not a uniform one."""
 
     def __init__(self, env: Any) -> None:  # noqa: ANN401  an unwrapped environment
         """Take its settings."""
@@ -33,7 +33,7 @@ class Batched:
         self.left_out = self.hidden * bool(getattr(env, "_exclude_current_positions_from_observation", False))
 
     def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """First positions (nq,) and velocities (nv,)."""
+        """Initial positions (nq,) and velocities (nv,)."""
         scale = self.env._reset_noise_scale
         qpos = self.qpos + rng.uniform(-scale, scale, self.model.nq)
         if self.normal:
@@ -41,7 +41,7 @@ class Batched:
         return qpos, self.qvel + rng.uniform(-scale, scale, self.model.nv)
 
     def before(self, sim: Sim) -> FloatArray:
-        """What `reward` compares with, of the moment before a control step, (B, ...)."""
+        """Values before a control step that `reward` compares with, (B, ...)."""
         return np.array(sim.qpos)
 
     def observe(self, sim: Sim) -> FloatArray:
@@ -49,7 +49,7 @@ class Batched:
         return np.concatenate([sim.qpos[:, self.left_out :], np.clip(sim.qvel, -self.most, self.most)], axis=1)
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
-        """The reward of the control step that just ended, with what `before` gave before it, (B,)."""
+        """The reward of the control step that just ended; `before` has the values from before it, (B,)."""
         forward: FloatArray = self.env._forward_reward_weight * ((sim.qpos[:, 0] - before[:, 0]) / self.env.dt)
         return forward - self.env._ctrl_cost_weight * self.effort(sim)
 
@@ -59,7 +59,7 @@ class Batched:
         return np.square(action).sum(axis=1)
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where the environment terminates, (B,)."""
+        """Which rollouts the environment terminates, (B,)."""
         return np.zeros(len(sim), dtype=bool)
 
 
@@ -117,7 +117,7 @@ class Ant(Batched):
         self.main = env.data.body(env._main_body).id
 
     def before(self, sim: Sim) -> FloatArray:
-        """Where its main body is, (B, 2)."""
+        """Position of its main body, (B, 2)."""
         return np.array(sim.xpos[:, self.main, :2])
 
     def observe(self, sim: Sim) -> FloatArray:
@@ -161,7 +161,7 @@ class Humanoid(Ant):
         Batched.__init__(self, env)
 
     def before(self, sim: Sim) -> FloatArray:
-        """Where its centre of mass is, (B, 2)."""
+        """Position of its centre of mass, (B, 2)."""
         return self.centre(sim)
 
     def centre(self, sim: Sim) -> FloatArray:
@@ -225,7 +225,7 @@ class InvertedDoublePendulum(Batched):
         return np.concatenate(parts, axis=1)
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
-        """A bonus for standing, less how far the tip is from where it should be, and the speeds."""
+        """A bonus for standing, minus the tip's distance from its target and the speeds."""
         x, y = sim.site_xpos[:, 0, 0], sim.site_xpos[:, 0, 2]
         v1, v2 = sim.qvel[:, 1], sim.qvel[:, 2]
         bonus = self.env._healthy_reward * ~self.ended(sim)
@@ -256,7 +256,7 @@ class Reacher(Batched):
         return np.concatenate(parts, axis=1)
 
     def way(self, sim: Sim, to: str, start: str) -> FloatArray:
-        """The way from one body to another [m], (B, 3)."""
+        """The vector from one body to another [m], (B, 3)."""
         way: FloatArray = sim.xpos[:, self.model.body(to).id] - sim.xpos[:, self.model.body(start).id]
         return way
 
@@ -316,7 +316,7 @@ def _length(vectors: FloatArray) -> FloatArray:
 
 
 def _drawn(draw: Any, fits: Any) -> FloatArray:  # noqa: ANN401  functions
-    """The first of the drawn points (2,) whose distance from 0 fits."""
+    """The first of the drawn points (2,) whose distance from 0 is accepted."""
     while True:
         point: FloatArray = draw()
         if fits(np.sqrt((point * point).sum())):

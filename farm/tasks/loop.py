@@ -22,17 +22,17 @@ from farm.sim.trajectory import Trajectory
 from farm.tasks.base import STEPS_LIMIT, Record, Task, TaskSpec, flat
 
 RETURN_FLOOR: Final = -1e12
-"""A return that overflows, or is of a rollout that failed, counts as this: it must never look good."""
+"""The return of a rollout that overflowed or failed: it must never look good."""
 
 Seed = tuple[int, ...] | None
-"""What a rollout's random numbers are drawn from; None for nominal conditions."""
+"""Seed of a rollout's random numbers; None for nominal conditions."""
 
 
 class Acts(Protocol):
-    """What the loop needs of a policy."""
+    """The methods that the loop needs from a policy."""
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """What of the parameters (B, P) does not change during a rollout, (B, ...)."""
+        """Compute from the parameters (B, P) what stays constant during a rollout, (B, ...)."""
         ...
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -42,30 +42,30 @@ class Acts(Protocol):
 
 @dataclass(frozen=True)
 class Rollouts:
-    """B rollouts that are over; T control steps, F frames: T, or T x substeps at physics rate."""
+    """B finished rollouts; T control steps, F frames: T, or T x substeps at physics rate."""
 
     returns: FloatArray
     """(B,)"""
     success: BoolArray
     """(B,); false if the task does not define success"""
     ended: BoolArray
-    """(B,) the task ended it before its last step."""
+    """(B,) whether the task ended it before its last step"""
     failed: BoolArray
-    """(B,) the physics blew up."""
+    """(B,) whether the simulation became unstable"""
     clamped: BoolArray
-    """(B,) the return overflowed."""
+    """(B,) whether the return overflowed"""
     steps: IntArray
-    """(B,) control steps until the end, the last one included."""
+    """(B,) control steps until the end, including the last one"""
     terms: FloatArray
     """(B, T, K), zero after the end."""
     actions: FloatArray
     """(B, T, A), zero after the end."""
     start: Mapping[str, FloatArray]
-    """What was measured at the start, and qpos, (B, ...)."""
+    """Measured values at the start, and qpos, (B, ...)."""
     frames: Mapping[str, FloatArray]
-    """And in every frame, zero after the end, (B, F, ...)."""
+    """The same in every frame, zero after the end, (B, F, ...)."""
     moments: FloatArray
-    """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) where they were not asked for."""
+    """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) if not requested."""
 
     @property
     def flags(self) -> BoolArray:
@@ -74,25 +74,25 @@ class Rollouts:
 
     @staticmethod
     def joined(parts: Sequence["Rollouts"]) -> "Rollouts":
-        """Rollouts of one task, one part after the other."""
+        """Concatenate rollouts of one task."""
         return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
 
     def at(self, rows: slice | IntArray) -> "Rollouts":
-        """Some of them."""
+        """Select some rollouts."""
         return _each(lambda values: values[rows], self)
 
 
 class Batch:
-    """Rollouts of one task that are stepped together, whatever decides the actions."""
+    """Rollouts of one task that are stepped together, independent of how actions are chosen."""
 
     def __init__(self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0) -> None:
-        """Bring them to their starts; rollouts of equal seeds share one.
+        """Prepare their starts; rollouts with equal seeds share one.
 
         Args:
-          task: what is simulated; its `setup` is done.
-          sim: where.
-          seeds: one each.
-          every: physics steps between two frames; 0: one frame each control step.
+          task: the task; its `setup` is done.
+          sim: the simulations.
+          seeds: one per rollout.
+          every: physics steps between two frames; 0: one frame per control step.
         """
         self.task, self.sim = task, sim
         self._parts = task.substeps // (every or task.substeps)
@@ -102,7 +102,7 @@ class Batch:
         task.prepare(sim, [None if seed is None else np.random.default_rng(seed) for seed in unique])
         sim.start(np.array([unique.index(seed) for seed in seeds]))
         count, self.active = len(seeds), np.arange(len(seeds))
-        self._start = {name: np.array(values) for name, values in self._measured().items()}  # they are live
+        self._start = {name: np.array(values) for name, values in self._measured().items()}  # the originals are live
         frames = (count, task.steps * self._parts)
         self._frames = {name: np.zeros((*frames, *values.shape[1:])) for name, values in self._start.items()}
         self._actions: FloatArray | None = None
@@ -113,13 +113,13 @@ class Batch:
         self._failed, self._ended, self._success = (np.zeros(count, dtype=bool) for _ in range(3))
 
     def observe(self) -> FloatArray:
-        """What the policy sees of the rollouts still going, (n, d)."""
+        """Observations of the active rollouts, (n, d)."""
         x = self.task.observe(self.sim)
         self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
         return _array("observe", x, (len(self.sim), self._width))
 
     def step(self, action: FloatArray) -> None:
-        """One control step of the rollouts still going: raw actions (n, A)."""
+        """One control step of the active rollouts, with raw actions (n, A)."""
         task, sim, t = self.task, self.sim, self.sim.t
         if self._actions is None:
             self._actions = np.zeros((len(self._steps), task.steps, action.shape[1]))
@@ -138,11 +138,11 @@ class Batch:
         self._conclude(failed, ended & ~failed, t)
 
     def _rows(self) -> slice | IntArray:
-        """The rollouts still going; a slice is the fastest where they are all."""
+        """Indices of the active rollouts; a slice, which is faster, if all are active."""
         return slice(None) if len(self.active) == len(self._steps) else self.active
 
     def _measured(self) -> dict[str, FloatArray]:
-        """What is kept of this frame, (n, ...) each."""
+        """The values kept of this frame, (n, ...) each."""
         count, given = len(self.sim), self.task.measure(self.sim)
         if not isinstance(given, dict):
             raise TaskError(f"measure gave a {type(given).__name__}; expected arrays by name")
@@ -150,7 +150,7 @@ class Batch:
         return {"qpos": self.sim.qpos, **own}
 
     def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> None:
-        """Note the reward terms of a control step, unless whole rollouts are scored."""
+        """Store the reward terms of a control step, unless whole rollouts are scored."""
         if scores(self.task):
             return
         given = self.task.reward(self.sim, action)
@@ -170,7 +170,7 @@ class Batch:
         self._terms[self._rows(), t] = values
 
     def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
-        """Let go of the rollouts that are over; the last step is the end of all."""
+        """Remove the finished rollouts; all end with the last step."""
         over = failed | ended
         last = t + 1 == self.task.steps
         if last or over.any():
@@ -185,7 +185,7 @@ class Batch:
         self._failed[self.active[failed]], self._ended[self.active[ended]] = True, True
         frames = slice(t * self._parts, (t + 1) * self._parts)
         for values in self._frames.values():
-            values[self.active[failed], frames] = 0.0  # no number of a blown-up state goes any further
+            values[self.active[failed], frames] = 0.0  # discard the numbers of unstable states
         self.active = self.active[~over]
         self.sim.keep(~over)
 
@@ -202,7 +202,7 @@ class Batch:
         return Record(frames, self._start, self._actions, self._steps, self._failed)
 
     def rollouts(self) -> Rollouts:
-        """Score them, when all are over."""
+        """Score the rollouts after all have ended."""
         record = self.record()
         score = self.task.score(record)
         terms, success = (self._terms, self._success) if score is None else (score.terms, score.success)
@@ -261,8 +261,8 @@ def _run(
     return batch.rollouts() if seen is None else replace(batch.rollouts(), moments=seen.table)
 
 
-def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  what `doing` gives
-    """Begin again where an output of the simulator was asked for the first time; numbers never depend on that."""
+def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`
+    """Start again if an output of the simulator is requested for the first time; no number depends on this."""
     while True:
         try:
             return doing()
@@ -315,7 +315,7 @@ def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row
 
 
 def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
-    """What was measured in one rollout: at its start, and in every frame until its end, (F + 1, ...)."""
+    """Measured values of one rollout: at its start, and in every frame until its end, (F + 1, ...)."""
     count = len(next(iter(rollouts.frames.values()))[row])
     frames = int(rollouts.steps[row]) * (count // rollouts.actions.shape[1])
     first = {name: values[row][None] for name, values in rollouts.start.items()}
@@ -332,11 +332,11 @@ def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> An
 
 
 def probe(task: Task) -> TaskSpec:
-    """What both sides must know of a task, found by one control step of one rollout.
+    """A task's specification, found by one control step of one rollout.
 
     Raises:
       ConfigError: the class cannot be a task.
-      TaskError: it gives arrays that make no sense.
+      TaskError: it returns invalid arrays.
     """
     quiet()
     _check_class(task)
@@ -366,10 +366,10 @@ def probe(task: Task) -> TaskSpec:
 
 
 def _check_class(task: Task) -> None:
-    """Whether attributes and methods are what a task's are.
+    """Check a task's attributes and methods.
 
     Raises:
-      ConfigError: names the first that is not.
+      ConfigError: names the first invalid one.
     """
     name = type(task).__name__
     for what, most in (("steps", STEPS_LIMIT), ("substeps", STEPS_LIMIT)):
@@ -389,10 +389,10 @@ def _check_class(task: Task) -> None:
 
 
 def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
-    """Whether the task shows what its channels say.
+    """Check that the task measures its channels.
 
     Raises:
-      TaskError: it does not show one, or in another shape.
+      TaskError: one is missing or has another shape.
     """
     missing = [c.name for c in task.channels if c.name not in frames]
     if missing and type(task).show is Task.show:
@@ -402,11 +402,11 @@ def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
         _array(f"channel {channel.name!r}", shown.get(channel.name), (1, 1, *channel.shape))
 
 
-def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa: ANN401  whatever a task gave
-    """The values, if they are an array of this shape.
+def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa: ANN401  a task's result
+    """Return the values if they are an array of this shape.
 
     Raises:
-      TaskError: they are not; names the array, what came and what was expected.
+      TaskError: they are not; names the array, its shape and the expected one.
     """
     if not isinstance(values, np.ndarray) or values.shape != shape:
         got = f"an array of shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
@@ -417,7 +417,7 @@ def _array(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa:
 
 
 def _each(call: Callable[..., AnyArray], *parts: Rollouts) -> Rollouts:
-    """Apply a function to every array of rollouts, or of several side by side."""
+    """Apply a function to every array of rollouts, or to the corresponding arrays of several."""
     made: dict[str, Any] = {}
     for name in Rollouts.__dataclass_fields__:
         values = [getattr(part, name) for part in parts]

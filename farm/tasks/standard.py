@@ -1,4 +1,4 @@
-"""What a task's observations are like: at its nominal start, and how far they spread."""
+"""Standardisation of a task's observations: the nominal start, and their spread."""
 
 from typing import Final
 
@@ -21,7 +21,7 @@ def nominal(task: Task) -> FloatArray:
     """The observation at the nominal start, (d,).
 
     Raises:
-      ConfigError: the task cannot be begun.
+      ConfigError: the task cannot start.
       TaskError: the observation is not finite.
     """
     return _observed(task, np.empty((0, task.model.nu)))[0]
@@ -31,12 +31,12 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
     """Origin m and spread s of the observation x, (d,) each: (x - m) / s is standardised.
 
     m is x at the nominal start. s is the interquartile range of x, divided by the normal distribution's, over 32
-    rollouts from there, each with a constant action, normal with standard deviation `action`: a few blows must not
-    widen it. What hardly moves must not count as much as what does: s is at least a third of its mean over that part of
-    the observation (`Task.parts`), and 1 where nothing of a part moves. It belongs to the task: all runs draw alike.
+    rollouts from there, each with a constant action, normal with standard deviation `action`: outliers must not
+    widen it. Numbers that hardly change must not count as much as others: s is at least a third of its mean over that
+    part of the observation (`Task.parts`), and 1 if a part is constant. It belongs to the task: equal in all runs.
 
     Raises:
-      ConfigError: the task cannot be begun.
+      ConfigError: the task cannot start.
       TaskError: an observation is not finite.
     """
     seen = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, task.model.nu)))

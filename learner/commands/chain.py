@@ -1,4 +1,4 @@
-"""`farm chain`: learnt policies in turn, each from where the one before it ended."""
+"""`farm chain`: runs learnt policies in turn, each from where the previous one ended."""
 
 import json
 from collections.abc import Sequence
@@ -28,22 +28,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainCommand(Settings):
-    """Learnt policies in turn, each from where the one before it ended: how many cycles they make."""
+    """Runs learnt policies in turn, each from where the previous one ended, and counts their cycles."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of the runs, in the order in which their policies act."""
     starts: int = setting(50, least=1, most=100_000)
     """Perturbed starts."""
     steps: int = setting(1000, least=1, most=100_000)
-    """Control steps that a chain has at most."""
+    """Largest number of control steps of a chain."""
     seed: int = setting(0, least=0, most=SEEDS - 1)
     """Seed of the perturbations."""
     to: Path = Path("chain.rrd")
-    """Recording to write; what is there is replaced."""
+    """Recording to write; an existing file is replaced."""
     shown: int = setting(120, least=1, most=10_000)
     """Control steps of the unperturbed chain that is recorded."""
     video: Path | None = None
-    """Video of it to write as well: a name that ends in .gif or .mp4."""
+    """Also write a video of it: a name that ends in .gif or .mp4."""
     speed: float = setting(1.0, least=0.01, most=10)
     """Speed of the video: 1 is real time."""
     json: bool = False
@@ -96,7 +96,7 @@ def check_lengths(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> 
 
 
 def figures(chained: "Chained", policies: int) -> dict[str, Any]:
-    """What came out, as the JSON shows it."""
+    """The results in the JSON's form."""
     changes, cycles = chained.changes, chained.changes // policies
     return {
         "starts": len(changes),
@@ -120,7 +120,7 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     first = policies[0].problem
     shown = chain(policies, [None], command.shown, every=1)
     found = loop.trajectory(shown.task, first.spec, first.scene, shown.rollouts, 0)
-    # Its reward would be the first policy's, all along.
+    # Its reward would be the first policy's throughout.
     trajectory = replace(found, terms=np.zeros_like(found.terms), value=float("nan"), success=None)
     name = f"{len(policies)} policies in turn: the goal is reached {shown.changes[0]} times"
     with writing(command.to):

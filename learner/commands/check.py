@@ -1,4 +1,4 @@
-"""`farm check`: tells the author of a task in seconds what is wrong with it."""
+"""`farm check`: finds errors of a task in seconds."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from learner.setup import Problem
 
 ROWS = 8
-"""Rollouts that are compared."""
+"""Number of rollouts that are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,14 +59,14 @@ def main(words: Sequence[str]) -> int:
 
 
 def _name(words: Sequence[str]) -> str | None:
-    """The task among the words: the first that looks like one, else the first that is no flag."""
+    """The task among the words: the first that looks like one, else the first that is not a flag."""
     loose = [word for word in words if not word.startswith("-")]
     named = [word for word in loose if ":" in word or word in plugins.names("tasks")]
     return next(iter(named or loose), None)
 
 
 def checked(config: RunConfig, picture: Path | None, backend: str = "cpu") -> Iterator[str]:
-    """Lines about a task, as they are found out; a TaskError where rollouts depend on their batch."""
+    """Yield lines about a task; a TaskError if rollouts depend on their batch."""
     from learner.setup import problem
 
     other = None if backend == "cpu" else rollouts.backend(backend)
@@ -85,7 +85,7 @@ def checked(config: RunConfig, picture: Path | None, backend: str = "cpu") -> It
     least, most = together.returns.min(), together.returns.max()
     yield f"returns {least:.4g} to {most:.4g}, {int(together.ended.sum())} ended early"
     if together.failed.any():
-        yield f"warning: the physics of {int(together.failed.sum())} of {ROWS} rollouts blew up"
+        yield f"warning: the simulation of {int(together.failed.sum())} of {ROWS} rollouts became unstable"
     order = np.random.default_rng(1).permutation(ROWS)
     permuted = runner.rollouts(theta[order], [drawn[i] for i in order])
     _same(_arrays(together), {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()}, "in another order")
@@ -131,7 +131,7 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
 
 
 def _picture(found: "Problem", qpos: FloatArray, path: Path | None) -> str:
-    """Draw the start, and say where."""
+    """Draw the start; returns a line with the file's name."""
     from farm.sim import rendering
 
     target = path or Path(f"{type(found.task).__name__.lower()}.png")

@@ -60,11 +60,11 @@ class Compared:
     """One of the runs."""
 
     name: str
-    """Its own among them."""
+    """Including its own settings."""
     config: RunConfig
     progress: Sequence[GenerationStats]
     summary: Mapping[str, Any]
-    """Empty as long as there is none."""
+    """Empty if there is none yet."""
 
 
 def read(folders: Sequence[RunFolder]) -> list[Compared]:
@@ -79,7 +79,7 @@ def read(folders: Sequence[RunFolder]) -> list[Compared]:
 
 
 def names(paths: Sequence[Path]) -> list[str]:
-    """A name for each folder, once each: its own, with those of folders above it as long as two are alike."""
+    """A unique name for each folder: its own, preceded by those of parent folders as long as two are equal."""
     whole = [path.resolve() for path in paths]
     for path, given in zip(whole, paths, strict=True):
         if whole.count(path) > 1:
@@ -91,7 +91,7 @@ def names(paths: Sequence[Path]) -> list[str]:
 
 
 def table(runs: Sequence[Compared]) -> str:
-    """A table of the runs, Markdown: a column each; settings that are the same everywhere are left out."""
+    """A Markdown table with one column per run; settings that are equal in all runs are left out."""
     rows = [("", *(f"**{run.name}**" for run in runs)), *_results(runs), *_settings(runs)]
     first, *rest = [f"| {' | '.join(row)} |" for row in rows]
     return "\n".join([first, f"|{'---|' * (len(runs) + 1)}", *rest])

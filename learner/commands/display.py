@@ -22,15 +22,15 @@ from learner.telemetry.report import Report
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
 _SPARK: Final = 80  # characters of a curve, at most
 _SPARK_LEAST: Final = 8
-_BESIDE_SPARK: Final = 33  # columns for what stands beside it
-_WORKERS: Final = 6  # shown by name
+_BESIDE_SPARK: Final = 33  # columns for the text beside it
+_WORKERS: Final = 6  # workers shown by name
 
 Style = Literal["auto", "quiet", "json"]
-"""What a user asked for: a screen or lines, nothing but the end, or a JSON object a line."""
+"""Form of the output: a screen or lines, only the end, or one JSON object per line."""
 
 
 class Display:
-    """Shows a run while it is entered, and how it ended after that; this one shows nothing before."""
+    """Shows a run as a context manager, and its end afterwards; this base class shows the end only."""
 
     def __enter__(self) -> "Display":
         return self
@@ -39,15 +39,15 @@ class Display:
         """End."""
 
     def show(self, report: Report) -> None:
-        """A generation is over."""
+        """Show a finished generation."""
 
     def conclude(self, lines: Sequence[str]) -> None:
-        """The run is over; the lines say how it went and what to do next."""
+        """Show the end of the run; the lines have the result and the next commands."""
         say(*lines)
 
 
 def display(run: Run, announcement: Sequence[str], style: Style) -> Display:
-    """What fits the user's wish and standard output; the announcement says what begins here."""
+    """The display for the user's options and standard output; the announcement describes the run."""
     if style == "json":
         return JsonDisplay(run)
     if style == "quiet":
@@ -87,7 +87,7 @@ class JsonDisplay(Display):
         """Write the generation."""
         self._say("generation", {**report.progress.to_dict(), "rollouts_per_second": round(report.rate, 1)})
 
-    def conclude(self, lines: Sequence[str]) -> None:  # noqa: ARG002  the summary says it all
+    def conclude(self, lines: Sequence[str]) -> None:  # noqa: ARG002  the summary has everything
         """Write the summary."""
         self._say("summary", self._run.summary)
 
@@ -159,7 +159,7 @@ class LiveDisplay(Display):
         p, workers = report.progress, self._run.farm.census()
         table = _grid()
         extra = f"; {p.reissued} jobs reissued" if p.reissued else ""
-        rates = [round(worker.rate) for worker in workers]  # rounded first, so that they add up
+        rates = [round(worker.rate) for worker in workers]  # rounded first, so that the parts add up
         table.add_row("farm", f"{sum(rates)}", f"rollouts/s, {p.workers} workers{extra}")
         for worker, rate in zip(workers[:_WORKERS], rates, strict=False):
             table.add_row("", f"{rate}", plain(name(worker)))
@@ -182,7 +182,7 @@ def name(worker: WorkerStatus) -> str:
 
 
 def spark(values: Sequence[float], width: int) -> str:
-    """A curve of at most so many characters: the last value of each share of the whole."""
+    """A curve of at most this number of characters: the last value of each part."""
     count = min(width, len(values))
     chosen = [values[(i + 1) * len(values) // count - 1] for i in range(count)]
     low = min(values)

@@ -21,7 +21,7 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateCommand(Settings):
-    """Tries the learnt mean policy on perturbed starts and conditions, as its task draws them."""
+    """Tests the learnt mean policy on perturbed starts and conditions drawn by its task."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -30,7 +30,7 @@ class EvaluateCommand(Settings):
     seed: int = setting(EVALUATION_SEED, least=0, most=SEEDS - 1)
     """Seed of the perturbations."""
     average: int | None = setting(None, least=1)
-    """Average the means after so many last generations; by default as many as the run says."""
+    """Average the means after this number of last generations; by default the run's own setting."""
     json: bool = False
     """Print JSON instead of a table."""
 
@@ -55,7 +55,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def evaluate(folder: RunFolder, rollouts: int, seed: int, average: int | None = None) -> dict[str, Any]:
-    """The figures, as the JSON shows them."""
+    """The figures in the JSON's form."""
     policy = loaded(folder, average=average)
     spec = policy.problem.spec
     given = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))

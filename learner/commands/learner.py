@@ -1,4 +1,4 @@
-"""`farm learner`: the learner alone; and what it shares with `farm run`."""
+"""`farm learner`: the learner without workers; and the code shared with `farm run`."""
 
 import gc
 import itertools
@@ -22,10 +22,10 @@ from learner.setup import fitted
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerCommand:
-    """The learner alone; workers join it with `farm worker`, from any machine."""
+    """The learner without workers; they join it with `farm worker` from any machine."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
-    """Where the run starts from, where it is saved, and how it is reached."""
+    """Where the run starts from, where it is saved, and its network addresses."""
     run: RunConfig = field(default_factory=RunConfig)
     """The run."""
 
@@ -71,7 +71,7 @@ def learn(
                     path = path.with_name(f"{first}-{number}")
             assert run is not None
             shown = display.display(run, _announcement(run, place), chosen.style)
-            gc.freeze()  # what is there stays: looking through it for garbage took 20 ms a time
+            gc.freeze()  # existing objects stay: collecting garbage among them took 20 ms each time
             with shown:
                 for report in run.learn():
                     shown.show(report)
@@ -81,7 +81,7 @@ def learn(
 
 def _announcement(run: Run, place: Placement) -> list[str]:
     folder, at = run.learner.folder, run.learner.state.generation
-    lines = [f"run {folder.path}" + (f", going on after generation {at}" if at else "")]
+    lines = [f"run {folder.path}" + (f", continuing after generation {at}" if at else "")]
     if place.record:
         lines[0] += "; farm view shows it at any time"
     if not place.workers:

@@ -19,7 +19,7 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerOptions:
-    """Where a run starts from, where it is saved, and how it is reached."""
+    """Where a run starts from, where it is saved, and its network addresses."""
 
     preset: str | None = None
     """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
@@ -28,11 +28,11 @@ class LearnerOptions:
     resume: Path | None = None
     """Continue the run in this folder; --generations may extend it."""
     resume_existing: bool = False
-    """Continue the run of that --name if it exists, else begin it: for learners that a supervisor restarts."""
+    """Continue the run of that --name if it exists, else start it: for learners restarted by a supervisor."""
     out: Path = Path("runs")
     """Folder in which run folders are made."""
     name: str = ""
-    """Name of the run and its folder; without one: task-preset-sSEED-UTC time."""
+    """Name of the run and its folder; by default task-preset-sSEED-UTC time."""
     record: bool = True
     """Record the run with Rerun."""
     log: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class LearnerOptions:
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
     trust_network: bool = False
-    """Listen to other machines without certificates: anybody there can read everything and pose as a worker."""
+    """Listen to other machines without certificates: everyone there can read everything and pose as a worker."""
     mixed: bool = False
     """Admit workers whose machines round differently, and resume with changed code: the run is not reproducible."""
     audit: float = setting(0.02, least=0.0, most=1.0)
@@ -103,7 +103,7 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     parts = {name: value for name, value in named.items() if value is not None}
     given = [f"--{name}" for name, value in chosen.items() if value is not None]
     if len(given) > 1:
-        raise ConfigError(f"{' and '.join(given)} exclude each other: each says what to start from")
+        raise ConfigError(f"{' and '.join(given)} exclude each other: each defines where to start from")
     if chosen["resume"] is not None:
         folder = RunFolder.open(Path(chosen["resume"]))
         return folder.read_config(), folder
@@ -125,10 +125,10 @@ def _value(words: Sequence[str], flag: str) -> str | None:
 
 
 def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
-    """Check that a run can continue with this configuration: only the number of generations may have grown."""
+    """Check that a run can continue with this configuration: only the number of generations may increase."""
     if changed := list(configs.other(saved, wanted)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
-        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may grow")
+        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may increase")
     done = max((stats.generation for stats in folder.progress()), default=0)
     if wanted.generations < done:
         raise ConfigError(f"--generations {wanted.generations}: the run has already done {done}")
@@ -142,7 +142,7 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
     name = keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
     if options.name:
         return name
-    later = (f"{name}-{number}" for number in itertools.count(2))  # another run of this second may have the name
+    later = (f"{name}-{number}" for number in itertools.count(2))  # another run of this second may have that name
     return next(each for each in itertools.chain([name], later) if not (options.out / each).exists())
 
 
@@ -155,7 +155,7 @@ def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[s
 
 
 def _with_names(words: Sequence[str]) -> list[str]:
-    """The words, with plug-ins in files named by their whole paths: a run can then be repeated from anywhere."""
+    """The words, with absolute paths of plug-ins in files: a run can then be repeated from any folder."""
     out = list(words)
     kinds = {"--task": "tasks", "--policy": "policies", "--algorithm": "algorithms"}
     for i, word in enumerate(words):

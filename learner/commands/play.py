@@ -25,7 +25,7 @@ from learner.run_folder import RunFolder
 
 @dataclass(frozen=True, kw_only=True)
 class PlayCommand(Settings):
-    """Plays the learnt policy again and again in MuJoCo's interactive viewer; Ctrl+drag pushes objects."""
+    """Plays the learnt policy repeatedly in MuJoCo's interactive viewer; Ctrl+drag pushes objects."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -65,7 +65,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def rollout(policy: LoadedPolicy) -> Callable[[Sim], int]:
-    """One nominal rollout in a simulation that is shown; control steps that it lasted."""
+    """Show one nominal rollout; returns its number of control steps."""
     found = policy.problem
     prepared = found.policy.prepare(policy.mu[None])
 

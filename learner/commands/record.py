@@ -1,4 +1,4 @@
-"""`farm record`: a run's recording made on any machine, over the network."""
+"""`farm record`: records a run over the network, on any machine."""
 
 import subprocess
 from collections.abc import Callable, Sequence
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordCommand:
-    """Records a run on any machine, over the network: the whole run, even if it begins late."""
+    """Records a run over the network, on any machine: the whole run, even if the command starts late."""
 
     connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable; without one: tcp/127.0.0.1:7447."""
+    """Where a learner or a router listens, repeatable; by default tcp/127.0.0.1:7447."""
     run: str = ""
-    """Name of the run; without one: the only run on the farm, or the first that appears."""
+    """Name of the run; by default the only run on the farm, or the first that appears."""
     out: Path = Path("recordings")
     """Folder in which the recording's folder is made."""
     file: bool = True
@@ -46,7 +46,7 @@ class RecordCommand:
     name: str = ""
     """Which viewer's certificate to use, if the folder holds several."""
     allow_file: tuple[Path, ...] = ()
-    """A copy of the file that the run's task or policy is in, if it is a file on the learner's machine; repeatable."""
+    """A copy of the file with the run's task or policy, if it is a file on the learner's machine; repeatable."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -57,7 +57,7 @@ class RecordCommand:
         if self.serve is not None:
             options.address(self.serve)
         if not (self.file or self.serve or self.spawn):
-            raise ConfigError("--no-file leaves nothing to do: add --serve PORT or --spawn")
+            raise ConfigError("--no-file records nothing: add --serve PORT or --spawn")
         if self.spawn and not display():
             raise ConfigError("no display to open a window on: take --serve PORT, and open the viewer elsewhere")
 
@@ -96,7 +96,7 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
     bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
     endpoints = command.connect or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"),)
     with ExitStack() as kept:
-        # The session goes first: the learner waits for that at the end, while the file is still being merged.
+        # The session closes first: the learner waits for that at the end, while the file is still being merged.
         with session.connect(endpoints, None, stopped, bundle) as link:
             run = command.run or find_run(link, command.farm, stopped)
             follower = Subscriber(link, command.farm, run, command.allow_file)
@@ -111,12 +111,12 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "Remote":
 
 
 def _announce(run: str, remote: "Remote", *, spawn: bool) -> None:
-    done = f", going on after generation {remote.done}" if remote.done else ""
+    done = f", continuing after generation {remote.done}" if remote.done else ""
     into = "" if remote.folder is None else f" into {remote.folder.path}"
     uri = remote.recording.uri
     say(f"recording run {run}{into}{done}", *([] if uri is None else recordings.look_on(uri)))
     if spawn and uri is not None:
-        # In a session of its own: the window stays when this ends, whoever looks closes it. A viewer listens, too.
+        # In a session of its own: the window stays open until the user closes it. A viewer listens, too.
         flags = ("--bind", "127.0.0.1", "--port", "auto")
         from learner.recording.files import program
 

@@ -1,4 +1,4 @@
-"""What several commands say of recordings: how to watch a run live, which files they are, where one may be written."""
+"""Shared by commands for recordings: how to watch a run live, which files to open, where one may be written."""
 
 import socket
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from farm.sim.trajectory import Trajectory
     from farm.tasks.base import Task
 
-_MAGIC: Final = b"RRF"  # what a recording begins with, whichever release of Rerun wrote it
+_MAGIC: Final = b"RRF"  # first bytes of a recording of any release of Rerun
 
 
 def look_on(uri: str) -> list[str]:
@@ -28,7 +28,7 @@ def look_on(uri: str) -> list[str]:
 
 
 def sources(what: str) -> list[str]:
-    """What a viewer opens for a run's folder, a recording, or the address of a live stream; else a ConfigError."""
+    """Files or addresses to open for a run's folder, a recording, or a live stream; else a ConfigError."""
     from learner.recording.files import parts
 
     if urlsplit(what).scheme in ("rerun", "rerun+http", "rerun+https"):
@@ -50,8 +50,8 @@ def sources(what: str) -> list[str]:
 
 
 def target(path: Path) -> Path:
-    """A file that a recording may be written to: it ends in .rrd, folders alone are above it, and no run goes on with
-    it. Else a ConfigError, before any work is done."""  # noqa: D205, D209
+    """Check that a recording may be written to a file: it ends in .rrd, its parents are folders, and it is not a run's
+    own recording. Raises ConfigError otherwise, before any work is done."""  # noqa: D205, D209
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
     there = next((each for each in path.absolute().parents if each.exists()), None)
@@ -65,7 +65,7 @@ def target(path: Path) -> Path:
 
 
 def film(task: "Task", shown: "Sequence[tuple[Trajectory, FloatArray]]", path: Path, speed: float) -> None:
-    """Write a video of rollouts side by side, each with its positions qpos (F, nq); one that ended early rests."""
+    """Write a video of rollouts side by side, each with positions qpos (F, nq); one that ended early stands still."""
     from farm.sim import video
 
     longest = max((rollout for rollout, _ in shown), key=lambda each: len(each.times))

@@ -1,4 +1,4 @@
-"""`farm replay`: any policy that a run stored again, or any rollout of it, into a recording and a video."""
+"""`farm replay`: simulates any stored policy or any rollout of a run again, for a recording and a video."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from learner.rewind import Rewound
 
 MOST: Final = 12
-"""Rollouts side by side, at most: more would be too small to see."""
+"""Largest number of rollouts side by side: more would be too small to see."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class ReplayCommand(Settings):
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task; the default is the run's own."""
     ended: int | None = None
-    """Show this number of rollouts that the task ended; the flag has the task's own word for it, see `_command`."""
+    """Show this number of rollouts that the task ended; the flag's name is the task's word for it, see `_command`."""
 
     @property
     def rewinds(self) -> bool:
@@ -88,8 +88,8 @@ def main(words: Sequence[str]) -> int:
 
 
 def _command(ending: str) -> type[ReplayCommand]:
-    """The command, whose flag for rollouts that ended is called as the task calls them."""
-    about = f"Show so many exploring rollouts of the generation that {_were(ending)}, the first ones."
+    """The command with its flag for ended rollouts renamed to the task's word."""
+    about = f"Show this number of the generation's exploring rollouts that {_were(ending)}, the first ones."
     named = Annotated[int | None, tyro.conf.arg(name=ending, help=about)]
     return make_dataclass(
         "ReplayCommand", [("ended", named, setting(None, least=1, most=MOST))], bases=(ReplayCommand,), frozen=True,
@@ -126,7 +126,7 @@ def _rollouts(
     from learner.rewind import rewound, under
 
     found = rewound(folder, command.generation)
-    policy = under(folder, found, command.task) if changed else found.policy  # chosen by what the run itself saw
+    policy = under(folder, found, command.task) if changed else found.policy  # chosen by the run's own results
     chosen = _chosen(command, found, ending)
     shown = found.again(chosen, policy)
     names = [f"rollout {index}" for index in chosen]
@@ -147,10 +147,10 @@ def _rollouts(
 
 
 def _chosen(command: ReplayCommand, found: "Rewound", ending: str) -> list[int]:
-    """Which rollouts: those that are named, the best, the worst, those that ended; each once, at most MOST.
+    """Indices of the rollouts: given ones, the best, the worst, those that ended; each once, at most MOST.
 
     Raises:
-      ConfigError: too many are wanted.
+      ConfigError: too many are requested.
       RunError: none ended.
     """
     ended = found.ended(command.ended or 0)
@@ -163,7 +163,7 @@ def _chosen(command: ReplayCommand, found: "Rewound", ending: str) -> list[int]:
     wanted = [*command.rollout, *found.best(command.best or 0), *found.worst(command.worst or 0), *ended]
     chosen = list(dict.fromkeys(wanted))
     if len(chosen) > MOST:
-        raise ConfigError(f"{len(chosen)} rollouts are wanted; at most {MOST} are shown side by side")
+        raise ConfigError(f"{len(chosen)} rollouts are requested; at most {MOST} are shown side by side")
     return chosen
 
 
@@ -180,16 +180,16 @@ def _record_one(folder: RunFolder, path: Path, policy: "LoadedPolicy", name: str
 
 
 def config_of(words: Sequence[str]) -> RunConfig | None:
-    """The configuration of the run that the words name, so that its task's flags are known; None without one.
+    """The configuration of the run in the words, for its task's flags; None without one.
 
     Raises:
-      ConfigError: the first word is no run's folder.
+      ConfigError: the first word is not a run's folder.
     """
     for word in words:
         if not word.startswith("-") and (Path(word) / "config.json").is_file():
             return RunFolder(Path(word)).read_config()
     if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
-        RunFolder.open(Path(words[0]))  # says that there is none: its task's flags would be called unknown
+        RunFolder.open(Path(words[0]))  # raises first: otherwise its task's flags would be reported as unknown
     return None
 
 
@@ -200,6 +200,6 @@ def task_of(words: Sequence[str]) -> TaskConfig | None:
 
 
 def differing(own: TaskConfig, chosen: TaskConfig) -> str:
-    """Settings that were changed, as a caption says them."""
+    """Changed settings, for a caption."""
     names = [f.name for f in fields(own) if getattr(own, f.name) != getattr(chosen, f.name)]
     return ", ".join(f"{name.replace('_', ' ')} {getattr(chosen, name)}" for name in names)

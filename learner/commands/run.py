@@ -15,10 +15,10 @@ from learner.run import Placement
 
 @dataclass(frozen=True, kw_only=True)
 class RunCommand(Settings):
-    """Learner and local workers together: learns a task and records it."""
+    """Starts a learner and local workers: learns a task and records the run."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
-    """Where the run starts from, where it is saved, and how it is reached."""
+    """Where the run starts from, where it is saved, and its network addresses."""
     workers: int = setting(2, least=0, most=1024)
     """Worker processes on this machine."""
     backend: str = "cpu"

@@ -25,7 +25,7 @@ from learner.setup import problem
 
 @dataclass(frozen=True, kw_only=True)
 class SweepCommand:
-    """Learns settings x seeds on one set of workers; a table and a figure. Run it again to continue."""
+    """Learns settings x seeds on one set of workers; makes table and figure. Run it again to continue."""
 
     vary: tuple[str, ...] = ()
     """NAME=V1,V2,...: a setting and its values, repeatable; every combination is learnt."""
@@ -38,7 +38,7 @@ class SweepCommand:
     config: Path | None = None
     """Settings to start from: a config.json (other flags override it)."""
     sharing: sweep.Sharing = field(default_factory=sweep.Sharing)
-    """Which workers do the runs."""
+    """Workers of the runs."""
     run: RunConfig = field(default_factory=RunConfig)
     """Settings of all runs."""
 
@@ -74,7 +74,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _given(words: Sequence[str]) -> list[str]:
-    pairs = zip(words, [*words[1:], ""], strict=True)
+    pairs = zip(words, [*words, ""][1:], strict=True)
     return [after if word == "--vary" else word[7:] for word, after in pairs if word.partition("=")[0] == "--vary"]
 
 
@@ -119,7 +119,7 @@ def _check_begins(chosen: Sweep) -> None:
 
 
 def _print(chosen: Sweep, table: Sequence[dict[str, Any]]) -> None:
-    """A line a setting: mean and standard deviation over the seeds."""
+    """One line per setting: mean and standard deviation over the seeds."""
     shown = compact()
     judged = any(row["robust_success_rate"] is not None for row in table)
     robust = ("robust success", "robust_success_rate") if judged else ("robust return", "robust_return")
@@ -190,7 +190,7 @@ class Runs:
             self._bars.stop()
 
     def progress(self, run: str, generation: int, of: int, returned: float) -> None:
-        """A generation is over."""
+        """Show a finished generation."""
         if run not in self._tasks:
             self._tasks[run] = self._bars.add_task(run, total=of, said="")
         self._bars.update(self._tasks[run], completed=generation, said=f"{returned:8.3f}")
@@ -202,7 +202,7 @@ class Runs:
             self._print(f"{run}: {line}")
 
     def ended(self, run: str, state: str, said: str) -> None:
-        """A run is over: finished, diverged, failed or interrupted; `said` is its reason, or how well it did."""
+        """Show the end of a run: finished, diverged, failed or interrupted; `said` is its reason or its result."""
         if run in self._tasks:
             self._bars.remove_task(self._tasks.pop(run))
         if state in ("finished", "diverged"):

@@ -1,4 +1,4 @@
-"""`farm tasks`: what can be farmed, from where, with its settings."""
+"""`farm tasks`: lists tasks and other plug-ins, with origin and settings."""
 
 import contextlib
 import io
@@ -30,7 +30,7 @@ class TasksCommand:
     """Lists tasks, policies, algorithms, backends and loggers; with a name, its settings and presets."""
 
     name: tyro.conf.Positional[str] = ""
-    """A name, or FILE.py:CLASS; without one: list all."""
+    """A name, or FILE.py:CLASS; by default list all."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -84,7 +84,7 @@ def described(name: str) -> str:
 
 
 def _kind(name: str) -> str:
-    """What kind of plug-in has this name."""
+    """The kind of the plug-in with this name."""
     if name.rpartition(":")[0].endswith(".py"):
         target = plugins.find("tasks", name).target
         return "tasks" if issubclass(target, Task) else "policies" if issubclass(target, Policy) else "algorithms"

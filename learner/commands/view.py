@@ -19,9 +19,9 @@ from farm.processes import end
 from learner.commands import recordings
 from learner.run import check_rerun
 
-_PAGE = 9090  # where a browser finds the viewer, if nobody else is there
-_LOOK = 0.1  # [s] between two looks at the viewer
-_CLOSING = 5.0  # [s] that it has to end
+_PAGE = 9090  # port for a browser, if it is free
+_LOOK = 0.1  # [s] between two checks of the viewer
+_CLOSING = 5.0  # [s] for it to end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def check_display(what: str) -> None:
-    """Check that a window can be opened: a ConfigError says what to do."""
+    """Check that a window can be opened; raises ConfigError otherwise."""
     if not display():
         raise ConfigError(
             f"no display to open a window on: farm view {what} --web serves a browser, or copy the recording elsewhere"
@@ -56,7 +56,7 @@ def check_display(what: str) -> None:
 
 
 def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> int:
-    """Open files or live streams in a window or browser, with their table first if wanted, until that is closed.
+    """Open files or live streams in a window or browser, with their table first if requested, until it is closed.
 
     Raises:
       RunError: the viewer failed.
@@ -68,7 +68,7 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
     port, page = free_port(), free_port(_PAGE)
     command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
     command += ["--web-viewer", "--web-viewer-port", str(page)] if web else []
-    quiet = {"RUST_LOG": "warn"} | os.environ  # its own lines name an address that ssh does not reach
+    quiet = {"RUST_LOG": "warn"} | os.environ  # its own messages name an address that ssh does not forward
     with stop_flag("closing the viewer") as stop, subprocess.Popen(command, env=quiet) as viewer:
         try:
 
@@ -78,7 +78,7 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
             if not web:
                 (show_table if table else show_newest)(port, gone)
             elif listens(page, gone):
-                live = [source for source in sources if "://" in source]  # these a browser reads itself
+                live = [source for source in sources if "://" in source]  # a browser can open these
                 say(_address(page, live or [f"rerun+http://127.0.0.1:{port}/proxy"]))
             while viewer.poll() is None and not stop.wait(_LOOK):
                 pass
@@ -86,14 +86,14 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
             end([viewer], _CLOSING)
     if stop.is_set():
         raise Interrupted("the viewer is closed")
-    hint = "see above" if web else "is the display there? --web serves a browser instead"
+    hint = "see above" if web else "is a display available? --web serves a browser instead"
     if viewer.returncode:
         raise RunError(f"Rerun's viewer ended with status {viewer.returncode}: {hint}")
     return 0
 
 
 def _address(page: int, streams: Sequence[str]) -> str:
-    """Where a browser finds the viewer with these streams, here and from another machine."""
+    """The viewer's address with these streams for a browser, here and from another machine."""
     ports = [page, *(urlsplit(stream).port for stream in streams)]
     tunnels = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
     asked = "&".join(f"url={quote(stream, safe='')}" for stream in streams)

@@ -1,4 +1,4 @@
-"""What a logger is, and a run's loggers together: what goes wrong in one never reaches the learning."""
+"""The base class of loggers, and all loggers of a run together: their errors never affect learning."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -14,26 +14,26 @@ log = logging.getLogger(__name__)
 
 
 class Logger(Protocol):
-    """Takes a run's figures to another tool."""
+    """Sends a run's figures to another tool."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:
-        """Begin or continue a run's log.
+        """Start or continue a run's log.
 
         Args:
           folder: of the run; its name is the run's.
           config: the resolved configuration, as in config.json.
-          done: generations that were logged before; what a killed learner logged beyond them comes again.
+          done: generations that were logged before; later ones, logged by a killed learner, are logged again.
         """
 
     def generation(self, figures: Mapping[str, float]) -> None:
-        """Log a generation that is over: the numbers of its line in progress.jsonl, by their names there."""
+        """Log a finished generation: the numbers of its line in progress.jsonl by name."""
 
     def end(self, summary: Mapping[str, Any]) -> None:
-        """Log what came out, as in summary.json, and close; called once, however the run ended."""
+        """Log the results in summary.json, and close; called once, however the run ended."""
 
 
 class Loggers:
-    """Those of a run, in their order."""
+    """The loggers of a run, in order."""
 
     def __init__(self, names: Sequence[str], folder: Path, config: Mapping[str, Any], done: int) -> None:
         """Begin all of them.
@@ -50,13 +50,13 @@ class Loggers:
             raise
 
     def generation(self, stats: GenerationStats) -> None:
-        """Log a generation; what is unknown of it is left out."""
+        """Log a generation, without unknown values."""
         figures = {name: float(value) for name, value in asdict(stats).items() if value is not None}
         for name in list(self._open):
             self._call(name, "generation", figures)
 
     def end(self, summary: Mapping[str, Any]) -> None:
-        """Log what came out, and close."""
+        """Log the results, and close."""
         for name in list(self._open):
             self._call(name, "end", summary)
         self._open.clear()
@@ -64,7 +64,7 @@ class Loggers:
     def _call(self, name: str, method: str, values: Mapping[str, Any]) -> None:
         try:
             getattr(self._open[name], method)(values)
-        except Exception as error:  # whatever another's tool may raise
+        except Exception as error:  # another tool may raise anything
             del self._open[name]
             log.error("--log %s ends here, learning continues: %s: %s", name, type(error).__name__, brief(str(error)))
 
@@ -77,6 +77,6 @@ def _begun(name: str, folder: Path, config: Mapping[str, Any], done: int) -> Log
         logger: Logger = target(folder, config, done)
     except ImportError as error:
         raise ConfigError(f"--log {name} needs {error.name}: pip install {error.name}") from None
-    except Exception as error:  # such as no account, or no network
+    except Exception as error:  # for example without an account or a network
         raise ConfigError(f"--log {name} cannot begin: {type(error).__name__}: {brief(str(error))}") from None
     return logger

@@ -1,4 +1,4 @@
-"""Curves for TensorBoard, in the run's folder: `tensorboard --logdir runs` shows them. The door to tensorboardX."""
+"""Curves for TensorBoard, in the run's folder: `tensorboard --logdir runs` shows them."""
 
 import json
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ class TensorBoard:
     """Event files that TensorBoard shows; needs the extra `tensorboard`."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:
-        """Begin a file in the folder `tensorboard`; rows of generations beyond `done` in older ones do not count."""
+        """Start a file in the folder `tensorboard`; it replaces generations after `done` in older files."""
         from tensorboardX import SummaryWriter
 
         begins = {"purge_step": done + 1, "filename_suffix": f".after{done}"}  # their names have seconds alone
@@ -18,7 +18,7 @@ class TensorBoard:
         self._writer.add_text("config", f"```json\n{json.dumps(config, indent=2)}\n```", done)
 
     def generation(self, figures: Mapping[str, float]) -> None:
-        """A point of each curve, over the generations."""
+        """Add a point to each curve, over the generations."""
         step = int(figures["generation"])
         for name, value in figures.items():
             if name != "generation":

@@ -1,4 +1,4 @@
-"""Curves for Weights & Biases; its own variables (WANDB_PROJECT, WANDB_MODE=offline, ...) rule. The door to wandb."""
+"""Curves for Weights & Biases; configured by its own variables (WANDB_PROJECT, WANDB_MODE=offline, ...)."""
 
 import secrets
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ class WeightsAndBiases:
     """A run at Weights & Biases; needs the extra `wandb`, and an account or WANDB_MODE=offline."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:  # noqa: ARG002  steps say it
-        """Begin a run with this name, or continue the one that this folder began."""
+        """Start a run with this name, or continue the one that this folder started."""
         import wandb
 
         known = folder / "wandb" / "id"
@@ -23,10 +23,10 @@ class WeightsAndBiases:
         )  # fmt: skip
 
     def generation(self, figures: Mapping[str, float]) -> None:
-        """A point of each curve, over the generations."""
+        """Add a point to each curve, over the generations."""
         self._run.log(dict(figures), step=int(figures["generation"]))
 
     def end(self, summary: Mapping[str, Any]) -> None:
-        """Note what came out, and close."""
+        """Store the results, and close."""
         self._run.summary.update(dict(summary))
         self._run.finish(exit_code=int(summary.get("state") == "failed"))

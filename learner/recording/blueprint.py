@@ -1,4 +1,4 @@
-"""Layouts of the viewer: a learning run, a replay of rollouts, and a comparison of runs. They travel in the file."""
+"""Layouts of the viewer: a learning run, a replay of rollouts, and a comparison of runs. Stored in the recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,27 +20,27 @@ _DARK: Final = [24, 25, 28, 255]
 _NEARER: Final = 0.88  # Rerun's eye sees a wider field than MuJoCo's camera
 _PICTURES: Final = 0.42  # height of the pictures below a scene of 1
 _CAPTION: Final = 0.16  # and of a caption alone
-_LEGEND: Final = 6  # more curves than these have no legend: it would hide them
+_LEGEND: Final = 6  # no legend for more curves than this: it would hide them
 _MARGIN: Final = 1.6  # so many rollouts before the cursor: the legend covers the older ones
-_SEAM: Final = 1000  # [ns] before its end a rollout's last frame stands
+_SEAM: Final = 1000  # [ns] from a rollout's last frame to its end
 _FIRST: Final = 1.2  # height of the first plots, whose legend is mostly the longest; of others 1
-_ROWS: Final = 3  # more plots of a rollout stand in two columns
+_ROWS: Final = 3  # more plots of a rollout are in two columns
 
 
 @dataclass(frozen=True)
 class Eye:
-    """Where a scene is looked at from."""
+    """The eye of a scene's view."""
 
     target: FloatArray
     """[m], (3,)"""
     away: FloatArray
     """From the target to the eye [m], (3,)"""
     tracked: str | None = None
-    """Entity that the eye goes with."""
+    """Entity that the eye follows."""
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera | None) -> "Eye":
-        """Return the task's camera; without one, an eye beside what moves, which goes with it."""
+        """The task's camera; by default an eye beside the moving bodies that follows them."""
         view = camera or beside(scene)
         a, e = np.deg2rad([view.azimuth, view.elevation])
         ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -54,7 +54,7 @@ def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
 
 
 def finished(spec: TaskSpec, eye: Eye, generations: int) -> rrb.Blueprint:
-    """Layout of a run that is over after so many generations: its last policy's rollout plays, again and again."""
+    """Layout of a finished run with this number of generations: its last policy's rollout plays repeatedly."""
     horizon = spec.steps * spec.period
     begin, end = (round(1e9 * number * horizon) for number in (generations, generations + 1))
     panel = rrb.TimePanel(
@@ -90,7 +90,7 @@ def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
 def comparison(
     roots: Sequence[str], eye: Eye, compared: Channel | None, *, success: bool, learning: bool
 ) -> rrb.Blueprint:
-    """Layout of several runs, each below its root; `compared` are scalars that all have, drawn label by label.
+    """Layout of several runs, each below its root; `compared` are scalars common to all, drawn label by label.
 
     Without `learning` they are rollouts, which have no learning curves.
     """
@@ -138,7 +138,7 @@ def _playing() -> rrb.TimePanel:
 def _beside(
     left: Sequence[rrb.View | rrb.Container], below: float, right: rrb.Container, share: float
 ) -> rrb.Container:
-    """A scene with what stands below it, if anything does, of that height; and tabs to its right."""
+    """A scene with a view of that height below it, if there is one, and tabs to its right."""
     column = rrb.Vertical(*left, row_shares=[1.0, below][: len(left)])
     return rrb.Horizontal(column, right, column_shares=[share, 1.0 - share])
 
@@ -166,7 +166,7 @@ def _picture(origin: str, name: str) -> rrb.View:
 
 
 def _images(spec: TaskSpec) -> list[rrb.View]:
-    """A picture of each image; several channels' have the channel's name before their label."""
+    """One view per image; with several channels the names are CHANNEL LABEL."""
     channels = [channel for channel in spec.channels if channel.kind == "images"]
     names = {c.name: f"{title(c)} " if len(channels) > 1 or not c.labels else "" for c in channels}
     return [
@@ -181,7 +181,7 @@ def _config() -> rrb.View:
 
 
 def _learning(*, success: bool) -> rrb.Container:
-    """Curves whose legends stand where curves seldom are: returns rise, sigma falls."""
+    """Learning curves with legends where curves seldom are: returns rise, sigma falls."""
     bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
     log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
     returns = ("/learning/return", "/learning/return_std", "/learning/mean_policy/return")
@@ -200,13 +200,13 @@ def _learning(*, success: bool) -> rrb.Container:
 
 
 def _farm() -> rrb.Container:
-    """A curve a plot, which needs no legend; lost rollouts are mostly none."""
+    """One curve per plot, without a legend; lost rollouts are mostly zero."""
     top = rrb.Corner2D.RightTop
     return rrb.Vertical(
         _plot("Workers", "/farm/workers", legend=None),
         _plot("Rollouts per second", "/farm/rollouts_per_s", legend=None),
         _plot("Lost rollouts", "/learning/lost", legend=top),
-        _plot("Jobs given out again", "/farm/reissued", legend=None),
+        _plot("Reissued jobs", "/farm/reissued", legend=None),
         name="Farm",
     )
 
@@ -241,7 +241,7 @@ def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:
         )
         for origin, name, count in curves
     ]
-    # A window would not move these lanes' axis, only empty the rest of it.
+    # A window would not move these lanes' axis, only clear the rest of it.
     lanes: list[rrb.View] = [
         rrb.StateTimelineView(origin=path(c.name), name=title(c)) for c in spec.channels if c.kind == "flags"
     ]

@@ -1,4 +1,4 @@
-"""A task's channels as Rerun entities, by kind: what never changes, and columns for a rollout's frames.
+"""A task's channels as Rerun entities, by kind: static parts, and columns for a rollout's frames.
 
 Scalars are curves at /NAME and their limits constant lines at /NAME/limits, flags state lanes at /NAME/LABEL, images
 pictures at /NAME/LABEL (and with places points on their bodies, at /world/BODY/NAME), arrows and points are at
@@ -38,7 +38,7 @@ class Columns:
     entity: str
     columns: rr.ComponentColumnList
     rows: IntArray | None = None
-    """Which frames the rows belong to; all of them where None."""
+    """Which frames the rows belong to; None: all of them."""
 
 
 class ChannelDrawing:
@@ -112,7 +112,7 @@ class ChannelDrawing:
         return self._in_world(values[..., :3], bodies), vectors
 
     def _in_world(self, places: FloatArray, bodies: FloatArray) -> FloatArray:
-        """Places in the frames of the channel's bodies, in the world's (F, n, 3)."""
+        """Convert positions in the frames of the channel's bodies to the world's (F, n, 3)."""
         if not self._bodies:
             return places
         poses = bodies[:, self._bodies]
@@ -155,7 +155,7 @@ class ChannelDrawing:
 
 
 def path(name: str) -> str:
-    """A name that may hold slashes as an entity's path."""
+    """Convert a name that may contain slashes to an entity's path."""
     return "".join(f"/{rr.escape_entity_path_part(part)}" for part in name.split("/"))
 
 
@@ -165,7 +165,7 @@ def entities(channel: Channel) -> list[str]:
 
 
 def limits(channel: Channel) -> list[str]:
-    """What a legend says of the channel's limits, the least and the greatest of each label."""
+    """Legend entries for the channel's limits, the smallest and the largest of each label."""
     return [
         f"{label}, {what} {value:g} {channel.unit}".strip()
         for label, pair in channel.limits.items()
@@ -210,7 +210,7 @@ def labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Po
 
 
 def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
-    """What is written beside a trace's picture: whose values its rows are, how long it is, and its colours."""
+    """Labels of a trace's picture: names of its rows, its duration, and its colours."""
     steps, rows = spec.trace
     first, places, texts = 0, [], []
     for channel in spec.traced:

@@ -1,13 +1,13 @@
 """Several runs, or rollouts of one, in one recording: scenes side by side, curves over each other.
 
-    /runs/<name>                 where its scene stands (static)
+    /runs/<name>                 position of its scene (static)
     /runs/<name>/world/...       the final policy's rollout, as in a run's own recording
     /runs/<name>/return, /band, /success, /sigma     learning curves (of runs)
     /runs/<name>/reward, /<channel>/<label>          of the rollout
 
-Of the channels, the first one of scalars is drawn, where all runs have it. Curves stand on the timelines `generation`
-and `rollouts`, rollouts on `sim_time`; on the first two the scenes stay as they are at the rollouts' ends. Rollouts of
-one run stand below `/rollouts` in the same way.
+The first channel of scalars is drawn, if all runs have it. Curves are on the timelines `generation` and `rollouts`,
+rollouts on `sim_time`; on the first two the scenes show the ends of the rollouts. Rollouts of one run are below
+`/rollouts` in the same way.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,18 +31,18 @@ from learner.recording.drawing import Drawing
 from learner.recording.rows import begin, flush, log_static, markdown, times
 
 COLOURS: Final = PALETTE
-"""One a run."""
+"""One colour per run."""
 
-_APPLICATION: Final = "rolloutfarm comparison"  # a layout of its own, which never becomes that of a run
+_APPLICATION: Final = "rolloutfarm comparison"  # a separate layout, which is never used for a run
 _BESIDE: Final = "rolloutfarm rollouts"
 _VIEW: Final = (160.0, -15.0)  # azimuth and elevation [deg]: robots that walk along x come towards the eye
 _SPACING: Final = 1.35  # in radii of the largest scene
-_WIDER: Final = 0.55  # so much farther away is the eye for each further scene, in spacings
+_WIDER: Final = 0.55  # the eye's additional distance per further scene, in spacings
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A run and its final policy's rollout; or any rollout under a name of its own."""
+    """A run and its final policy's rollout; or any rollout with its own name."""
 
     name: str
     drawing: Drawing
@@ -60,7 +60,7 @@ def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
 
 
 def record_side_by_side(path: Path, run: str, rollouts: Sequence[Shown], table: str) -> None:
-    """Write a run's rollouts with a table of them (Markdown); `progress` is not looked at.
+    """Write a run's rollouts with a table of them (Markdown); `progress` is not used.
 
     Raises:
       OSError: the file cannot be written.
@@ -92,7 +92,7 @@ def _record(
 
 
 def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
-    """From each scene to the next [m] (3,), across what the eye looks along; and the eye, before all of them."""
+    """The vector from each scene to the next [m] (3,), across the line of sight; and the eye that sees all of them."""
     sizes = [run.drawing.scene.radius for run in runs]
     largest = runs[int(np.argmax(sizes))].drawing
     camera = largest.camera or replace(beside(largest.scene), azimuth=_VIEW[0], elevation=_VIEW[1])
@@ -112,7 +112,7 @@ def _compared(runs: Sequence[Shown]) -> Channel | None:
 
 
 def _names(run: Shown, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:
-    """What never changes but the scene: names and the run's colour."""
+    """Static entities besides the scene: names and the run's colour."""
     size = run.drawing.scene.radius
     above = Eye.of(run.drawing.scene, run.drawing.camera).target + (0.0, 0.0, size)
     point = rr.Points3D([above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True)
@@ -126,7 +126,7 @@ def _names(run: Shown, colour: Colour, compared: Channel | None, *, learning: bo
 
 
 def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats], final: float) -> None:
-    """The learning curves. A mean policy's return stands at the updates and rollouts behind it."""
+    """The learning curves. A mean policy's return is at the number of updates and rollouts before it."""
     at = [
         rr.TimeColumn("generation", sequence=[s.generation for s in progress]),
         rr.TimeColumn("rollouts", sequence=[s.rollouts for s in progress]),
@@ -147,7 +147,7 @@ def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[Gener
 
 
 def _send_rollout(stream: rr.RecordingStream, root: str, run: Shown, compared: Channel | None) -> None:
-    """The rollout's frames; on the timelines of the curves all are there from the beginning."""
+    """The rollout's frames; on the timelines of the curves all exist from the start."""
     rollout = run.rollout
     before = np.zeros(len(rollout.times), dtype=np.int64)
     at = [*times("generation", before, rollout.times), rr.TimeColumn("rollouts", sequence=before)]

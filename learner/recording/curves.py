@@ -22,7 +22,7 @@ VERMILLION: Final = (213, 94, 0)
 GREY: Final = (150, 150, 150)
 
 PALETTE: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
-"""Colours of what has none of its own, by Okabe and Ito."""
+"""Default colours, by Okabe and Ito."""
 
 _RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
     [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
@@ -30,12 +30,12 @@ _RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alik
 
 
 def palette(count: int) -> list[Colour]:
-    """So many colours; they repeat after seven."""
+    """This number of colours; they repeat after seven."""
     return list(islice(cycle(PALETTE), count))
 
 
 def lighter(colour: Colour) -> Colour:
-    """Halfway to white."""
+    """A colour halfway to white."""
     red, green, blue = ((255 + part) // 2 for part in colour)
     return red, green, blue
 
@@ -67,7 +67,7 @@ def pack(colour: Colour) -> int:
 
 
 def static(*, success: bool) -> list[tuple[str, Any]]:
-    """Names and colours of the learning curves, in the order of `statistics`; with success where the task knows it."""
+    """Names and colours of the learning curves, in the order of `statistics`; with success if the task defines it."""
     returns = ("mean", "min", "max", "best", "baseline")
     colours = (SKY, VERMILLION, GREEN, ORANGE, GREY)
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
@@ -88,7 +88,7 @@ def static(*, success: bool) -> list[tuple[str, Any]]:
 
 
 def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
-    """What a generation's exploring rollouts gave; rate is of these [1/s]."""
+    """Statistics of a generation's exploring rollouts; `rate` is theirs [1/s]."""
     s = stats
     baseline = np.nan if s.baseline is None else s.baseline
     success = []
@@ -110,6 +110,6 @@ def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
 
 
 def mean_policy(value: float, success: bool | None) -> list[tuple[str, Any]]:
-    """The return of a mean policy, and whether it succeeds (None where the task knows no success)."""
+    """The return of a mean policy, and whether it succeeds (None if the task does not define success)."""
     succeeds = [] if success is None else [("/learning/mean_policy/success", rr.Scalars([float(success)]))]
     return [("/learning/mean_policy/return", rr.Scalars([value])), *succeeds]

@@ -1,6 +1,6 @@
-"""A scene and its rollouts as Rerun entities: what never changes, and columns for what moves.
+"""A scene and its rollouts as Rerun entities: static parts, and columns for moving ones.
 
-Bodies hang flat below /world: /world/<body>, with its geometries as children.
+All bodies are directly below /world: /world/<body>, with its geometries as children.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,17 +21,17 @@ from learner.recording.solids import solid, xyzw
 from learner.setup import Problem
 
 CAPTION: Final = "/world/caption"
-"""Entity of what is written in the scene."""
+"""Entity of the text in the scene."""
 
 _WHITE: Final = (255, 255, 255)
-_ABOVE: Final = 0.75  # so many radii of the scene above its middle stands the caption
+_ABOVE: Final = 0.75  # height of the caption above the scene's middle, in radii of the scene
 
 
 class Drawing:
     """How a task's scene and rollouts are drawn."""
 
     def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None) -> None:
-        """Of a scene, with the channels of its task; seen from a camera, or (None) from beside what moves."""
+        """Draw a scene with its task's channels; seen from a camera, or (None) from the side of the moving bodies."""
         self.scene, self.spec, self.camera = scene, spec, camera
         self._channels = {channel.name: ChannelDrawing(channel, scene) for channel in spec.channels}
 
@@ -57,7 +57,7 @@ class Drawing:
             yield from channel.static()
 
     def check(self, rollout: Trajectory) -> None:
-        """Check that a rollout is one of this scene and task: a ValueError says why not."""
+        """Check that a rollout belongs to this scene and task; raises ValueError otherwise."""
         count, arrays = len(rollout.times), rollout.arrays()
         for name, shape in self.spec.shapes(len(self.scene.bodies)).items():
             found = arrays[name].shape if name in arrays else None
@@ -65,9 +65,9 @@ class Drawing:
                 raise ValueError(f"{name} of shape {found}, expected {(count, *shape)}: another scene or task?")
 
     def captions(self, rollouts: Sequence[tuple[str, Trajectory]]) -> Columns:
-        """What stands in the scene about the frames of rollouts with their names, one after the other.
+        """Texts in the scene for the frames of named rollouts, one rollout after the other.
 
-        That is the rollout's name, return and success, and how far the first free body has moved since its start.
+        Each has the rollout's name, return and success, and how far the first free body has moved since its start.
         """
         eye = Eye.of(self.scene, self.camera)
         place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
@@ -78,7 +78,7 @@ class Drawing:
         return Columns(CAPTION, values.partition(np.ones(len(texts), dtype=int)))
 
     def _moved(self, rollout: Trajectory, body: str | None) -> FloatArray:
-        """How far a body has moved since the start [m], (F, 3); without one, not at all."""
+        """Displacement of a body since the start [m], (F, 3); zero without a body."""
         if body is None:
             return np.zeros((len(rollout.times), 3))
         places = rollout.bodies[:, self.scene.bodies.index(body), :3]

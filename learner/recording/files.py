@@ -1,7 +1,7 @@
 """The files of a recording: parts that a run left behind, merged, repaired and compacted.
 
-Rerun overwrites a file it is given, and a file whose last bytes a crash tore off cannot be read until `rerun rrd
-optimize` has repaired it. So a run that goes on repairs what is there and begins a part of its own.
+Rerun overwrites the file it is given, and a file truncated by a crash cannot be read until `rerun rrd optimize` has
+repaired it. So a run that continues repairs its existing files and starts a new part.
 """
 
 import json
@@ -29,11 +29,11 @@ if sys.platform == "linux":
         sys.exit(1)
 os.execvp(sys.argv[2], sys.argv[2:])
 """
-"""Becomes the program in its arguments, which ends when its parent, named first, is killed."""
+"""Runs the program in its arguments, which ends when its parent, given first, is killed."""
 
 
 def parts(path: Path) -> list[Path]:
-    """The files of a recording that are there: run.rrd, run.part2.rrd, ...; open them together."""
+    """The existing files of a recording: run.rrd, run.part2.rrd, ...; open them together."""
     further = [f for f in path.parent.glob(f"{path.stem}.part*{path.suffix}") if _number(path, f)]
     further.sort(key=lambda f: _number(path, f))
     return [path, *further] if path.exists() else further
@@ -47,10 +47,10 @@ def program() -> str:
 
 
 def compact(path: Path) -> bool:
-    """Merge a recording's parts into one compact file, repairing an end that a crash tore off.
+    """Merge a recording's parts into one compact file, repairing one truncated by a crash.
 
     Returns:
-      whether it worked; where not, every part is as it was.
+      whether it worked; if not, every part is unchanged.
     """
     found = parts(path)
     merged, home = _left_behind(path)
@@ -70,7 +70,7 @@ def compact(path: Path) -> bool:
 
 
 def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
-    """Have a compacted recording open with one layout, which `layout` writes to a file: it keeps several in any order.
+    """Give a compacted recording one layout, which `layout` writes to a file; it may have kept several in any order.
 
     Raises:
       OSError: the disk is full, or Rerun's command fails; the file is as it was.
@@ -95,13 +95,13 @@ def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
 
 
 def _call(command: list[str], environment: dict[str, str]) -> None:
-    """Run a command of Rerun's, which ends with this process."""
+    """Run a command of Rerun that ends with this process."""
     bound = [sys.executable, "-ISc", _ENDS_WITH_PARENT, str(os.getpid()), *command]
     subprocess.run(bound, env=environment, check=True, capture_output=True, timeout=COMPACTING)
 
 
 def tidy(path: Path) -> None:
-    """Remove what a process that was killed while it compacted a recording left beside it."""
+    """Remove temporary files of a process that was killed while compacting this recording."""
     merged, home = _left_behind(path)
     with suppress(OSError):
         merged.unlink(missing_ok=True)
@@ -114,7 +114,7 @@ def _left_behind(path: Path) -> tuple[Path, Path]:
 
 
 def next_part(path: Path) -> Path:
-    """Where a run goes on recording; what is there becomes one file first, if it can."""
+    """The file in which a run continues to record; existing parts are merged first, if possible."""
     path.parent.mkdir(parents=True, exist_ok=True)
     tidy(path)
     if not parts(path):
@@ -125,7 +125,7 @@ def next_part(path: Path) -> Path:
 
 
 def _number(path: Path, part: Path) -> int:
-    """Which part a file is, 0 where it is none."""
+    """Number of a part, 0 if the file is not one."""
     digits = part.name.removeprefix(f"{path.stem}.part").removesuffix(path.suffix)
     return int(digits) if digits.isdecimal() else 0
 

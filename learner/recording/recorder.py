@@ -1,15 +1,15 @@
 """A run as a Rerun recording: into a file, and live to viewers.
 
-One recording a run, its id the run's name. Every row stands on three timelines:
+One recording per run, with the run's name as its id. Every row is on three timelines:
 
     generation   updates done, a sequence
     sim_time     generation x length of a rollout + time in that rollout, a duration without gaps
     wall_time    when it was recorded; a rollout's frames fill the time since the last one
 
-A mean policy, its rollout among it, stands at the number of updates that led to it, 0 for the first: generation G
-explores around the mean after G - 1 updates. A finished run's last policy stands at its last generation.
+A mean policy, including its rollout, is at the number of updates before it, 0 for the first: generation G explores
+around the mean after G - 1 updates. A finished run's last policy is at its last generation.
 
-A file is never overwritten: a run that goes on writes run.part2.rrd, and closing merges the parts
+A file is never overwritten: a run that continues writes run.part2.rrd, and closing merges the parts
 into run.rrd and compacts it. All parts opened together are one recording as well.
 """
 
@@ -54,16 +54,16 @@ from learner.recording.rows import (
 log = logging.getLogger(__name__)
 
 HOLD: Final = 0.5
-"""Rollouts of so long are written together, statistics at once: a row costs much more than what it says [s]."""
+"""Rollouts of this duration are written together: writing a row costs much more than its data [s]."""
 RESERVE: Final = 32 << 20
-"""Free space on the disk below which a recording ends [bytes]."""
+"""Free disk space below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
-"""A rollout's last frame comes so much before the next one's first, which would hide it [s]."""
+"""Time from a rollout's last frame to the next one's first, which would hide it otherwise [s]."""
 _LEVELS: Final = {"WARNING": "WARN"}  # the standard library's name in Rerun's
 
 
 class Recorder:
-    """Writes a run down, generation by generation."""
+    """Records a run, generation by generation."""
 
     def __init__(
         self,
@@ -77,20 +77,20 @@ class Recorder:
         properties: Mapping[str, object] | None = None,
         again: Callable[[GenerationStats], str] | None = None,
     ) -> None:
-        """Open the file, its next part where it is there already, and the server.
+        """Open the file, or its next part if it exists, and the server.
 
         Args:
           path: of the recording.
           run: its name.
-          drawing: what is drawn, and how.
+          drawing: the scene and its channels.
           config: the resolved configuration, Markdown.
           serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
-          properties: what tells the run from others.
-          again: how a generation is seen again, Markdown.
+          properties: values that identify the run.
+          again: how to show a generation again, Markdown.
 
         Raises:
-          ConfigError: neither path nor address, or the address is taken.
+          ConfigError: neither path nor address, or the address is in use.
           OSError: the file cannot be written.
         """
         if path is None and serve is None:
@@ -107,7 +107,7 @@ class Recorder:
         if scene.left_out:
             log.info("%d height fields or distance fields of the scene are not drawn", scene.left_out)
         self.uri: str | None = None
-        """Address that a viewer opens: `rerun URI`; None where nothing is served."""
+        """Address for viewers: `rerun URI`; None without a server."""
         sinks: list[Any] = []
         if serve is not None:
             host, port = serve[0], _free_port(*serve)
@@ -130,18 +130,18 @@ class Recorder:
         traces: Mapping[str, AnyArray],
         rate: float,
     ) -> None:
-        """Record a generation that is over; its rollout may be held back for HOLD, or until `settle` or `close`.
+        """Record a finished generation; its rollout may be held back for HOLD, or until `settle` or `close`.
 
         Args:
           stats: its statistics.
           sample: a rollout at control rate, usually the mean policy's.
           traces: `best` and `worst` (T, K) are drawn as pictures; `all` (2N, T, K) float32 is kept bit by bit. K are
             the traced channels' values side by side, see `farm.tasks.base.flat`.
-          rate: exploring rollouts a second.
+          rate: exploring rollouts per second.
 
         Raises:
           ValueError: the sample or a trace has another shape.
-          OSError: the file takes no more (a full disk); what is there stays.
+          OSError: the file cannot be written (a full disk); what it has stays.
         """
         self._check_space()
         if sample is not None:
@@ -162,7 +162,7 @@ class Recorder:
         self._flush()
 
     def settle(self) -> None:
-        """Write what is held back.
+        """Write the rollouts that are held back.
 
         Raises:
           OSError: the file takes no more.
@@ -172,7 +172,7 @@ class Recorder:
             self._flush()
 
     def final(self, rollout: Trajectory) -> None:
-        """Record the finished run's mean policy, and have viewers open with its rollout, playing again and again.
+        """Record the finished run's mean policy, and make viewers open with its rollout, playing repeatedly.
 
         Raises:
           ValueError: it is a rollout of another scene or task.
@@ -187,7 +187,7 @@ class Recorder:
         self.settle()
 
     def log(self, text: str, level: str = "INFO") -> None:
-        """Record a line; levels are those of the standard library."""
+        """Record a log message; levels are those of the standard library."""
         self._stream.send_columns("/log", self._at(time.time()), row(rr.TextLog(text, level=_LEVELS.get(level, level))))
 
     def result(self, values: Mapping[str, object]) -> None:
@@ -195,7 +195,7 @@ class Recorder:
         send_properties(self._stream, "result", values)
 
     def close(self, *, merge: bool = True) -> None:
-        """Write everything out, merge the parts and compact them if wanted; a broken recording is left as it is.
+        """Write everything, merge the parts and compact them if requested; a broken recording stays unchanged.
 
         Raises:
           OSError: the file takes no more.
@@ -218,7 +218,7 @@ class Recorder:
         return rr.Tensor(np.ascontiguousarray(values, dtype=np.float32), dim_names=("rollout", "step", "value"))
 
     def _draw(self) -> None:
-        """Send the rollouts that are held back, each entity's rows of all of them together."""
+        """Send the rollouts that are held back, all rows of an entity together."""
         held, self._held = self._held, []
         if not held:
             return
@@ -238,7 +238,7 @@ class Recorder:
             raise
 
     def _check_space(self) -> None:
-        """Stop before Rerun meets a full disk."""
+        """Stop before the disk is full for Rerun."""
         if self._path is None:
             return
         free = shutil.disk_usage(self._path.parent).free
@@ -251,27 +251,27 @@ class Recorder:
             self._stream.send_columns(entity, at, row(archetype))
 
     def _hold(self, rollout: Trajectory, generation: int, now: float) -> None:
-        """Have a mean policy's rollout wait to be written, with those that come soon."""
+        """Hold back a mean policy's rollout, to be written together with the next ones."""
         start = generation * self._horizon
         wall = now + (rollout.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
         sim = np.minimum(start + rollout.times, start + self._horizon - SEAM)
         self._held.append(_Held(now, generation, sim, wall, rollout))
 
     def _at(self, now: float, generation: int | None = None) -> list[rr.TimeColumn]:
-        """Where a generation begins (None: the one that was recorded last), recorded now [s since the epoch]."""
+        """Start of a generation (None: the one recorded last) that is recorded now [s since the epoch]."""
         numbers = np.array([self._generation if generation is None else generation])
         return times("generation", numbers, numbers * self._horizon, np.array([now]))
 
 
 @dataclass(frozen=True)
 class _Held:
-    """A rollout that waits to be written."""
+    """A rollout that is held back."""
 
     since: float
-    """When it came [s since the epoch]."""
+    """When it was recorded [s since the epoch]."""
     generation: int
     sim: FloatArray
-    """Where its frames stand on sim_time [s], (F,)"""
+    """Its frames' times on sim_time [s], (F,)"""
     wall: FloatArray
     """And on wall_time [s since the epoch], (F,)"""
     rollout: Trajectory

@@ -1,4 +1,4 @@
-"""A recording of a run that is learnt elsewhere, in a folder of its own, continued where its file ends."""
+"""A recording of a run on another machine, in its own folder, continued where its file ends."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -24,11 +24,11 @@ _STATISTICS: Final = "/learning/return"  # an entity that has one row a generati
 
 @dataclass
 class Remote:
-    """A recording of a run that is learnt elsewhere."""
+    """A recording of a run on another machine."""
 
     recording: RunRecording
     folder: RunFolder | None
-    """Where the files go, None for none."""
+    """Folder of the files, None for none."""
     done: int
     """Generations that are recorded."""
     end: RunEnd | None = None
@@ -52,7 +52,7 @@ class Remote:
                     raise RunError(f"the learner cannot be understood: {error}") from None
                 self.done = message.generation
             if not self.recording.thread.settled():
-                raise RunError("the recording ended before its time; the line above says why")
+                raise RunError("the recording ended too early; see the message above")
 
     def _end(self, end: RunEnd) -> None:
         self.end = end
@@ -72,10 +72,10 @@ def open_remote(
     serve: tuple[str, int] | None,
     drawing: Drawing,
 ) -> Iterator[Remote]:
-    """Begin a recording in a folder (None: serve only), or continue the one that is there; `name` is its id.
+    """Start a recording in a folder (None: serve only), or continue an existing one; `name` is its id.
 
     Raises:
-      ConfigError: the folder is another run's or the learner's, or the address is taken.
+      ConfigError: the folder is another run's or the learner's, or the address is in use.
     """
     folder = None if path is None else _folder(path, config)
     with nullcontext() if folder is None else folder.held():
@@ -91,13 +91,13 @@ def open_remote(
 
 
 def _recorded(path: Path) -> int:
-    """The last generation that a recording's files hold, 0 where there are none; torn files are repaired first."""
+    """The last generation in a recording's files, 0 if there are none; truncated files are repaired first."""
     if parts(path):
         compact(path)
     try:
         chunks = (chunk for part in parts(path) for chunk in RrdReader(part).stream())
         batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == _STATISTICS]
-    except Exception as error:  # Rerun's reader raises many kinds
+    except Exception as error:  # Rerun's reader raises many types
         raise ConfigError(f"cannot read {path}: {error}; move it away, or choose another --out") from None
     numbers = [
         batch.column("generation").cast("int64").to_pylist() for batch in batches if "generation" in batch.schema.names

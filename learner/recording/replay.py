@@ -1,4 +1,4 @@
-"""Rollouts in a recording of their own, one after the other."""
+"""Rollouts in a separate recording, one after the other."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from learner.recording.files import compact
 from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, times
 
 PAUSE: Final = 0.1
-"""Between two rollouts of a replay [s]."""
+"""Pause between two rollouts of a replay [s]."""
 
 
 def record_replay(
@@ -26,13 +26,13 @@ def record_replay(
     config: str,
     rollouts: Sequence[tuple[str, Trajectory]],
 ) -> None:
-    """Write rollouts into a file of their own; it may replace one.
+    """Write rollouts into a separate file; an existing one is replaced.
 
     Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1. The recording's id is
     `<run>-replay`; config is the resolved configuration, Markdown. A rollout whose return is not a number has none.
 
     Raises:
-      OSError: the file cannot be written; one that was there stays.
+      OSError: the file cannot be written; an existing one stays.
     """
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
     aside = path.with_name(f"{path.stem}.new{path.suffix}")

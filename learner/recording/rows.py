@@ -1,4 +1,4 @@
-"""A Rerun recording, and how rows get into it: several at once, on timelines of our own."""
+"""Opens Rerun recordings and writes rows to them: several at once, on our own timelines."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ APPLICATION: Final = "rolloutfarm"
 def begin(
     recording: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION
 ) -> rr.RecordingStream:
-    """Open a recording of that id into these sinks, its layout first; the viewer keeps one layout an application."""
+    """Open a recording with that id for these sinks, layout first; the viewer keeps one layout per application."""
     rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
     stream = rr.RecordingStream(application, recording_id=recording)
     stream.set_sinks(*sinks)
@@ -30,7 +30,7 @@ def begin(
 
 
 def file_sink(path: Path) -> rr.FileSink:
-    """Open a recording's next file; an OSError where it cannot be written."""
+    """Open a recording's next file; an OSError if it cannot be written."""
     part = next_part(path)
     part.touch()  # fails with an errno; Rerun's own error has none
     return rr.FileSink(part)
@@ -40,19 +40,19 @@ def flush(stream: rr.RecordingStream) -> None:
     """Wait until every row is in the files.
 
     Raises:
-      OSError: the files take no more; the stream writes nothing any more.
+      OSError: the files cannot be written; the stream writes nothing more.
     """
     try:
         stream.flush(timeout_sec=FLUSH)
     except RuntimeError as error:
-        # Rerun would now wait for this file for ever, at the latest when the process ends.
+        # Rerun would wait for this file forever, at the latest when the process ends.
         rr.unregister_shutdown()
         stream.inner = _Abandoned()  # type: ignore[assignment]
-        raise OSError(f"Rerun writes no more: {error}") from error
+        raise OSError(f"Rerun has stopped writing: {error}") from error
 
 
 class _Abandoned:
-    """Stands in for a native recording that must not be waited for."""
+    """Replaces a native recording that must not be waited for."""
 
     def is_forked_child(self) -> bool:
         """Return true: Rerun releases those without waiting."""
@@ -60,14 +60,14 @@ class _Abandoned:
 
 
 def send_properties(stream: rr.RecordingStream, name: str, values: Mapping[str, object]) -> None:
-    """Send what a table of recordings shows of this one; sent again, they replace the former values."""
+    """Send properties that a table of recordings shows; later values replace earlier ones."""
     known: dict[str, Any] = {key: value for key, value in values.items() if value is not None}
     if known:
         stream.send_property(name, rr.AnyValues(**known))
 
 
 def log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:
-    """Log what holds at any time."""
+    """Log static entities."""
     for entity, archetype in entities:
         stream.log(entity, archetype, static=True)
 

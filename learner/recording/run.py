@@ -1,4 +1,4 @@
-"""A run's recordings: the live one, written by a thread of its own, and the replays at physics rate."""
+"""A run's recordings: the live one, written by a separate thread, and the replays at physics rate."""
 
 import contextlib
 import json
@@ -26,29 +26,29 @@ from learner.telemetry.report import Report
 log = logging.getLogger(__name__)
 
 WAITING: Final = 256
-"""Messages that may wait before rollouts and traces are dropped."""
+"""Length of the queue at which rollouts and traces are dropped."""
 
 QUIET: Final = 0.5
-"""When nothing has come for so long, what the recorder holds back is written [s]."""
+"""Rollouts that are held back are written after this time without a new one [s]."""
 
-_CLOSE: Final = 60.0  # [s] for what still waits to be written
+_CLOSE: Final = 60.0  # [s] for writing the queue at the end
 
 
 class RecorderThread:
-    """Calls a recorder in a thread of its own: learning never waits for it, nor fails with it.
+    """Calls a recorder in a separate thread: learning never waits for it and never fails because of it.
 
-    When more than `waiting` messages wait, rollouts and traces are dropped, and counted; statistics and lines never. A
-    recorder that fails (a full disk) ends the recording with one line in the log.
+    If more than `waiting` messages are queued, rollouts and traces are dropped and counted, but never statistics and
+    log messages. A recorder that fails (a full disk) ends the recording with one message in the log.
     """
 
     def __init__(self, recorder: Recorder, waiting: int = WAITING) -> None:
         self._recorder, self._waiting = recorder, waiting
         self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self.failed = False
-        """Whether the recording ended before its time."""
+        """Whether the recording ended too early."""
         self._merge = True
         self.dropped = 0
-        """Generations recorded without their rollout and traces, because too many waited."""
+        """Number of generations recorded without their rollout and traces, because the queue was full."""
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
@@ -67,7 +67,7 @@ class RecorderThread:
         self.put(lambda: self._recorder.generation(stats, sample, traces, rate))
 
     def settled(self) -> bool:
-        """Wait until what was queued is recorded; return false when the recording ended before its time."""
+        """Wait until the queue is recorded; return false if the recording ended too early."""
         reached = threading.Event()
         self.put(self._recorder.settle)
         self.put(reached.set)
@@ -76,7 +76,7 @@ class RecorderThread:
         return not self.failed
 
     def close(self, timeout: float | None = None, *, merge: bool = True) -> bool:
-        """Record what waits within a timeout [s], compact the file if wanted; return whether everything is recorded."""
+        """Record the queue within a timeout [s], compact the file if requested; return whether all is recorded."""
         self._merge = merge
         self._queue.put(None)
         self._thread.join(timeout)
@@ -92,18 +92,18 @@ class RecorderThread:
             self._recorder.close(merge=self._merge)
         except Exception as error:
             self.failed = True
-            log.error("the recording ends here, learning goes on: %s", error)
+            log.error("the recording ends here, learning continues: %s", error)
             self._abandon()
 
     def _next(self) -> Callable[[], None] | None:
-        """Return the next call; where none comes for a while, the one that writes what is held back."""
+        """Return the next call; if there is none for a while, the one that writes held back rollouts."""
         try:
             return self._queue.get(timeout=QUIET)
         except queue.Empty:
             return self._recorder.settle
 
     def _abandon(self) -> None:
-        """Empty the queue, and keep what is recorded as far as that goes."""
+        """Empty the queue, and save what is recorded as far as possible."""
         while not self._queue.empty():
             self._queue.get()
         with contextlib.suppress(Exception):
@@ -111,7 +111,7 @@ class RecorderThread:
 
 
 class RunRecording(logging.Handler):
-    """A run's recordings, from its reports and log messages; what goes wrong here never reaches the learning."""
+    """A run's recordings, from its reports and log messages; errors here never affect learning."""
 
     def __init__(
         self,
@@ -125,12 +125,12 @@ class RunRecording(logging.Handler):
         serve: tuple[str, int] | None,
         folder: Path | None = None,
     ) -> None:
-        """Open the file and, if wanted, the server; see `Recorder`. `replay` is of the recording at physics rate.
+        """Open the file and, if requested, the server; see `Recorder`. `replay` is the recording at physics rate.
 
-        `folder` is the run's own, which commands in the recording's text name; None where it is on another machine.
+        `folder` is the run's own, for commands in the recording's text; None if it is on another machine.
 
         Raises:
-          ConfigError: the address is taken, or the file cannot be written.
+          ConfigError: the address is in use, or the file cannot be written.
         """
         super().__init__(logging.INFO)
         self._replay, ending = replay, plugins.find("tasks", config.task).target.ending
@@ -151,11 +151,11 @@ class RunRecording(logging.Handler):
         self.line(record.levelname, record.getMessage())
 
     def line(self, level: str, text: str) -> None:
-        """Record a line; levels are those of the standard library."""
+        """Record a log message; levels are those of the standard library."""
         self.thread.put(lambda: self._recorder.log(text, level))
 
     def generation(self, report: Report) -> None:
-        """Record a generation; the best rollout at physics rate goes into replay.rrd when there is a new one."""
+        """Record a generation; a new best rollout at physics rate is written to replay.rrd."""
         self.thread.generation(report.progress, report.sample, report.traces, report.rate)
         if report.progress.return_max >= report.progress.best:
             self.line("INFO", f"new best rollout: return {report.progress.best:.3f}")
@@ -164,9 +164,9 @@ class RunRecording(logging.Handler):
             self._write_replay([self._best])
 
     def end(self, generation: int, mean: Trajectory | None, best: Trajectory | None, best_generation: int) -> None:
-        """Record a run's end after so many updates, and write replay.rrd once more; no best where it was there before.
+        """Record a run's end after this number of updates, and write replay.rrd again; `best` is None if already there.
 
-        The rollouts are of the final mean policy, and the best one with the generation it came from.
+        The rollouts are those of the final mean policy, and the best one with its generation.
         """
         self._ended = True
         if best is not None:
@@ -181,7 +181,7 @@ class RunRecording(logging.Handler):
             self._write_replay(rollouts)
 
     def finish(self) -> None:
-        """Write out what waits, and close; an interrupted run's parts are merged only when it goes on."""
+        """Write the queue, and close; an interrupted run's parts are merged when it continues."""
         logging.getLogger().removeHandler(self)
         self.thread.close(_CLOSE + (COMPACTING if self._ended else 0.0), merge=self._ended)
 
@@ -192,14 +192,14 @@ class RunRecording(logging.Handler):
 
 
 def markdown(config: RunConfig) -> str:
-    """A configuration as the recording shows it."""
+    """A configuration for display in the recording."""
     return f"```json\n{json.dumps(configs.to_dict(config), indent=2)}\n```"
 
 
 def again(folder: str, ending: str, stats: GenerationStats) -> str:
-    """The commands that show a generation again, Markdown; `ending` is the task's word for what it ended.
+    """The commands that show a generation again, Markdown; `ending` is the task's word for rollouts that it ended.
 
-    The rollout in view is of the mean policy after that generation.
+    The displayed rollout is of the mean policy after that generation.
     """
     replay = f"farm replay {folder} --generation"
     chosen = ["--best 5", "--worst 5", *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else [])]

@@ -12,11 +12,11 @@ from rerun.experimental import ViewerClient, ViewerState
 log = logging.getLogger(__name__)
 
 _LOADING: Final = 60.0  # [s]
-_PERIOD: Final = 0.2  # [s] between two questions to a viewer that starts
+_PERIOD: Final = 0.2  # [s] between two requests to a viewer that starts
 
 
 def free_port(rather: int = 0) -> int:
-    """A free port on this machine: `rather` if it is free."""
+    """A free port on this machine; `rather` is preferred."""
     with socket.socket() as probe:
         try:
             probe.bind(("127.0.0.1", rather))
@@ -26,7 +26,7 @@ def free_port(rather: int = 0) -> int:
 
 
 def listens(port: int, gone: Callable[[], bool]) -> bool:
-    """Wait until somebody listens on a port of this machine; false where the viewer is gone before."""
+    """Wait until a program listens on a port of this machine; false if the viewer ends before."""
     until = time.monotonic() + _LOADING
     while time.monotonic() < until and not gone():
         with socket.socket() as probe:
@@ -37,10 +37,10 @@ def listens(port: int, gone: Callable[[], bool]) -> bool:
 
 
 def show_table(port: int, gone: Callable[[], bool]) -> bool:
-    """Go from the recordings that the viewer on this port loads to the table of them all.
+    """Switch the viewer on this port from its recordings to the table of all of them.
 
     Returns:
-      whether it is shown; where not, the recordings are there all the same.
+      whether it is shown; the recordings are loaded in either case.
     """
 
     def go(viewer: ViewerClient, state: ViewerState) -> None:
@@ -50,7 +50,7 @@ def show_table(port: int, gone: Callable[[], bool]) -> bool:
 
 
 def show_newest(port: int, gone: Callable[[], bool]) -> bool:
-    """Begin at the newest rollout where a recording plays: a layout has no place for the cursor.
+    """Start playing a recording at the newest rollout: a layout cannot contain the cursor.
 
     Returns:
       whether the recording is loaded.
@@ -68,7 +68,7 @@ def _go_to_newest(viewer: ViewerClient, state: ViewerState) -> None:
 
 
 def _once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
-    """Do something with the viewer on this port as soon as its recordings are loaded, and return whether it was."""
+    """Call a function with the viewer on this port as soon as its recordings are loaded; return whether it was done."""
     until = time.monotonic() + _LOADING
     while time.monotonic() < until and not gone():
         try:
@@ -84,6 +84,6 @@ def _once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClien
 
 
 def _table(catalog: str, recording: str) -> str:
-    """Where the viewer's catalog has the table that a recording is in: under its application's id."""
+    """Path in the viewer's catalog of a recording's table: under its application's id."""
     (application,) = parse_qs(urlsplit(recording).query)["app_id"]
     return f"{catalog}/entry/{application}"

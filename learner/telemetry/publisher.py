@@ -1,4 +1,4 @@
-"""A run for viewers over the network: every generation as it ends, and all earlier ones on request."""
+"""Publishes a run for viewers over the network: every generation as it ends, and earlier ones on request."""
 
 import logging
 import time
@@ -24,18 +24,18 @@ LINES: Final = 100
 LINE: Final = 500
 """Characters of a line."""
 _TRACES: Final = 8 << 20  # [bytes]; larger traces of all rollouts stay with the learner
-_FAREWELL: Final = 5.0  # [s] that recorders have to fetch the end
-_LOOK: Final = 0.02  # [s] between two looks at whether they have
+_FAREWELL: Final = 5.0  # [s] for recorders to fetch the end
+_LOOK: Final = 0.02  # [s] between two checks whether they have
 
 
 class Publisher(logging.Handler):
     """Publishes each generation's report without waiting; serves past reports on request.
 
-    What a recorder misses it notices by the generation's number, and asks for.
+    A recorder notices missing reports by their generations' numbers, and requests them.
     """
 
     def __init__(self, session: Session, farm: str, incarnation: str, learner: Learner) -> None:
-        """Begin with what the run's folder knows of generations before."""
+        """Start with the earlier generations in the run's folder."""
         super().__init__(logging.INFO)
         self._session, self._key, self._incarnation = session, keys.history(farm, learner.folder.name), incarnation
         self._run, self._recording, self._config = learner.folder.name, learner.run, configs.to_dict(learner.config)
@@ -52,11 +52,11 @@ class Publisher(logging.Handler):
         logging.getLogger().addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send a line with the next report."""
+        """Send a log message with the next report."""
         self._lines = [*self._lines[1 - LINES :], Line(level=record.levelname, text=record.getMessage()[:LINE])]
 
     def generation(self, report: Report) -> None:
-        """Say that a generation is over."""
+        """Publish a finished generation."""
         message = packed(self._bounded(report), self._run, self._incarnation, self._taken())
         if message.replay is not None:
             self._best = message.replay, message.replay_generation
@@ -80,15 +80,15 @@ class Publisher(logging.Handler):
             time.sleep(_LOOK)
 
     def close(self) -> None:
-        """Take no more lines."""
+        """Accept no more log messages."""
         logging.getLogger().removeHandler(self)
         super().close()
 
     def _page(self, asked: str) -> bytes:
-        """What was reported from a generation on: `from=<generation>`; answers on a thread of its own."""
+        """Past reports from a generation on: `from=<generation>`; called on another thread."""
         digits = asked.removeprefix("from=")[:12]
         first = int(digits) if digits.isascii() and digits.isdigit() else 1
-        done, end = self._generation, self._end  # before the reports, which may go on meanwhile
+        done, end = self._generation, self._end  # before the reports, which may grow meanwhile
         return codec.encode(
             RunHistory(
                 run=self._run,
@@ -109,7 +109,7 @@ class Publisher(logging.Handler):
         return lines
 
     def _bounded(self, report: Report) -> Report:
-        """The report without the traces of all rollouts, if a message should not be so large."""
+        """The report, without the traces of all rollouts if they are too large for a message."""
         if "all" not in report.traces or report.traces["all"].nbytes <= _TRACES:
             return report
         if not self._told:
@@ -120,7 +120,7 @@ class Publisher(logging.Handler):
 
 
 def _before(progress: list[GenerationStats], run: str, incarnation: str) -> Iterator[RunReport]:
-    """Reports of the generations that the folder knows, without rollouts."""
+    """Reports of the generations in the folder, without rollouts."""
     rollouts, seconds = 0, 0.0
     for p in progress:
         rate = (p.rollouts - rollouts) / max(p.seconds - seconds, 1e-3)  # seconds are written to the millisecond

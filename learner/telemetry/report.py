@@ -15,23 +15,23 @@ from farm.sim.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Report:
-    """A generation that is over."""
+    """A finished generation."""
 
     progress: GenerationStats
     rate: float
-    """Rollouts a second over this generation."""
+    """Rollouts per second in this generation."""
     sample: Trajectory | None
     """The mean policy's rollout."""
     traces: Mapping[str, AnyArray]
     """Traces: `best` and `worst` (T, N), and `all` (2N, T, N) if the run keeps them."""
     replay: Trajectory | None
-    """The best rollout so far at physics rate, once there is a new one."""
+    """The best rollout so far at physics rate, if there is a new one."""
     replay_generation: int
-    """The generation the replayed rollout came from."""
+    """The generation of the replayed rollout."""
 
 
 def packed(report: Report, run: str, incarnation: str, lines: tuple[Line, ...]) -> RunReport:
-    """A report as it is sent, with what was said meanwhile."""
+    """A report's message, with the log messages since the previous one."""
     traces = {name: values if name == "all" else values[None] for name, values in report.traces.items()}
     return RunReport(
         run=run,
@@ -49,7 +49,7 @@ def packed(report: Report, run: str, incarnation: str, lines: tuple[Line, ...]) 
 
 
 def unpacked(message: RunReport) -> Report:
-    """A report as it was; a MessageError where its progress makes no sense."""
+    """The report in a message; a MessageError if its progress is invalid."""
     try:
         progress = GenerationStats.from_dict(message.progress)
     except ValueError as error:
@@ -67,5 +67,5 @@ def unpacked(message: RunReport) -> Report:
 
 
 def wire(trajectory: Trajectory | None) -> WireTrajectory | None:
-    """A trajectory as it is sent."""
+    """A trajectory for sending."""
     return None if trajectory is None else WireTrajectory.of(trajectory)

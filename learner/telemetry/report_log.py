@@ -1,4 +1,4 @@
-"""What a run reported so far, for recorders that join late. Bounded: old rollouts go, statistics stay."""
+"""A run's past reports, for recorders that join late. Limited in size: old rollouts are dropped, statistics kept."""
 
 import threading
 from collections import deque
@@ -9,26 +9,26 @@ from farm.net import codec
 from farm.net.telemetry import RunReport
 
 MEMORY: Final = 32 << 20
-"""What rollouts and traces may take in memory [bytes]; the oldest go first."""
+"""Memory limit of rollouts and traces [bytes]; the oldest are dropped first."""
 
 PAGE: Final = 4 << 20
 """A page ends with the report that reaches this size [bytes]."""
 
-_PLAIN: Final = 600  # [bytes] of a report's statistics, about
+_PLAIN: Final = 600  # [bytes] of a report's statistics, approximately
 
 
 class ReportLog:
-    """Reports in order; written by the learner's thread, read by the one that answers."""
+    """Reports in order; written by the learner's thread, read by the thread that answers queries."""
 
     def __init__(self, memory: int = MEMORY, page: int = PAGE) -> None:
         self._memory, self._page = memory, page
         self._reports: list[RunReport | bytes] = []  # as bytes, statistics take a fifth
-        self._whole: deque[int] = deque()  # where the reports with rollouts or traces stand
+        self._whole: deque[int] = deque()  # positions of the reports with rollouts or traces
         self._size = 0
         self._lock = threading.Lock()
 
     def add(self, report: RunReport) -> None:
-        """Keep the next generation's report, and let go of the oldest rollouts if they are too many."""
+        """Keep the next generation's report, and drop the oldest rollouts if there are too many."""
         with self._lock:
             size = _size(report)
             self._reports.append(report if size else codec.encode(report))
@@ -42,7 +42,7 @@ class ReportLog:
                 self._reports[at] = codec.encode(statistics(oldest))
 
     def page(self, generation: int) -> tuple[RunReport, ...]:
-        """Reports from that generation on, as many as a message should hold; one at least, if there is one."""
+        """Reports from that generation on, as many as fit into a page; at least one, if there is one."""
         with self._lock:
             chosen: list[RunReport] = []
             size = 0
@@ -71,6 +71,6 @@ def statistics(report: RunReport) -> RunReport:
 
 
 def _size(report: RunReport) -> int:
-    """What rollouts and traces take [bytes]."""
+    """Size of rollouts and traces [bytes]."""
     shown = sum(part.nbytes for part in (report.sample, report.replay) if part)
     return shown + sum(trace.values.nbytes for trace in report.traces)

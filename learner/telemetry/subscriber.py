@@ -1,4 +1,4 @@
-"""Follows a run over the network: its reports in order, each once, even if either side is away for a time."""
+"""Follows a run over the network: its reports in order, each once, even if either side is offline for a time."""
 
 import logging
 import time
@@ -16,9 +16,9 @@ from learner.config import RunConfig
 
 log = logging.getLogger(__name__)
 
-_WAIT: Final = 0.2  # [s] between two looks at whether to stop
-_ANSWER: Final = 2.0  # [s] that a learner has to answer
-_AGAIN: Final = 1.0  # [s] after which one that did not is asked again
+_WAIT: Final = 0.2  # [s] between two checks whether to stop
+_ANSWER: Final = 2.0  # [s] for a learner to answer
+_AGAIN: Final = 1.0  # [s] after which a learner that did not answer is asked again
 _QUIET: Final = 3.0  # [s] without a report after which the last may have been lost
 
 
@@ -39,16 +39,16 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
         if not told:
             log.info("no run on farm %s yet, waiting for one", farm)
             told = True
-        # Asked again, not watched: of a token declared at this very moment a watch and a query may disagree.
+        # Queried repeatedly, not watched: for a token just being declared a watch and a query may disagree.
         session.events.waiting(_WAIT)
     raise Interrupted("stopped before there was a run")
 
 
 class Subscriber:
-    """Reads one run's reports as they come, and asks the learner for those it missed."""
+    """Reads one run's reports as they arrive, and requests missing ones from the learner."""
 
     def __init__(self, session: Session, farm: str, run: str, files: tuple[Path, ...] = ()) -> None:
-        """Subscribe: what is published from now on is not missed; `files` are those whose classes may be used."""
+        """Subscribe, so that no later report is missed; `files` are those whose classes may be used."""
         self._files = files
         self._session, self._run, self._key = session, run, keys.history(farm, run)
         self._done, self._incarnation = 0, ""
@@ -59,11 +59,11 @@ class Subscriber:
         session.watch("learner", keys.learner_token(farm, run))
 
     def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig, dict[str, str]]:
-        """The recording's id, the run's configuration and its task's texts, as soon as its learner is there.
+        """The recording's id, the run's configuration and its task's files, as soon as its learner answers.
 
         Raises:
-          ConfigError: the configuration is none of this release.
-          RunError: the learner speaks another version.
+          ConfigError: the configuration is not of this release.
+          RunError: the learner has another version.
           Interrupted: it was stopped.
         """
         told = False
@@ -83,7 +83,7 @@ class Subscriber:
         """Reports after generation `done` in order, each once; finally the end, when the run is over for good.
 
         Raises:
-          RunError: the run began anew with other settings, or its learner speaks another version.
+          RunError: the run was restarted with other settings, or its learner has another version.
         """
         self._done, self._ask_at = done, 0.0
         while not stopped():
@@ -104,7 +104,7 @@ class Subscriber:
         try:
             report = codec.decode(event.payload, RunReport)
         except MessageError:
-            self._ask_at = 0.0  # the history's answer is checked, and says what is wrong
+            self._ask_at = 0.0  # the history's answer is checked, with an error message
             return
         if report.incarnation != self._incarnation or report.generation > self._done + 1:
             self._ask_at = 0.0
@@ -114,7 +114,7 @@ class Subscriber:
             yield report
 
     def _note(self, event: Event) -> None:
-        """Look at what is not a report: mostly a reason to ask."""
+        """Handle an event that is not a report: mostly a reason to query the learner."""
         if event.topic == "learner" and not event.alive:
             log.warning("the learner of run %s is gone, waiting for it to come back", self._run)
         elif event.topic in ("learner", "history"):
@@ -135,9 +135,9 @@ class Subscriber:
         if page.incarnation != self._incarnation:
             self._recognise(page)
         if page.generation > self._done:
-            self._ask_at = 0.0  # at least one page more, until we are level
+            self._ask_at = 0.0  # at least one more page, until we are up to date
         if not page.reports:
-            self._done = max(self._done, page.generation)  # what its folder lost is not to be had
+            self._done = max(self._done, page.generation)  # reports missing in its folder are lost
         for report in page.reports:
             if report.generation > self._done:
                 self._done = report.generation

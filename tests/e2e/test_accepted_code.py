@@ -100,7 +100,8 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     assert max(took) < 2.0, "from the run's announcement to a whole generation [s]"
     said = "".join(map(ended, workers))
     for i, text in enumerate(texts):
-        assert f"run r{i}: pole.py (SHA-256 {hashlib.sha256(text.encode()).hexdigest()}) came from its learner" in said
+        sent = hashlib.sha256(text.encode()).hexdigest()
+        assert f"run r{i}: received pole.py (SHA-256 {sent}) from its learner" in said
     assert len({farm.summary(f"r{i}")["mean_policy_return"] for i in range(3)}) == 3, "each is another task"
     farm.call("run", "--task", "pole.py:Pole", "--name", "here", *FEW)
     assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
@@ -128,7 +129,7 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
         for worker in workers:
             said = ended(worker)
             for name in ("first", "second"):
-                assert f"run {name}: pole.py" in said
+                assert f"run {name}: received pole.py" in said
                 assert f"serving run {name}" in said
 
 
@@ -168,7 +169,7 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
 
 def test_what_is_refused_at_the_start(farm: Farm, certs: Path, task: Path) -> None:
     said = farm.call("worker", "--accept-code", "--processes", "1", status=2)
-    assert said == "farm: --accept-code needs --tls: without certificates anybody could send code\n"
+    assert said == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
     task.write_text(POLE + "#" * 1_000_000)
     tls = ("--listen", free_endpoint().replace("tcp/", "tls/"), "--tls", str(certs / "own"))
     said = farm.call("learner", "--task", "pole.py:Pole", "--name", "large", *FEW, *tls, status=2)
@@ -246,7 +247,7 @@ def test_who_listens_without_a_learners_certificate_of_this_authority_sends_no_c
     bundle = find(certs / "foreign", "learner") if who == "foreign" else Posing(folder, "learner", "w2")
     with session.listen(endpoint, "farm", bundle) as liar:
         pose(liar, "w1/1", "fake")
-        with pytest.raises(FarmError, match="nobody answers"), holding(endpoint, find(certs / "own", "worker", "w1")):
+        with pytest.raises(FarmError, match="no answer from"), holding(endpoint, find(certs / "own", "worker", "w1")):
             pass
 
 

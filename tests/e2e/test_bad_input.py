@@ -186,8 +186,8 @@ def test_a_port_in_use(farm: Farm) -> None:
 def test_nobody_answers(farm: Farm) -> None:
     endpoint = free_endpoint()
     said = farm.call("worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1)
-    assert f"nobody answers at {endpoint} yet, trying again" in said
-    assert f"nobody answers at {endpoint} after 4 s: start a learner there, or check --connect" in said
+    assert f"no answer from {endpoint} yet, trying again" in said
+    assert f"no answer from {endpoint} after 4 s: start a learner there, or check --connect" in said
     assert "Traceback" not in said
 
 

@@ -48,7 +48,7 @@ def test_a_run_that_is_begun_once_and_gone_on_with_later(farm: Farm) -> None:
     once = ("run", "--name", "r", "--resume-existing", *SMALL)
     farm.call(*once, "--generations", "2")
     said = farm.call(*once, "--generations", "6")
-    assert "going on after generation 2" in said
+    assert "continuing after generation 2" in said
     farm.call(*once, "--generations", "6")  # over already: evaluated again, nothing else
     assert len(farm.progress("r")) == 6
     assert farm.summary("r")["parameters_sha256"] == farm.summary("whole")["parameters_sha256"]

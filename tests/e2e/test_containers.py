@@ -169,7 +169,7 @@ def test_containers_that_die(farm: Farm, stack: Stack) -> None:
     lines = stack.read("progress.jsonl", farm.folder).splitlines()
     assert [json.loads(line)["generation"] for line in lines] == list(range(1, summary["generations"] + 1))
     assert summary["state"] == "interrupted"
-    assert "going on after generation" in stack.compose("logs", "--no-color", "learner")
+    assert "continuing after generation" in stack.compose("logs", "--no-color", "learner")
     expected = outside(farm, **{**settings, "GENERATIONS": str(summary["generations"])})
     assert summary["parameters_sha256"] == expected
 

@@ -71,7 +71,7 @@ def test_a_worker(farm: Farm, number: signal.Signals, record_property) -> None:
 def test_a_worker_that_finds_nobody(farm: Farm, record_property) -> None:
     worker = farm.start("worker", "--connect", free_endpoint(), "--processes", "2")
     assert worker.stdout
-    while "nobody answers" not in worker.stdout.readline():
+    while "no answer from" not in worker.stdout.readline():
         pass
     end(worker, signal.SIGINT, record_property)
     assert worker.returncode == 0
@@ -80,7 +80,7 @@ def test_a_worker_that_finds_nobody(farm: Farm, record_property) -> None:
 def test_a_learner_that_finds_no_router(farm: Farm) -> None:
     learner = farm.start("learner", "--name", "r", "--connect", free_endpoint(), *SMALL)
     assert learner.stdout
-    while "nobody answers" not in learner.stdout.readline():
+    while "no answer from" not in learner.stdout.readline():
         pass
     learner.send_signal(signal.SIGINT)
     said, _ = learner.communicate(timeout=SOON)
@@ -137,7 +137,7 @@ def test_workers_that_cannot_work(farm: Farm, monkeypatch: pytest.MonkeyPatch) -
     (broken / "sitecustomize.py").write_text("import os, sys\nif 'workers' in sys.orig_argv:\n    os._exit(1)\n")
     monkeypatch.setenv("PYTHONPATH", str(broken))
     said = farm.call("run", "--name", "r", "--generations", "1", *SMALL, status=1)
-    assert "farm: no local worker keeps running; their own messages above say why" in said
+    assert "farm: no local worker keeps running; see their messages above" in said
     assert farm.summary("r")["state"] == "failed"
 
 

@@ -77,7 +77,7 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     """Begun before there is a learner, with all there is to record."""
     endpoint = free_endpoint()
     process = farm.start("record", "--connect", endpoint)
-    until(process, "nobody answers")
+    until(process, "no answer from")
     flags = ("--name", "r", "--pairs", "3", "--generations", "12", "--traces", "all", "--listen", endpoint)
     farm.call("run", *flags)
     said = finish(process)
@@ -134,7 +134,7 @@ def test_a_recorder_killed_and_started_again(farm: Farm) -> None:
     process.communicate(timeout=10)
     process = farm.start("record", "--connect", endpoint)
     line = until(process, "recording run r into recordings/r")
-    found = re.search(r"going on after generation (\d+)", line)
+    found = re.search(r"continuing after generation (\d+)", line)
     assert found
     assert int(found[1]) >= 1
     hire(farm, endpoint)
@@ -239,7 +239,7 @@ def test_flags_that_make_no_sense(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     for flags, expected in (
-        ({"file": False}, "--no-file leaves nothing to do: add --serve PORT or --spawn"),
+        ({"file": False}, "--no-file records nothing: add --serve PORT or --spawn"),
         ({"spawn": True}, "no display to open a window on: take --serve PORT"),
         ({"run": ".."}, "run '..' is not a name"),
         ({"serve": "here"}, "--serve 'here' is not of the form"),

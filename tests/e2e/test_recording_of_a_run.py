@@ -132,7 +132,7 @@ def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
 def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
     before = recorded.summary("r")
     said = recorded.call("run", "--resume", "runs/r")
-    assert f"going on after generation {GENERATIONS}" in said
+    assert f"continuing after generation {GENERATIONS}" in said
     after = recorded.summary("r")
     assert {**after, "reissued": 0} == {**before, "reissued": 0}
     folder = recorded.folder / "runs" / "r"

@@ -57,14 +57,14 @@ def test_learners_of_another_release(farm: Farm) -> None:
     with listen(endpoint, "farm") as session:
         session.answer(keys.status("farm", "r"), lambda: codec.encode(STATUS, codec.SCHEMA + 1))
         said = farm.call("status", "--connect", endpoint, status=1)
-    versions = f"schema version {codec.SCHEMA + 1}, this side speaks {codec.SCHEMA}"
-    assert f"a learner answers, but what it says cannot be read: {versions}" in said
+    versions = f"schema version {codec.SCHEMA + 1}, this side has {codec.SCHEMA}"
+    assert f"a learner answers, but its message cannot be read: {versions}" in said
 
 
 def test_nobody_there(farm: Farm) -> None:
     endpoint = free_endpoint()
     said = farm.call("status", "--connect", endpoint, "--timeout", "1", status=1)
-    assert f"nobody answers at {endpoint}" in said
+    assert f"no answer from {endpoint}" in said
 
 
 def test_status_fails_when_who_is_named_is_missing(farm: Farm) -> None:

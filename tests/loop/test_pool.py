@@ -125,7 +125,7 @@ def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: Fl
         (np.zeros((2, 3)), None, r"thetas has shape \(2, 3\); expected \(B, 72\)"),
         ([["a"] * 72], None, r"thetas is a list of str32; expected numbers of shape \(B, 72\)"),
         (np.zeros((2, 72), complex), None, "thetas is a ndarray of complex128; expected numbers"),
-        ([[0.0] * 72, [0.0]], None, "thetas is a list that makes no array; expected numbers"),
+        ([[0.0] * 72, [0.0]], None, "thetas is a list that is not an array; expected numbers"),
         (None, None, "thetas is a NoneType of object; expected numbers"),
         (np.zeros((2, 72)), 3, "seeds is a int; expected 2 whole numbers"),
         (np.full((2, 72), np.nan), None, r"thetas\[0\] is not finite"),

@@ -1,1 +1,1 @@
-"""What a worker simulates with."""
+"""Simulation backends of workers."""

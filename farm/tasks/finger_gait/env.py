@@ -33,7 +33,7 @@ REACH: Final = 1.0
 """Actions that are no joint positions lie in [-REACH, REACH] [rad]."""
 
 JOINT_BOUND: Final = 2.0 * np.pi
-"""Joint readings are clipped here; the joints end far below [rad]."""
+"""Joint readings are clipped here, far above the joints' limits [rad]."""
 
 FORCE_BOUND: Final = 1000.0
 """A taxel's force is clipped here [N]."""
@@ -77,7 +77,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Release the object; with perturb=True under conditions of its own, drawn from the seed."""
+        """Release the object; with perturb=True under conditions drawn from the seed."""
         super().reset(seed=seed, options=options)
         drawn = None
         if self._task.config.perturb:  # as the farm has seeds: four words
@@ -113,7 +113,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._renderer.render()
 
     def close(self) -> None:
-        """Give back the renderer."""
+        """Release the renderer."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -123,7 +123,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 
 def _observed(config: FingerGaitConfig) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest observation, (d,)."""
+    """Smallest and largest observation, (d,)."""
 
     def x(joint: float, force: float, point: float) -> FloatArray:
         joints = np.full((1, len(JOINTS)), joint * config.joints_scale)

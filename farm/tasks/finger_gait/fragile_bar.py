@@ -1,9 +1,9 @@
-"""The fragile bar: a finger is added to a grip, gently, on a surface whose height nobody knows.
+"""The fragile bar: a finger is added to a grip, gently, on a surface of unknown height.
 
-The finger gait's grip of a bar by index finger and thumb, to which the middle finger is added. But the bar under the
-middle finger lies up to 10 mm higher or lower than it seems, and breaks at 3 N: when to stop closing can only be
-felt. Friction, mass and the bar's place vary more than in the finger gait, and the joints' readings are wrong by a
-constant that is drawn for each rollout, so that the joints' deflection is a poor sensor of force.
+Index finger and thumb grip a bar as in the finger gait, and the middle finger is added. But the bar under the middle
+finger is up to 10 mm higher or lower than it appears, and breaks at 3 N: only touch tells when to stop closing.
+Friction, mass and the bar's position vary more than in the finger gait, and the joint readings have a constant error
+that is drawn for each rollout, so that the joints' deflection is a poor measure of force.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,25 +34,25 @@ from farm.tasks.finger_gait.task import (
 )
 
 TERMS: Final = ("force", "grip", "crush", "pose", "action", "drop")
-"""What the reward is made of."""
+"""Names of the reward's terms."""
 
 WANTED: Final = 0.9
-"""Force of the middle finger that is wanted [N]."""
+"""Target force of the middle finger [N]."""
 
 WINDOW: Final = (0.4, 1.4)
-"""Forces of the middle finger that are a success [N]."""
+"""Range of the middle finger's force that counts as success [N]."""
 
 BREAKS: Final = 3.0
-"""Force at which the bar breaks, as seen at control steps [N]."""
+"""Force at which the bar breaks, checked at control steps [N]."""
 
 HEIGHT: Final = 0.01
-"""The surface under the middle finger lies U(-, +) off [m]."""
+"""The surface under the middle finger is displaced by U(-, +) [m]."""
 
 _FRICTION: Final = (0.5, 1.5)
 _MASS: Final = (0.6, 2.0)
 _DISPLACEMENT: Final = 0.003  # [m]
-_WORST: Final = 6.0  # reward that a step after a drop loses, and all that crush and pose can lose of one
-_ACTION: Final = 0.2  # reward per squared change of the targets [1 / rad^2]
+_WORST: Final = 6.0  # penalty for each step after a drop, and the largest one for crush and pose in a step
+_ACTION: Final = 0.2  # penalty per squared change of the targets [1 / rad^2]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ class FragileBarConfig(TaskConfig):
 
 
 class FragileBar(FingerGait):
-    """The middle finger joins the grip of a bar whose surface is nobody knows where, without breaking it."""
+    """The middle finger joins the grip of a bar whose surface has an unknown height, without breaking it."""
 
     Config = FragileBarConfig
     steps = 25
@@ -101,21 +101,21 @@ class FragileBar(FingerGait):
     ends = None  # type: ignore[assignment]  # it begins with a grip, but ends with a force
 
     def spec(self) -> TaskSpec:
-        """What both sides must know, without closing a grip."""
+        """The task's specification, found without closing a grip."""
         return TaskSpec(
             observation=STATES[self.config.state].size, action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
             terms=TERMS, success=True, channels=self.channels,
         )  # fmt: skip
 
     def setup(self, sim: Sim) -> None:
-        """Find the start grip; a ConfigError where it does not hold."""
+        """Find the start grip; a ConfigError if it does not hold the bar."""
         self._find_start(sim)
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
         """Set conditions and the surface's height, close the start grip round the frozen bar, and release it."""
         place = sim.expand("geom_pos")
         fragile = self.model.geom("fragile").id
-        # Drawn ahead of everything else: what follows does not depend on how many numbers there are.
+        # Drawn first, so that the other numbers do not depend on how many are drawn here.
         place[:, fragile, 2] = [0.0 if rng is None else rng.uniform(-HEIGHT, HEIGHT) for rng in rngs]
         super().prepare(sim, rngs)
 
@@ -125,7 +125,7 @@ class FragileBar(FingerGait):
         return drawn
 
     def score(self, record: Record) -> Score:
-        """Reward terms, and success: the force in its window at the last steps, and never where it breaks."""
+        """Reward terms, and success: the force is in its range at the last steps, and the bar never broke."""
         force = record.frames["force"].sum(axis=-1)
         middle = force[..., FINGERS.index("middle")]
         others = np.delete(force, FINGERS.index("middle"), axis=-1)
@@ -158,12 +158,12 @@ class FragileBar(FingerGait):
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:  # type: ignore[override]  # as the finger gait's
-        """The finger gait's, with the forces of the middle finger that are a success."""
+        """The finger gait's channels, with the range of the middle finger's force that counts as success."""
         window = {"middle": WINDOW}
         return tuple(replace(c, limits=window) if c.name == "contacts/force" else c for c in super().channels)
 
     def exported(self) -> dict[str, Any]:
-        """Nothing of its own."""
+        """Nothing in addition."""
         return {}
 
 

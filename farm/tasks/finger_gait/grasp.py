@@ -1,9 +1,9 @@
-"""Where the fingers touch an object and what to command for a grip, found by simulation.
+"""Contact points and commands of a grip, found by simulation.
 
-Nothing about a grip is typed in: each fingertip comes straight down (the thumb: up) on the
-object until it touches; from there the servos are asked for the joint torques that press
-with a chosen force, tau = J' F (a position servo of stiffness k turns them into an offset
-tau / k of its target).
+No number of a grip is given: each fingertip moves straight down (the thumb: up) onto the
+object until it touches; from there the joint targets are chosen for the torques that press
+with a given force, tau = J' F (for a position servo of stiffness k this is an offset tau / k
+of its target).
 """
 
 from typing import Final
@@ -17,26 +17,26 @@ from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, LOWER, UPPER
 from farm.tasks.finger_gait.model import Hand
 
 WAIT: Final = 0.02
-"""Height over its contact at which a finger that does not grip waits [m]."""
+"""Height above its contact at which a finger outside the grip waits [m]."""
 
 _APPROACH: Final = {"index": -1.0, "middle": -1.0, "thumb": 1.0}
-"""Sign of the vertical motion with which a fingertip comes to the object."""
+"""Sign of a fingertip's vertical motion towards the object."""
 
 _BENT: Final = np.array([0.47, 1.09, 0.88, 0.48, 1.11, 0.88, 0.70, 0.86])
-"""Where the search for joint positions starts [rad]: fingers bent round a middling object."""
+"""Where the search for joint positions starts [rad]: fingers bent around a medium-sized object."""
 
 _REACH: Final = 0.06
 """How far from the object's centre the approach starts [m]."""
 
 _DAMPING: Final = 1e-8
-"""Of the search for joint positions [m^2]: keeps a stretched finger's step finite."""
+"""Damping of the search for joint positions [m^2]: keeps the step of a stretched finger finite."""
 
 
 class Grasping:
-    """Inverse kinematics and touch for one scene."""
+    """Inverse kinematics and contacts for one scene."""
 
     def __init__(self, scene: Hand) -> None:
-        """Look at the scene in its start configuration, hand bent and object in place."""
+        """Put the scene into its start configuration: hand bent, object in place."""
         self.scene = scene
         self.data = mujoco.MjData(scene.model)
         self.data.qpos[:8] = _BENT
@@ -47,7 +47,7 @@ class Grasping:
             self.contact[FINGER_JOINTS[finger]] = self._touch(finger)
 
     def command(self, fingers: tuple[str, ...]) -> FloatArray:
-        """Joint targets of a grip by these fingers, the others waiting open [rad], (8,)."""
+        """Joint targets of a grip by these fingers while the others wait open [rad], (8,)."""
         targets = np.empty(8)
         for finger in FINGERS:
             joints = FINGER_JOINTS[finger]
@@ -114,7 +114,7 @@ class Grasping:
         return jacobian[2, joints] * _APPROACH[finger] * self.scene.pose.press[finger] / stiffness
 
     def _place(self, finger: str, joints: FloatArray) -> None:
-        """Put one finger's joints as given and the others as they began: nothing depends on what was asked before."""
+        """Set one finger's joints, and reset the others: results never depend on earlier calls."""
         index = FINGER_JOINTS[finger]
         self.data.qpos[:8] = _BENT
         self.data.qpos[index] = joints[index]
@@ -128,7 +128,7 @@ class Grasping:
 def _step(jacobian: FloatArray, error: FloatArray) -> FloatArray:
     """J' (J J' + damping I)^-1 e for J (2, n) and e (2,) [m] -> (n,) [rad].
 
-    Spelt out, by Cramer's rule: a linear algebra library rounds as the processor likes, and every grip begins here.
+    Written out by Cramer's rule: a linear algebra library's rounding depends on the processor, and every grip needs it.
     """
     first, second = jacobian
     a, b, c = (first * first).sum() + _DAMPING, (first * second).sum(), (second * second).sum() + _DAMPING

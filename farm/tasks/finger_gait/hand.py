@@ -1,6 +1,6 @@
-"""The Allegro hand as the task sees it: names, order and ranges of what moves and what feels.
+"""The Allegro hand as used by the task: names, order and ranges of joints and sensors.
 
-Pure. The figures of the hand itself stand in `assets/README.md`.
+Pure data. The hand's own figures are in `assets/README.md`.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 FINGERS: Final = ("index", "middle", "thumb")
-"""The fingers that take part, in the order of every (..., 3) array."""
+"""The fingers in use, in the order of every (..., 3) array."""
 
 JOINTS: Final = (
     *("index_1", "index_2", "index_3"),
@@ -23,10 +23,10 @@ FINGER_JOINTS: Final = {"index": [0, 1, 2], "middle": [3, 4, 5], "thumb": [6, 7]
 """Which of the controlled joints move a finger."""
 
 LOWER: Final = np.array([-0.196, -0.174, -0.227, -0.196, -0.174, -0.227, -0.189, -0.162])
-"""Lower ends of the joint ranges [rad], (8,)."""
+"""Lower joint limits [rad], (8,)."""
 
 UPPER: Final = np.array([1.61, 1.709, 1.618, 1.61, 1.709, 1.618, 1.644, 1.719])
-"""Upper ends of the joint ranges [rad], (8,)."""
+"""Upper joint limits [rad], (8,)."""
 
 TIP_RADIUS: Final = 0.012
 """Radius of the half-spherical fingertips [m]."""
@@ -41,16 +41,16 @@ GRIPS: Final = {
 
 @dataclass(frozen=True)
 class Pose:
-    """How the hand is set up round an object: what the controller cannot move."""
+    """The hand's fixed set-up around an object, which the controller cannot change."""
 
     press: Mapping[str, float]
-    """Force with which a finger is told to press [N]; the object's weight and friction share it out."""
+    """Force that a finger is commanded to press with [N]; weight and friction change the actual forces."""
     place: str | None = None
-    """Where the object's centre hangs while the fingers close [m]; None: where its file says."""
+    """Position of the object's centre while the fingers close [m]; None: as in its file."""
     turned: Mapping[str, str] = field(default_factory=dict)
     """Orientations of links whose joints are fixed, by the link's body, quaternions wxyz; others as in hand.xml."""
     options: Mapping[str, str] = field(default_factory=dict)
-    """What is other in the physics, as MJCF's `option` has it."""
+    """Changed physics options, as attributes of MJCF's `option`."""
 
 
 POSES: Final[Mapping[str, Pose]] = {

@@ -1,4 +1,4 @@
-"""The hand with an object: which files it is made of, and where things are in its arrays."""
+"""The model of the hand with an object: its files, and indices into its arrays."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
@@ -23,23 +23,23 @@ OBJECT: Final = "object"
 
 
 def folder() -> Path:
-    """Where the assets are: beside this package in a checkout, in it where it is installed."""
+    """The folder of assets: next to this package in a checkout, inside it if installed."""
     inside = Path(farm.__file__).parent / "assets"
     return inside if inside.is_dir() else inside.parent.parent / "assets"
 
 
 def objects() -> list[str]:
-    """Names of the objects there are, one file each."""
+    """Names of the available objects, one file each."""
     return sorted(file.stem for file in folder().glob("objects/*.xml"))
 
 
 def files(object_name: str, pose: str) -> dict[str, str]:
-    """The texts that the model is made of, by name: hand, what the task adds, and an object by name or file.
+    """The files of the model by name: hand, the task's additions, and an object given by name or file.
 
     Hand and object are set up for a pose, one of POSES.
 
     Raises:
-      ConfigError: there is no such object.
+      ConfigError: the object does not exist.
     """
     known = objects()
     path = Path(object_name) if object_name.endswith(".xml") else folder() / f"objects/{object_name}.xml"
@@ -54,7 +54,7 @@ def files(object_name: str, pose: str) -> dict[str, str]:
 
 
 def posed(sources: Mapping[str, str], pose: Pose) -> dict[str, str]:
-    """The texts with links turned and the object placed as a pose has them."""
+    """The files with links turned and the object placed for a pose."""
     hand, thing = (_parsed(sources, name) for name in ("hand.xml", "object.xml"))
     out = dict(sources)
     if pose.turned or pose.options:
@@ -83,7 +83,7 @@ def _parsed(sources: Mapping[str, str], name: str) -> ET.Element:
 
 
 def mjcf(sources: Mapping[str, str]) -> str:
-    """The texts of `files` as one MJCF text that needs no other file; a ConfigError where one is no XML."""
+    """The texts of `files` as one MJCF text that needs no other file; a ConfigError if one is not XML."""
     whole = ET.Element("mujoco")
     for name in ("hand.xml", "finger_gait.xml", "object.xml"):
         whole.extend(_parsed(sources, name))
@@ -94,8 +94,8 @@ def mjcf(sources: Mapping[str, str]) -> str:
 class Hand:
     """A compiled hand with one object.
 
-    The object hangs on a weld to the mocap body `anchor` while equality 0 is active: that is the task's freeze. Its
-    free joint comes last in `qpos`, after the eight controlled joints.
+    While equality 0, a weld to the mocap body `anchor`, is active, the object is frozen. Its free joint is the last in
+    `qpos`, after the eight controlled joints.
     """
 
     model: mujoco.MjModel

@@ -1,6 +1,6 @@
-"""What the hand feels, and what of it the controller sees: the thesis' four state bases (3.5.3), and two of forces.
+"""The hand's sensor values, and the state bases that select from them: the thesis' four (3.5.3), and two of forces.
 
-Pure, batched. A new state base is one line in STATES.
+Pure functions of batches. A new state base is one line in STATES.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _SIZES: Final = {"joints": len(JOINTS), "images": TAXELS * _COUNT, "points": 3 *
 
 @dataclass(frozen=True)
 class Felt:
-    """What the hand feels, at any number of moments; that of a grip to be reached is its demonstration."""
+    """Sensor values of the hand at any number of times; those of the goal grip are its demonstration."""
 
     joints: FloatArray
     """q [rad], (..., 8)"""
@@ -35,10 +35,10 @@ class Felt:
 
 @dataclass(frozen=True)
 class StateBase:
-    """A state base: what is felt of these kinds, one after the other."""
+    """A state base: sensor values of these kinds, concatenated."""
 
     parts: tuple[str, ...]
-    """Names of what is felt."""
+    """Names of the kinds of sensor values."""
 
     @property
     def size(self) -> int:
@@ -52,11 +52,11 @@ class StateBase:
 
     @property
     def touch(self) -> bool:
-        """Whether it needs taxels or contact points (they cost time)."""
+        """Whether it needs taxels or contact points, which take time to compute."""
         return self.parts != ("joints",)
 
     def observe(self, felt: Felt) -> FloatArray:
-        """The observation x of B moments, (B, d)."""
+        """The observation x at B times, (B, d)."""
         count = len(felt.joints)
         return np.concatenate([getattr(felt, part).reshape(count, -1) for part in self.parts], axis=1)
 

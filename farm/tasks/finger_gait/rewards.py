@@ -1,6 +1,6 @@
-"""Rewards of the thesis (3.5.2) as terms a step, and the return.
+"""Rewards of the thesis (3.5.2) as terms per step, and the return.
 
-Pure, batched. A new reward is one function here and one line in REWARDS.
+Pure functions of batches. A new reward is one function here and one line in REWARDS.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import Felt
 
 TERMS: Final = ("tactile", "joints", "action", "contact points", "drop")
-"""What a reward is made of, in the order of every (..., 5) array of terms."""
+"""Names of the reward's terms, in the order of every (..., 5) array of terms."""
 
 RETURN_SCALE: Final = 0.1
 """Factor of the return (3.4)."""
@@ -23,7 +23,7 @@ _RANGE: Final = UPPER - LOWER
 
 
 def _squares(difference: FloatArray) -> FloatArray:
-    return (difference * difference).sum(axis=-1)  # no matrix product: it rounds as the processor likes
+    return (difference * difference).sum(axis=-1)  # not a matrix product: its rounding depends on the processor
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ WEIGHTS: Final[dict[str, Weights]] = {
 
 
 Reward = Callable[[Felt, FloatArray, Felt, Weights], FloatArray]
-"""What is felt (..., 8 and so on), the action (..., 8), the demonstration and weights -> terms (..., 5)."""
+"""Sensor values (..., 8 and so on), the action (..., 8), the demonstration and weights -> terms (..., 5)."""
 
 
 def basic(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
@@ -72,7 +72,7 @@ def full(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatA
 
 
 def limited(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
-    """Terms of (3.5) with no action punished for more than a joint's range ("limit the action punishment", 4.1.1)."""
+    """Terms of (3.5), the action's penalty limited to a joint's range ("limit the action punishment", 4.1.1)."""
     return full(felt, np.minimum(np.abs(action), _RANGE), goal, weights)
 
 
@@ -84,10 +84,10 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
     """Cut the terms where each rollout ended and add the penalty there.
 
     Args:
-      terms: (B, T, 5) as a reward gave them for every step.
-      steps: (B,) how many control steps each rollout lasted, its last included.
+      terms: (B, T, 5) from a reward for every step.
+      steps: (B,) control steps of each rollout, including its last.
       dropped: (B,) whether the last of them ended without any contact: the penalty is added.
-      failed: (B,) whether the physics blew up in the last of them: the penalty is all it gives.
+      failed: (B,) whether the simulation became unstable in the last of them: it gives the penalty only.
       weights: for the penalty p.
 
     Returns:
@@ -103,7 +103,7 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
 
 
 def factors(reward: str, weights: Weights, goal: Felt) -> FloatArray:
-    """Factors of the squares that a reward takes off: tactile, joints, action, contact points, (4,)."""
+    """Factors of the squares that a reward subtracts: tactile, joints, action, contact points, (4,)."""
     full = float(reward != "basic")
     touch = full * weights.tactile / float(_squares(goal.images.reshape(-1)))
     near = weights.joints / float(_squares(goal.joints))

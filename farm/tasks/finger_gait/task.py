@@ -1,7 +1,7 @@
 """Finger gaiting: from one grip of an object to another (Plage 2016, ch. 3).
 
-The hand closes a start grip round a frozen object and releases it; for `steps` control steps of SUBSTEPS x TIMESTEP
-the controller sets joint targets; a demonstration of the goal grip defines the reward.
+The hand closes a start grip around a frozen object and releases the object. For `steps` control steps of SUBSTEPS x
+TIMESTEP the controller sets joint targets; a demonstration of the goal grip defines the reward.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,25 +25,25 @@ from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
 
 TIMESTEP: Final = 0.01
-"""A physics step [s]."""
+"""Length of a physics step [s]."""
 
 SUBSTEPS: Final = 10
 """Physics steps per control step."""
 
 CONTROL_PERIOD: Final = TIMESTEP * SUBSTEPS
-"""A control step [s]."""
+"""Length of a control step [s]."""
 
 PRESSES: Final = 0.1
-"""Force from which a fingertip counts as pressing [N]."""
+"""Smallest force at which a fingertip counts as pressing [N]."""
 
 SUCCESS_STEPS: Final = 3
 """Control steps at the end of a rollout over which success is judged."""
 
 MAX_SHIFT: Final = 0.015
-"""How far the object's centre may move from where it was released [m]."""
+"""How far the object's centre may move from its position at the release [m]."""
 
 MAX_TURN: Final = np.deg2rad(30.0)
-"""How far the object may turn from how it was released [rad]."""
+"""How far the object may turn from its orientation at the release [rad]."""
 
 LEAST_COSINE: Final = float(elementary.cos(np.array(0.5 * MAX_TURN)))
 """Cosine of half of that."""
@@ -67,7 +67,7 @@ JOINT_NOISE: Final = 0.01
 """Perturbation: standard deviation of the joint readings [rad]."""
 
 CLOSING: Final = 100
-"""Physics steps in which a grip is closed round the frozen object."""
+"""Physics steps in which a grip is closed around the frozen object."""
 
 RAMP: Final = 50
 """Physics steps of them in which the commands move from waiting to gripping."""
@@ -76,10 +76,10 @@ SETTLE: Final = 50
 """Physics steps from the release of the goal grip until its demonstration is recorded."""
 
 HOLD: Final = 200
-"""Physics steps from the release for which a grip must hold the object by itself to be taken."""
+"""Physics steps after the release for which a grip must hold the object to be accepted."""
 
 _MOST_MOTION: Final = 20.0  # of the squares of a step: a lost object is punished by other terms
-_TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target a number that MuJoCo takes
+_TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target in MuJoCo's range
 _COLOURS: Final = ((86, 180, 233), (0, 158, 115), (204, 121, 167))  # of the fingers
 _SHADES: Final = (1.25, 0.95, 0.65)  # of a finger's joints, first to last
 
@@ -110,7 +110,7 @@ class FingerGaitConfig(TaskConfig):
     weights: str = "projected"
     """Row of the thesis' Table 3.1 with the reward's weights: direct | projected."""
     motion: float = setting(0.0, least=0.0)
-    """What moving the object costs in each step: so much times its shift / 3 mm and turn / 6 degrees, squared."""
+    """Penalty per step for moving the object: this factor times the squares of shift / 3 mm and turn / 6 degrees."""
     action: Literal["offset", "absolute", "increment"] = "offset"
     """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
     clip: bool = True
@@ -144,7 +144,7 @@ class FingerGaitConfig(TaskConfig):
 
 @dataclass(frozen=True)
 class Perturbation:
-    """What is different in one rollout, from the freeze on."""
+    """Perturbed conditions of one rollout, from the freeze on."""
 
     friction: float
     """Factor of every friction coefficient."""
@@ -165,7 +165,7 @@ class Perturbation:
         mass: tuple[float, float] = SCALE,
         displacement: float = DISPLACEMENT,
     ) -> "Perturbation":
-        """Draw one, always the same numbers in the same order."""
+        """Draw the conditions, always as many numbers and in the same order."""
         return cls(
             friction=float(rng.uniform(*friction)),
             mass=float(rng.uniform(*mass)),
@@ -221,7 +221,7 @@ class FingerGait(Task):
 
     @cached_property
     def hand(self) -> model.Hand:
-        """Where things are in the model."""
+        """Indices into the model."""
         return model.Hand(self.model, self.config.object, POSES[self.config.pose])
 
     @property
@@ -230,7 +230,7 @@ class FingerGait(Task):
         return float(self.config.return_scale)
 
     def spec(self) -> TaskSpec:
-        """What both sides must know, without closing a grip."""
+        """The task's specification, found without closing a grip."""
         return TaskSpec(
             observation=STATES[self.config.state].size, action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
             terms=(*TERMS, *(["motion"] if self.config.motion else [])), success=True, channels=self.channels,
@@ -254,9 +254,9 @@ class FingerGait(Task):
         self.goal = self._demonstrate(sim, self.config.goal_grip, goal)
 
     def _find_start(self, sim: Sim) -> Grasping:
-        """Find the commands of the start grip, and see that it holds the object."""
+        """Find the commands of the start grip, and check that it holds the object."""
         sim.begin(1)
-        self.measure(sim)  # asked for before the search for the grip, which would begin again otherwise
+        self.measure(sim)  # requested before the search for the grip, which would start again otherwise
         grasping = Grasping(self.hand)
         self._waiting = grasping.command(())
         self.start_commands = grasping.command(GRIPS[self.config.start_grip])
@@ -281,7 +281,7 @@ class FingerGait(Task):
         return Felt(joints=joints, images=images[0], points=touch.contact_points(images)[0])
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
-        """Set friction and mass, close the start grip round the frozen object, and release it."""
+        """Set friction and mass, close the start grip around the frozen object, and release the object."""
         nominal = Perturbation.none(self.steps)
         drawn = [nominal if rng is None else self._drawn(rng) for rng in rngs]
         if self.config.friction != 1.0 or any(each is not nominal for each in drawn):
@@ -303,7 +303,7 @@ class FingerGait(Task):
             inertia[row, body] = own.body_inertia[body] * each.mass
 
     def _close(self, sim: Sim, commands: FloatArray, displaced: FloatArray) -> None:
-        """Close a grip round the frozen object, displaced by (B, 3) [m], and release it."""
+        """Close a grip around the frozen object, displaced by (B, 3) [m], and release the object."""
         place = slice(len(JOINTS), len(JOINTS) + 3)
         sim.qpos[:, : len(JOINTS)] = self._waiting
         sim.qpos[:, place] += displaced
@@ -316,7 +316,7 @@ class FingerGait(Task):
     # A control step
 
     def measure(self, sim: Sim) -> dict[str, FloatArray]:
-        """Normal forces of the contacts (B, 3, C) [N] as of the beginning of the last physics step, where they act
+        """Normal forces of the contacts (B, 3, C) [N] at the beginning of the last physics step, where they act
         (B, 3, C, 3) [m], the fingertips' positions (B, 3, 3) [m] and axes (B, 3, 9), and joint targets (B, 8) [rad].
 
         `touch.place` puts them into the fingertips' frames, once for all frames of a batch.
@@ -331,7 +331,7 @@ class FingerGait(Task):
         """The state base's x, (B, d)."""
         config, state = self.config, STATES[self.config.state]
         joints = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)]
-        images = points = joints  # not looked at by a state base without touch
+        images = points = joints  # unused by a state base without touch
         if state.touch:
             felt = self.measure(sim)
             images = touch.images(felt)
@@ -349,7 +349,7 @@ class FingerGait(Task):
         return sim.own["target"]
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where no fingertip touches the object any more."""
+        """Which rollouts ended because no fingertip touches the object any more."""
         return _dropped(sim)
 
     # A chain of gaits
@@ -360,11 +360,11 @@ class FingerGait(Task):
         return self.config.start_grip, self.config.goal_grip
 
     def reached(self, sim: Sim) -> BoolArray:
-        """Where the goal grip's fingers press, and no others."""
+        """Which rollouts have only the goal grip's fingers pressing."""
         return np.asarray((_pressing(_force(_sensors(sim))) == self._wanted).all(axis=-1))
 
     def lost(self, sim: Sim) -> BoolArray:
-        """Where the object has been dropped, or is out of place."""
+        """Which rollouts have dropped the object or moved it too far."""
         return _dropped(sim) | ~stayed(sim.qpos[:, len(JOINTS) :], sim.own["released"])
 
     @property
@@ -389,7 +389,7 @@ class FingerGait(Task):
         return Score(terms, ~(dropped | record.failed) & self._success(record))
 
     def _motion(self, record: Record) -> FloatArray:
-        """What moving the object costs, (B, T)."""
+        """Penalty for moving the object, (B, T)."""
         pose = slice(len(JOINTS), None)
         shift, cosine = distance(record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose])
         # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
@@ -397,14 +397,14 @@ class FingerGait(Task):
         return np.asarray(-self.config.motion * np.minimum(moved, _MOST_MOTION))
 
     def _success(self, record: Record) -> BoolArray:
-        """Whether the goal grip's fingers, no others, press at the last steps and the object stayed where it was."""
+        """Whether only the goal grip's fingers press at the last steps, and the object stayed in place."""
         last = slice(-SUCCESS_STEPS, None)
         grips = _pressing(record.frames["force"][:, last]) == self._wanted
         pose = slice(len(JOINTS), None)
         there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
         return np.asarray(grips.all(axis=(1, 2)) & there.all(axis=1))
 
-    # What is shown
+    # Channels
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:  # type: ignore[override]  # needs the model's fingertips
@@ -434,7 +434,7 @@ class FingerGait(Task):
         )  # fmt: skip
 
     def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """The channels' values, from what was measured."""
+        """The channels' values from measured values."""
         images = touch.images(frames)
         points, force = touch.contact_points(images), images.sum(axis=-1)
         centres = np.stack([self.model.geom_pos[tip] for tip in self.hand.tip_geoms])
@@ -492,7 +492,7 @@ def _force(sensors: FloatArray) -> FloatArray:
 
 
 def _dropped(sim: Sim) -> BoolArray:
-    """Where no fingertip touches the object, (B,)."""
+    """In which rollouts no fingertip touches the object, (B,)."""
     sensors = _sensors(sim)
     return np.asarray(~((sensors[..., 0] > 0) & (sensors[..., 1] > 0)).any(axis=(1, 2)))
 
@@ -508,13 +508,13 @@ def touching(force: FloatArray) -> BoolArray:
 
 
 def moved(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far poses (..., 7) are from others: shift [m] and angle [rad], to be read, not to decide: see `stayed`."""
+    """Distance between poses (..., 7): shift [m] and angle [rad]; for display only: see `stayed`."""
     shift, cosine = distance(pose, start)
     return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
 
 
 def stayed(pose: FloatArray, start: FloatArray) -> BoolArray:
-    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others, the same on every processor: no arccos."""
+    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others; without arccos: equal on every processor."""
     shift, cosine = distance(pose, start)
     return np.asarray((shift <= MAX_SHIFT) & (cosine >= LEAST_COSINE))
 

@@ -1,12 +1,12 @@
 """Touch: 18 taxels on the half sphere of each fingertip.
 
-Pure, batched. The fingertip's frame has z along the last link, x to the side that closes on
+Pure functions of batches. The fingertip's frame has z along the last link, x to the side that closes on
 the object, y across. Its half sphere looks along z turned by TILT towards x, because that is
 where a bent finger touches. The taxels lie on it in SHAPE = 6 rows by 3 columns: a row is an
 angle in the finger's plane (first row towards the back of the finger, last towards its pad),
 a column an angle across (first column at negative y). A contact's normal force is spread over the
 taxels by their distance from it, weights exp(KAPPA (cos(angle) - 1)), normalised: the total is
-the contact's force (thesis 3.4.3 gives the idea, a decrease with the radius, and no figures).
+the contact's force (thesis 3.4.3 describes a decrease with the radius, without figures).
 """
 
 from collections.abc import Mapping
@@ -22,10 +22,10 @@ SHAPE: Final = (6, 3)
 """Rows and columns of a fingertip's image."""
 
 TAXELS: Final = SHAPE[0] * SHAPE[1]
-"""Taxels a fingertip."""
+"""Taxels per fingertip."""
 
 TILT: Final = np.deg2rad(30.0)
-"""Where the middle of the half sphere looks: from the finger's axis towards its pad [rad]."""
+"""Direction of the middle of the half sphere: from the finger's axis towards its pad [rad]."""
 
 ROWS: Final = np.deg2rad([-75.0, -45.0, -15.0, 15.0, 45.0, 75.0])
 """Angles of the rows in the finger's plane, from the middle of the half sphere [rad]."""
@@ -51,12 +51,12 @@ DIRECTIONS: Final = _directions()
 
 
 def positions() -> FloatArray:
-    """Places of the taxels in the fingertip's frame [m], (18, 3)."""
+    """Positions of the taxels in the fingertip's frame [m], (18, 3)."""
     return DIRECTIONS * TIP_RADIUS
 
 
 def images(frames: Mapping[str, FloatArray]) -> FloatArray:
-    """The tactile images of what was measured: `force` (..., C) [N] at `contact` (..., C, 3) [m], fingertips at `tip`
+    """The tactile images of measured values: `force` (..., C) [N] at `contact` (..., C, 3) [m], fingertips at `tip`
     (..., 3) [m] with `axes` (..., 9).
 
     Returns:
@@ -73,7 +73,7 @@ def image(force: FloatArray, position: FloatArray) -> FloatArray:
     """Spread contact forces over the taxels.
 
     Args:
-      force: (..., C) normal forces of up to C contacts on a fingertip [N], 0 where there is none.
+      force: (..., C) normal forces of up to C contacts on a fingertip [N], 0 for missing contacts.
       position: (..., C, 3) where they act, in the fingertip's frame [m].
 
     Returns:
@@ -89,11 +89,11 @@ def image(force: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _spread(force: FloatArray, position: FloatArray) -> FloatArray:
-    """One contact a row: force (K,) and place (K, 3) to taxels (K, 18)."""
+    """One contact per row: force (K,) and position (K, 3) to taxels (K, 18)."""
     x, y, z = np.ascontiguousarray(position.T)
     length = np.sqrt(x * x + y * y + z * z)
     length = np.where(length > 0, length, 1.0)
-    # Spelt out, not a matrix product: its sums must not depend on the size of the batch.
+    # Written out, not a matrix product: the sums must not depend on the size of the batch.
     across, sideways, along = (DIRECTIONS[:, axis, None] for axis in range(3))
     cosine = (x / length) * across + (y / length) * sideways + (z / length) * along
     cosine -= 1.0

@@ -60,7 +60,7 @@ def files(folder: Path) -> dict[str, bytes]:
 )  # fmt: skip
 def test_what_is_no_host(host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(["new", str(tmp_path / "certs"), f"--learner={host}"], capsys)
-    assert "is no host; expected a name like learner.lab, or an address like 10.0.0.7, without port" in said
+    assert "is not a host; expected a name like learner.lab, or an address like 10.0.0.7, without port" in said
     assert not list(tmp_path.iterdir())
 
 
@@ -154,7 +154,7 @@ def test_renewed(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 
     assert "no worker w9 is known" in refused(["renew", str(folder), "--worker", "w9"], capsys)
     shutil.move(learner, tmp_path / "there")
-    assert "say its names by --learner HOST" in refused(["renew", str(folder)], capsys)
+    assert "give its host names with --learner HOST" in refused(["renew", str(folder)], capsys)
     assert main(["certificates", "renew", str(folder), "--learner", "new.lab"]) == 0
     assert find(folder, "learner").roster().workers == ("w1",)
 
@@ -163,12 +163,12 @@ def test_a_key_that_others_can_read(folder: Path, capsys: pytest.CaptureFixture[
     key = folder / "worker-w1" / "key.pem"
     for mode in (0o644, 0o640, 0o602):
         key.chmod(mode)
-        with pytest.raises(ConfigError, match=rf"can be read by others \(mode {mode:04o}\).*: chmod 600 {key}"):
+        with pytest.raises(ConfigError, match=rf"can be read by other users \(mode {mode:04o}\).*: chmod 600 {key}"):
             find(folder, "worker")
     key.chmod(0o400)
     assert find(folder, "worker").name == "w1"
     (folder / "ca" / "key.pem").chmod(0o644)
-    assert "can be read by others (mode 0644)" in refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "can be read by other users (mode 0644)" in refused(["add", str(folder), "--worker", "w2"], capsys)
 
 
 def test_another_name_than_the_certificates_is_refused(folder: Path) -> None:

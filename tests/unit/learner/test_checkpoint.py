@@ -179,7 +179,7 @@ def test_a_file_that_a_power_failure_tore_has_a_copy(tmp_path: Path, caplog: pyt
 
     path.write_bytes(path.read_bytes()[:-100])
     assert load(path).rollouts == 1
-    assert "checkpoint is missing or damaged; going on from its copy checkpoint.safe" in caplog.text
+    assert "checkpoint is missing or damaged; continuing from its copy checkpoint.safe" in caplog.text
 
 
 def test_a_run_that_is_over_has_one_file(tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def test_physics_that_always_blows_up_is_said_once(
     )
     assert [report.progress.failed for report in learnt(configure("fast.py:Pole"), tmp_path / "r")] == [8, 8, 8]
     assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [
-        "the physics of all 8 rollouts blew up: farm check shows how they start"
+        "all 8 rollouts became unstable: farm check shows how they start"
     ]
 
 

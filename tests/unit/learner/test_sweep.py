@@ -122,6 +122,12 @@ def test_mistakes_are_one_line_and_nothing_is_begun(tmp_path, monkeypatch, words
     assert list(tmp_path.iterdir()) == []
 
 
+def test_nothing_need_be_varied(tmp_path, monkeypatch):
+    monkeypatch.setattr(command.sweep, "run", lambda runs, *_: len(runs) == 5)
+    monkeypatch.chdir(tmp_path)
+    assert command.main([]) == 0
+
+
 def test_a_setting_is_what_farm_run_would_take():
     words = ("--vary", "policy=direct,kernel", "--vary", "clip=true,false", "--pairs", "4", "--preset", "thesis")
     setting = command._setting({"policy": "direct", "clip": "false"}, words)

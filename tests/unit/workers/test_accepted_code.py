@@ -95,7 +95,7 @@ print("noise")
         returns = safe.results(learner.run).returns
         assert (returns > 3.9).all(), "four steps of at most 1"
     assert author.asked["code"] + other.asked["code"] == 1, "a source is fetched once, for all runs"
-    assert f"pole.py (SHA-256 {digest(file)}) came from its learner" in caplog.text
+    assert f"received pole.py (SHA-256 {digest(file)}) from its learner" in caplog.text
     kept = worker._sources.place("pole.py", digest(file))
     assert kept.read_bytes() == file.read_bytes()
     assert kept.parents[1].stat().st_mode & 0o077 == 0
@@ -127,8 +127,8 @@ def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, c
 @pytest.mark.parametrize(
     ("sends", "words"),
     [
-        (b"x = 1\n", "the source of pole.py that came does not fit its digest"),
-        (b"#" * 1_000_001, "the source of pole.py that came has more than 1000000 bytes"),
+        (b"x = 1\n", "the received source of pole.py does not match its digest"),
+        (b"#" * 1_000_001, "the received source of pole.py has more than 1000000 bytes"),
     ],
     ids=["digest", "size"],
 )
@@ -154,7 +154,7 @@ def test_a_name_that_leads_elsewhere(safe: Stage, certs: Path, tmp_path: Path, n
     learner = Learner(safe.session, "r", replace(pole(write(tmp_path)), task=f"{name}:Pole"))
     worker = hire(safe, certs)
     learner.send(worker.id, 0)
-    assert "is no name of a file that travels" in safe.failure().error
+    assert "is not a valid name for a file" in safe.failure().error
 
 
 def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
@@ -200,7 +200,7 @@ def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monk
     author, worker = Author(safe, hangs), hire(safe, certs)
     author.send(worker.id, 0)
     said = safe.failure()
-    assert (said.index, said.error) == (None, "its code did not answer within 0.2 s and was ended")
+    assert (said.index, said.error) == (None, "its code did not answer within 0.2 s and was stopped")
 
 
 def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: Path) -> None:
@@ -222,5 +222,5 @@ if sys.argv[0].endswith("runner_process.py"):
 
 
 def test_without_certificates_it_is_refused() -> None:
-    with pytest.raises(ConfigError, match="--accept-code needs --tls: without certificates anybody could send code"):
+    with pytest.raises(ConfigError, match="--accept-code needs --tls: without certificates anyone could send code"):
         WorkerConfig(accept_code=True)

@@ -47,7 +47,7 @@ def test_messages_it_cannot_read(
     learner.announce()
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]
-    said = f"schema version {codec.SCHEMA + 1}, this side speaks {codec.SCHEMA}"
+    said = f"schema version {codec.SCHEMA + 1}, this side has {codec.SCHEMA}"
     until(lambda: sum(said in line for line in caplog.messages) == 2)
 
 
@@ -105,7 +105,7 @@ def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog
     learner.spec += b" "
     worker = stage.hire()
     learner.send(worker.id, 0)
-    until(lambda: "run r does not tell what it simulates; its jobs wait" in caplog.messages)
+    until(lambda: "run r does not send its specification; its jobs wait" in caplog.messages)
     learner.spec = learner.spec[:-1]
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]

@@ -68,7 +68,7 @@ def test_a_broken_recorder_ends_with_one_line(stats, caplog: pytest.LogCaptureFi
         assert not thread.close(timeout=10)
     assert thread.failed
     assert [r.getMessage() for r in caplog.records] == [
-        "the recording ends here, learning goes on: no space left on device"
+        "the recording ends here, learning continues: no space left on device"
     ]
     assert broken.closed
 
