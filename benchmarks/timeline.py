@@ -1,0 +1,166 @@
+"""Who waits for what in a generation: a picture of two of them, and a table of where the two cores' time goes.
+
+    python benchmarks/timeline.py [--pairs 15] [--generations 60] [--picture FILE.svg]
+
+A learner with two workers of its own learns the gait. Learner and workers note when they begin and end their parts, by
+the same clock. Of the middle generations, the picture shows two whose time is the median.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+from farm import configure
+from farm.net import session
+from farm.net.session import free_endpoint
+from learner.run import Placement, open_run
+from workers.worker import Worker, WorkerConfig
+
+PARTS: Final = {
+    "simulate": "#009e73", "send results": "#e69f00", "hand out jobs": "#56b4e9", "take results": "#0072b2",
+    "update, save, report": "#cc79a7",
+}  # fmt: skip
+
+Noted = list[tuple[str, float, float]]
+"""Part, begin and end [s]."""
+
+
+def noting(noted: Noted, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, noting when it runs."""
+
+    def run(*words: Any, **more: Any) -> Any:  # noqa: ANN401
+        begun = time.monotonic()
+        try:
+            return function(*words, **more)
+        finally:
+            noted.append((part, begun, time.monotonic()))
+
+    return run
+
+
+def work(endpoint: str) -> None:
+    """Be a worker until standard input closes, and print what was noted."""
+    noted: Noted = []
+    with session.connect((endpoint,), 30.0, lambda: False) as link:
+        worker = Worker(WorkerConfig(connect=(endpoint,)), link)
+        worker._do = noting(noted, "simulate", worker._do)  # type: ignore[method-assign]
+        worker._answer = noting(noted, "send results", worker._answer)  # type: ignore[method-assign]
+        worker.join()
+        sys.stdin.readline()  # wait until the learner listens to results
+        while not _closed():
+            worker.turn()
+        worker.close()
+    print(json.dumps(noted))
+
+
+def _closed() -> bool:
+    import select
+
+    return bool(select.select([sys.stdin], [], [], 0.0)[0])
+
+
+def main() -> None:
+    """Learn, and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=15)
+    parser.add_argument("--generations", type=int, default=60)
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--work", help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.work:
+        work(chosen.work)
+        return
+    rounds, rows = measure(chosen.pairs, chosen.generations)
+    middle = rounds[len(rounds) // 3 :]
+    lengths = [b - a for a, b in zip(middle, middle[1:], strict=False)]
+    length = statistics.median(lengths)
+    print(f"a generation of {chosen.pairs} pairs: {1e3 * length:.1f} ms (median of {len(lengths)})\n")
+    print("| part | ms of a generation, learner and both workers |\n|---|---|")
+    took = {
+        part: 1e3 * sum(e - b for noted in rows for name, b, e in noted if name == part and middle[0] <= b < middle[-1])
+        for part in PARTS
+    }
+    took["update, save, report"] -= took["hand out jobs"]  # the next jobs go out in the middle of it
+    for part, total in took.items():
+        print(f"| {part} | {total / len(lengths):.1f} |")
+    print(f"| both workers wait | {2e3 * length - (took['simulate'] + took['send results']) / len(lengths):.1f} |")
+    if chosen.picture:
+        at = min(range(len(middle) - 2), key=lambda i: abs(middle[i + 2] - middle[i] - 2 * length))
+        draw(rows, middle[at] - 0.002, middle[at + 2] + 0.002, chosen.picture)
+
+
+def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
+    """When each round began, and what learner and workers noted."""
+    config = configure(pairs=pairs, generations=generations)
+    endpoint, rounds = free_endpoint(), list[float]()
+    learner: Noted = []
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        run = stack.enter_context(
+            open_run(config, Path(folder, "r"), Placement(workers=0, listen=endpoint, record=False))
+        )
+        begin, collect, take = run.farm.begin, run.farm.collect, run.farm._take
+
+        def begun(*words: Any, **more: Any) -> None:  # noqa: ANN401
+            rounds.append(time.monotonic())
+            begin(*words, **more)
+
+        run.farm.begin = noting(learner, "hand out jobs", begun)  # type: ignore[method-assign]
+        run.farm._take = noting(learner, "take results", take)  # type: ignore[method-assign]
+        ended = [0.0]
+
+        def collected() -> Any:  # noqa: ANN401
+            if ended[0]:
+                learner.append(("update, save, report", ended[0], time.monotonic()))
+            results = collect()
+            ended[0] = time.monotonic()
+            return results
+
+        run.farm.collect = collected  # type: ignore[method-assign]
+        command = [sys.executable, __file__, "--work", endpoint]
+        pipe = subprocess.PIPE
+        workers = [subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) for _ in range(2)]
+        try:
+            for worker in workers:
+                assert worker.stdin is not None
+                worker.stdin.write("\n")
+                worker.stdin.flush()
+            while len(run.farm.workers) < 2:
+                for event in run.farm._events():
+                    take(event)
+            for _ in run.learner.learn(run.farm):
+                pass
+        finally:
+            said = [worker.communicate("\n")[0] for worker in workers]
+    return rounds, [learner, *(json.loads(text) for text in said)]
+
+
+def draw(rows: list[Noted], begin: float, end: float, path: Path) -> None:
+    """Bars over time: learner, workers."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 2.6), layout="constrained")
+    axes = figure.subplots()
+    for height, noted in enumerate(rows):
+        order = sorted(noted, key=lambda one: one[0] == "hand out jobs")  # inside the learner's own part: on top
+        for part, first, last in order:
+            if last > begin and first < end:
+                axes.barh(-height, 1e3 * (last - first), left=1e3 * (first - begin), height=0.7, color=PARTS[part])
+    for part, colour in PARTS.items():
+        axes.barh(0, 0, color=colour, label=part)
+    axes.set_yticks([0, -1, -2], ["learner", "worker 1", "worker 2"])
+    axes.set_xlim(0, 1e3 * (end - begin))
+    axes.set_xlabel("time [ms]; blank: waiting")
+    axes.legend(ncols=5, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+if __name__ == "__main__":
+    main()
