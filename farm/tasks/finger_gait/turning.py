@@ -22,16 +22,12 @@ from farm.tasks.finger_gait.task import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, Fin
 TERMS: Final = ("turn", "speed", "pose", "action", "drop")
 """What the reward is made of."""
 
-HARMONICS: Final = 3
-"""Multiples of the cycle's frequency that are seen."""
-
-LEVEL: Final = float(elementary.cos(np.array(MAX_TURN)))
-"""Cosine of the tilt from which the plate is lost."""
-
-_SIZES: Final = {"phase": 2 * HARMONICS, "joints": len(JOINTS), "forces": len(FINGERS)}
+_HARMONICS: Final = np.arange(1, 4)  # of the cycle's frequency, that are seen
+_LEVEL: Final = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt from which the plate is lost
+_SIZES: Final = {"phase": 2 * len(_HARMONICS), "joints": len(JOINTS), "forces": len(FINGERS)}
 _FORCE: Final = 0.1  # of the forces that are seen [1 / N]
 _ACTION: Final = 0.02  # reward per squared change of the targets [1 / rad^2]
-_POSE: Final = 1.0  # reward that a plate loses which is about to be lost
+_POSE: Final = 0.6  # reward that a plate loses which is tilted or shifted so far that it is nearly lost
 _FASTEST: Final = 3.0  # times the wanted speed: what is faster costs no more
 
 
@@ -43,7 +39,7 @@ class TurningConfig(TaskConfig):
     """What a policy sees besides the time in its cycle: nothing, the joints, the fingertips' forces, or both."""
     cycle: float = setting(2.0, least=0.2, most=100.0)
     """Time of a cycle [s]."""
-    speed: float = setting(50.0, above=0.0, most=360.0)
+    wanted: float = setting(60.0, above=0.0, most=360.0)
     """Wanted speed while the plate turns [deg/s]."""
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
@@ -88,12 +84,9 @@ class Turning(FingerGait):
         self._find_start(sim)
 
     def observe(self, sim: Sim) -> FloatArray:
-        """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d).
-
-        The phase as sines and 1 - cosines, which are zero at the beginning of a cycle: a linear policy without
-        offsets begins each with the start grip.
-        """
-        phase = 2.0 * np.pi * np.arange(1, HARMONICS + 1) * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
+        """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d)."""
+        # 1 - cosine is zero where a cycle begins, as the sine is: only a policy's offsets change the grip there.
+        phase = 2.0 * np.pi * _HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
         seen = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
         if "joints" in self.config.state:
             noise = sim.own["noise"][:, min(sim.t, self.steps - 1)]
@@ -106,16 +99,16 @@ class Turning(FingerGait):
         """Where the plate is tilted or out of place, or no fingertip touches it."""
         pose = sim.qpos[:, len(JOINTS) :]
         shift, _ = distance(pose, sim.own["released"])
-        return super().ended(sim) | (shift > MAX_SHIFT) | (upright(pose) < LEVEL)
+        return super().ended(sim) | (shift > MAX_SHIFT) | (upright(pose) < _LEVEL)
 
     def score(self, record: Record) -> Score:
         """Reward terms; a success is a plate that is still held and turned at half of the wanted speed or more."""
         pose, start = record.frames["qpos"][..., len(JOINTS) :], record.start["qpos"][:, None, len(JOINTS) :]
-        wanted = np.deg2rad(self.config.speed) * CONTROL_PERIOD
+        wanted = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
         speed = turned(np.concatenate([start, pose], axis=1)) / wanted
         shift, _ = distance(pose, start)
         change = np.diff(record.frames["target"], axis=1, prepend=record.start["target"][:, None])
-        lean = (1.0 - upright(pose)) / (1.0 - LEVEL)
+        lean = (1.0 - upright(pose)) / (1.0 - _LEVEL)
         terms = np.stack(
             [
                 np.maximum(np.minimum(speed, 1.0), -_FASTEST),
