@@ -5,7 +5,7 @@
 Each row is learnt by the farm in runs of its own under runs/turning, one per seed, with the preset of the task
 `turning`; rows differ in what the policy sees. Policies are judged for 16 s from 200 perturbed starts that no run
 trained on, and for 24 s with cycles of 3 s instead of 2. With shuffled touch every policy is given the forces that
-another rollout's fingers feel. The film shows the last row's policy of the first seed, slowed, from the nominal start.
+another rollout's fingers feel. The film shows the last row's policy of the first seed from the nominal start.
 """
 
 import argparse
@@ -35,8 +35,8 @@ SLOW: Final[Mapping[str, Any]] = {"steps": 240, "cycle": 3.0}
 STARTS: Final[list[loop.Seed]] = [seeds.trial(9, i) for i in range(200)]
 """Starts that are judged."""
 
-Figures = dict[str, float]
-"""Of one policy from all starts, by column."""
+Figures = dict[str, float | None]
+"""Of one policy from all starts, by column; None where there is none."""
 
 
 class Shuffled:
@@ -73,14 +73,20 @@ def main() -> None:
         if not table:
             print(f"| what the policy sees | {' | '.join(found[0])} |\n|---|{'---|' * len(found[0])}")
         table[name] = found
-        cells = (", ".join(f"{figures[column]:g}" for figures in found) for column in found[0])
+        cells = (", ".join(_cell(figures[column]) for figures in found) for column in found[0])
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
     if chosen.json is not None:
         chosen.json.write_text(json.dumps(table) + "\n")
     if chosen.video is not None:
-        policy = farm.load(_learnt(names[-1], numbers[0], options), **SLOW)
-        shown = policy.runner.rollouts(policy.mu[None], [None], physics=True)
-        video.write(chosen.video, film(policy.runner.task, _turned(shown)))
+        policy = farm.load(_learnt(names[-1], numbers[0], options), **LONG)
+        shown = _turned(policy.runner.rollouts(policy.mu[None], [None], physics=True))
+        lifts = (shown.felt[0, :-1] & ~shown.felt[0, 1:]).sum(axis=0).tolist()
+        print(f"lifted in the film's 16 s: {dict(zip(FINGERS, lifts, strict=True))}")
+        video.write(chosen.video, film(policy.runner.task, shown))
+
+
+def _cell(figure: float | None) -> str:
+    return "-" if figure is None else f"{figure:g}"
 
 
 def _learnt(name: str, number: int, options: Mapping[str, Any]) -> Path:
@@ -140,7 +146,7 @@ def _figures(found: Turned) -> Figures:
         "drift [mm]": round(1e3 * max(one.drift.max() for one in each), 1),
         "lost [%]": round(100 * float(found.lost[:, -1].mean()), 1),
         "reached 360 [%]": round(100 * len(round_at) / len(each), 1),
-        "after [s]": round(float(np.median(round_at)) * CONTROL_PERIOD, 1) if round_at else float("nan"),
+        "after [s]": round(float(np.median(round_at)) * CONTROL_PERIOD, 1) if round_at else None,
     }
 
 
