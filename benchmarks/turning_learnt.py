@@ -1,6 +1,6 @@
 """A plate turned by regrasping, learnt with touch and without, beside holding still and the script; one table.
 
-    python benchmarks/turning_learnt.py [--seeds 20,21,22] [--rows phase,phase+forces] [--video FILE.gif] [--json FILE]
+    python benchmarks/turning_learnt.py [--seeds 20,21,22,23] [--rows phase,phase+forces] [--video FILE.gif] [--json FILE]
 
 Each row is learnt by the farm in runs of its own under runs/turning, one per seed, with the preset of the task
 `turning`; rows differ in what the policy sees. Policies are judged for 16 s from 200 perturbed starts that no run
@@ -58,7 +58,7 @@ class Shuffled:
 def main() -> None:
     """Learn, judge, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="20,21,22")
+    parser.add_argument("--seeds", default="20,21,22,23")
     parser.add_argument("--rows", default=ROWS, help="what policies see, with commas")
     parser.add_argument("--generations", type=int, help="other than the preset's")
     parser.add_argument("--video", type=Path, metavar="FILE", help=".gif or .mp4")
