@@ -1,6 +1,6 @@
 """A plate turned by regrasping, learnt with touch and without, beside holding still and the script; one table.
 
-    python benchmarks/turning_learnt.py [--seeds 20,21,22,23] [--rows phase,phase+forces] [--video FILE.gif] [--json FILE]
+    python benchmarks/turning_learnt.py [--seeds 20,21] [--rows phase,phase+forces] [--video FILE] [--json FILE]
 
 Each row is learnt by the farm in runs of its own under runs/turning, one per seed, with the preset of the task
 `turning`; rows differ in what the policy sees. Policies are judged for 16 s from 200 perturbed starts that no run

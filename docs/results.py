@@ -71,7 +71,7 @@ Results that have pages of their own:
 |---|---|
 | [Does touch decide?](touch.md) | {touch} |
 | [How long does a chain of gaits go on?](chain.md) | ten cycles or more in five seeds of five |
-| [Can an object be turned?](turning.md) | a plate, by a script: 360 degrees from each of 200 starts; learnt, with touch or without: 11 of 16 policies from 95 % or more |
+| [Can an object be turned?](turning.md) | a plate, by 360 degrees: a script, and most learnt policies |
 | [How surely do the presets learn?](seeds.md) | `default` in ten seeds of ten, `thesis` in eight of ten |
 | [How do the learners compare with published scores?](learners.md) | a table per environment |
 
