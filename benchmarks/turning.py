@@ -21,7 +21,6 @@ import numpy as np
 from farm import seeds
 from farm.arrays import BoolArray, FloatArray
 from farm.sim import rendering, video
-from farm.sim.channels import Camera
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait import model
@@ -29,11 +28,11 @@ from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS, LOWER, UPPER
 from farm.tasks.finger_gait.model import Hand
 from farm.tasks.finger_gait.task import MAX_SHIFT, TIMESTEP, FingerGait, FingerGaitConfig
+from farm.tasks.finger_gait.turning import Turning, turned, upright
 from farm.tasks.loop import Seed, again
 
 MOST_TILT: Final = 30.0
 """Tilt from which the plate counts as dropped [deg]."""
-CAMERA: Final = Camera(lookat=(0.062, 0.022, 0.022), distance=0.2, azimuth=158.0, elevation=-42.0)
 TURN: Final = 360.0
 """What is to be reached [deg]."""
 SIDE: Final = (264, 216)
@@ -144,6 +143,16 @@ class Turned:
     qpos: FloatArray
     """(B, T, nq)."""
 
+    @classmethod
+    def of(cls, qpos: FloatArray, felt: BoolArray) -> "Turned":
+        """What follows from the states (B, T, nq) and from which fingertips touch the plate (B, T, 3)."""
+        pose = qpos[..., -7:]
+        degrees = np.cumsum(np.degrees(2.0 * np.arctan(0.5 * turned(pose))), axis=1)
+        tilt = np.degrees(np.arccos(np.clip(upright(pose), -1.0, 1.0)))
+        drift = np.linalg.norm(pose[..., :3] - pose[:, :1, :3], axis=-1)
+        lost = np.maximum.accumulate(~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1)
+        return cls(np.pad(degrees, ((0, 0), (1, 0))), tilt, drift, lost, felt, qpos)
+
     def first(self, row: int) -> "Turned":
         """One rollout until the plate was lost."""
         steps = max(1, int(np.argmax(self.lost[row]))) if self.lost[row].any() else self.lost.shape[1]
@@ -183,13 +192,7 @@ def turn(gait: FingerGait, targets: FloatArray, starts: Sequence[Seed]) -> Turne
         return np.stack(poses, axis=1), np.stack(felt, axis=1)
 
     qpos, felt = again(played)
-    w, x, y, z = np.moveaxis(qpos[..., -4:], -1, 0)
-    heading = np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), axis=1)
-    tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
-    place = qpos[..., -7:-4]
-    drift = np.linalg.norm(place - place[:, :1], axis=-1)
-    lost = np.maximum.accumulate(~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1)
-    return Turned(np.degrees(heading[:, :1] - heading), tilt, drift, lost, felt, qpos)
+    return Turned.of(qpos, felt)
 
 
 def main() -> None:
@@ -211,17 +214,17 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     for number, reach in enumerate(chosen.reach.split(",")):
         keys = Keys(gait.hand, Script(reach=1e-3 * float(reach)))
-        turned = turn(gait, script_of(keys, chosen.cycles), [None, *(seeds.trial(0, i) for i in range(chosen.starts))])
-        print(f"| {reach} | nominal | {row(turned, slice(0, 1))} |")
+        found = turn(gait, script_of(keys, chosen.cycles), [None, *(seeds.trial(0, i) for i in range(chosen.starts))])
+        print(f"| {reach} | nominal | {row(found, slice(0, 1))} |")
         if chosen.starts:
-            print(f"| | {chosen.starts} perturbed | {row(turned, slice(1, None))} |", flush=True)
+            print(f"| | {chosen.starts} perturbed | {row(found, slice(1, None))} |", flush=True)
         if chosen.video is not None and not number:
-            video.write(chosen.video, film(gait, turned))
+            video.write(chosen.video, film(gait, found))
 
 
-def row(turned: Turned, rows: slice) -> str:
+def row(found: Turned, rows: slice) -> str:
     """Cells of the table: of several rollouts the least turn, the latest time, the largest tilt and drift."""
-    each = [turned.first(i) for i in range(len(turned.lost))[rows]]
+    each = [found.first(i) for i in range(len(found.lost))[rows]]
     whole = [i for i in each if i.degrees[0].max(initial=0.0) >= TURN]
     degrees = min(i.degrees[0, -1] for i in each)
     seconds = max(i.degrees.shape[1] for i in each) * TIMESTEP
@@ -233,13 +236,13 @@ def row(turned: Turned, rows: slice) -> str:
     return f"{degrees:.0f} | {seconds:.1f} | {speed:.0f} | {after} | {tilt:.1f} | {drift:.1f} | {reached}"
 
 
-def film(gait: FingerGait, turned: Turned) -> Iterator[rendering.Picture]:
+def film(gait: FingerGait, found: Turned) -> Iterator[rendering.Picture]:
     """The first rollout in real time, until the plate is round."""
-    first = turned.first(0)
+    first = found.first(0)
     round_at = np.flatnonzero(first.degrees[0] >= TURN)
     poses = first.qpos[0, : round_at[0] + 1] if len(round_at) else first.qpos[0]
     shown = video.moments((np.arange(len(poses)) * TIMESTEP).tolist(), speed=1.0, rest=0.0)[::2]
-    for picture in rendering.pictures(gait.model, poses[shown], SIDE, camera=CAMERA):
+    for picture in rendering.pictures(gait.model, poses[shown], SIDE, camera=Turning.camera):
         yield from (picture, picture)  # a gif keeps it once
 
 

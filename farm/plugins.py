@@ -25,6 +25,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     "tasks": {
         "finger-gait": "farm.tasks.finger_gait.task:FingerGait",
         "fragile-bar": "farm.tasks.finger_gait.fragile_bar:FragileBar",
+        "turning": "farm.tasks.finger_gait.turning:Turning",
         "gym": "farm.tasks.gymnasium:Environment",
     },
     "policies": {

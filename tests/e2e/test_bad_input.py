@@ -34,7 +34,7 @@ MISTAKES = [
     (("run", "--goal-grip", "fist"), "unknown grip 'fist'; known are index+thumb"),
     (
         ("run", "--task", "juggling"),
-        "unknown task 'juggling'; known are finger-gait, fragile-bar, gym, or",
+        "unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or",
     ),
     (
         ("run", "--task", "gym:Swimmr-v5"),

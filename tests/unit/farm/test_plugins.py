@@ -41,7 +41,11 @@ def test_every_built_in_one_is_there(kind: str, name: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "words"),
     [
-        ("tasks", "juggling", r"unknown task 'juggling'; known are finger-gait, fragile-bar, gym, or FILE\.py:CLASS"),
+        (
+            "tasks",
+            "juggling",
+            r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or FILE\.py:CLASS",
+        ),
         ("policies", "pid", r"unknown policy 'pid'; known are direct, .*, or FILE\.py:CLASS"),
         ("backends", "gpu", r"unknown backend 'gpu'; known are cpu, warp, or FILE"),
         ("commands", "fly", r"unknown command 'fly'; known are run, .*certificates$"),
@@ -199,13 +203,14 @@ def test_a_class_of_an_installed_package() -> None:
     found = find("tasks", "walk")
     assert (found.target.steps, found.wire, found.release, found.origin) == (5, "walk", "theirs 1.2", "theirs 1.2")
     assert names("tasks") == {
-        **dict.fromkeys(("finger-gait", "fragile-bar", "gym"), "built in"),
+        **dict.fromkeys(("finger-gait", "fragile-bar", "turning", "gym"), "built in"),
         **dict.fromkeys(("walk", "broken", "lost"), "theirs 1.2"),
     }
     assert find("tasks", "finger-gait").target is FingerGait, "nobody takes a built-in's name"
     assert find("commands", "hike").target.steps == 5
     with pytest.raises(
-        ConfigError, match=r"unknown task 'juggling'; known are finger-gait, fragile-bar, gym, walk, broken, lost"
+        ConfigError,
+        match=r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, walk, broken, lost",
     ):
         find("tasks", "juggling")
 

@@ -241,7 +241,10 @@ def test_other_code_is_refused_and_named(spec, file, name, words, digest):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"task": "juggling"}, r"unknown task 'juggling'; known are finger-gait, fragile-bar, gym, or FILE\.py:CLASS"),
+        (
+            {"task": "juggling"},
+            r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or FILE\.py:CLASS",
+        ),
         ({"policy": "pid"}, "unknown policy 'pid'; known are direct"),
         ({"policy_release": "mine 2"}, "the run uses direct of mine 2, but here direct belongs to rolloutfarm"),
         (

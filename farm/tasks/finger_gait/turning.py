@@ -1,0 +1,148 @@
+"""Turning: a plate is turned about the vertical by regrasping, and slowly, so that no finger flicks it.
+
+The hand holds the plate with three fingers, the thumb below. A policy sees where in a cycle it is, and perhaps the
+joints and what the fingertips feel. Turning counts up to a wanted speed; what is faster costs as much again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+
+from farm import elementary
+from farm.arrays import BoolArray, FloatArray
+from farm.settings import setting
+from farm.sim.channels import Camera
+from farm.sim.sim import Sim
+from farm.tasks.base import Record, Score, Task, TaskConfig, TaskSpec
+from farm.tasks.finger_gait.hand import FINGERS, JOINTS
+from farm.tasks.finger_gait.task import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, FingerGait, distance
+
+TERMS: Final = ("turn", "speed", "pose", "action", "drop")
+"""What the reward is made of."""
+
+_HARMONICS: Final = np.arange(1, 4)  # of the cycle's frequency, that are seen
+_LEVEL: Final = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt from which the plate is lost
+_SIZES: Final = {"phase": 2 * len(_HARMONICS), "joints": len(JOINTS), "forces": len(FINGERS)}
+_FORCE: Final = 0.1  # of the forces that are seen [1 / N]
+_ACTION: Final = 0.02  # reward per squared change of the targets [1 / rad^2]
+_POSE: Final = 0.6  # reward that a plate loses which is tilted or shifted so far that it is nearly lost
+_FASTEST: Final = 3.0  # times the wanted speed: what is faster costs no more
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurningConfig(TaskConfig):
+    """Settings of turning."""
+
+    state: Literal["phase", "phase+joints", "phase+forces", "phase+joints+forces"] = "phase+forces"
+    """What a policy sees besides the time in its cycle: nothing, the joints, the fingertips' forces, or both."""
+    cycle: float = setting(2.0, least=0.2, most=100.0)
+    """Time of a cycle [s]."""
+    wanted: float = setting(60.0, above=0.0, most=360.0)
+    """Wanted speed while the plate turns [deg/s]."""
+    friction: float = setting(1.0, above=0.0)
+    """Factor of every friction coefficient, of fingertips and object alike."""
+
+    # What the finger gait has settings for, and is fixed here: no fields, so no flags.
+    object = "plate"
+    pose = "between"
+    start_grip = "index+middle+thumb"
+    action = "offset"
+    clip = True
+
+
+class Turning(FingerGait):
+    """A hand turns a plate by regrasping it."""
+
+    Config = TurningConfig
+    steps = 80
+    ending = "lost"
+    camera = Camera(lookat=(0.062, 0.022, 0.022), distance=0.2, azimuth=158.0, elevation=-42.0)
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "default": {
+            "policy": "linear", "algorithm": "snes", "pairs": 20, "initial_sigma": 0.03, "generations": 100,
+        },
+    }  # fmt: skip
+    return_scale = Task.return_scale
+    ends = None  # type: ignore[assignment]  # no grip is to be reached
+
+    def spec(self) -> TaskSpec:
+        """What both sides must know, without closing a grip."""
+        return TaskSpec(
+            observation=sum(self.parts), action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
+            terms=TERMS, success=True, channels=self.channels,
+        )  # fmt: skip
+
+    @property
+    def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
+        """Sizes of what is seen."""
+        return tuple(_SIZES[part] for part in self.config.state.split("+"))
+
+    def setup(self, sim: Sim) -> None:
+        """Find the start grip; a ConfigError where it does not hold."""
+        self._find_start(sim)
+
+    def observe(self, sim: Sim) -> FloatArray:
+        """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d)."""
+        # 1 - cosine is zero where a cycle begins, as the sine is: only a policy's offsets change the grip there.
+        phase = 2.0 * np.pi * _HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
+        seen = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
+        if "joints" in self.config.state:
+            noise = sim.own["noise"][:, min(sim.t, self.steps - 1)]
+            seen.append(sim.qpos[:, : len(JOINTS)] + noise - self.start_commands)
+        if "forces" in self.config.state:
+            seen.append(_FORCE * self.measure(sim)["force"].sum(axis=-1))
+        return np.concatenate(seen, axis=1)
+
+    def ended(self, sim: Sim) -> BoolArray:
+        """Where the plate is tilted or out of place, or no fingertip touches it."""
+        pose = sim.qpos[:, len(JOINTS) :]
+        shift, _ = distance(pose, sim.own["released"])
+        return super().ended(sim) | (shift > MAX_SHIFT) | (upright(pose) < _LEVEL)
+
+    def score(self, record: Record) -> Score:
+        """Reward terms; a success is a plate that is still held and turned at half of the wanted speed or more."""
+        pose, start = record.frames["qpos"][..., len(JOINTS) :], record.start["qpos"][:, None, len(JOINTS) :]
+        wanted = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
+        speed = turned(np.concatenate([start, pose], axis=1)) / wanted
+        shift, _ = distance(pose, start)
+        change = np.diff(record.frames["target"], axis=1, prepend=record.start["target"][:, None])
+        lean = (1.0 - upright(pose)) / (1.0 - _LEVEL)
+        terms = np.stack(
+            [
+                np.maximum(np.minimum(speed, 1.0), -_FASTEST),
+                -np.minimum(np.maximum(speed - 1.0, 0.0), _FASTEST),
+                -_POSE * np.minimum((shift / MAX_SHIFT) ** 2 + lean, 2.0),
+                -_ACTION * (change * change).sum(axis=-1),
+                np.zeros_like(speed),
+            ],
+            axis=-1,
+        )
+        over = np.arange(self.steps) >= record.steps[:, None]
+        terms[over], terms[over, -1] = 0.0, -1.0
+        terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)
+        enough = terms[..., 0].sum(axis=1) >= 0.5 * self.steps
+        return Score(terms / self.steps, enough & (record.steps == self.steps) & ~record.failed)
+
+    def exported(self) -> dict[str, Any]:
+        """Nothing of its own."""
+        return {}
+
+
+def turned(pose: FloatArray) -> FloatArray:
+    """By how much poses (..., T + 1, 7) turn between each other [rad], clockwise seen from above, (..., T).
+
+    2 tan(angle / 2) instead of the angle: nearly the same where it is small, and arctan rounds as the processor likes.
+    """
+    w, x, y, z = np.moveaxis(pose[..., 3:], -1, 0)
+    cosine, sine = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
+    across = sine[..., :-1] * cosine[..., 1:] - cosine[..., :-1] * sine[..., 1:]
+    along = cosine[..., :-1] * cosine[..., 1:] + sine[..., :-1] * sine[..., 1:]
+    length = np.sqrt(across * across + along * along)
+    return np.asarray(2.0 * across / np.maximum(length + along, 1e-9))
+
+
+def upright(pose: FloatArray) -> FloatArray:
+    """Cosine of the tilt of poses (..., 7)."""
+    return np.asarray(1.0 - 2.0 * (pose[..., 4] ** 2 + pose[..., 5] ** 2))
