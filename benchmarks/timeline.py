@@ -89,6 +89,7 @@ def main() -> None:
         for part in PARTS
     }
     took["update, save, report"] -= took["hand out jobs"]  # the next jobs go out in the middle of it
+    took["simulate"] -= took["send results"]  # at its end
     for part, total in took.items():
         print(f"| {part} | {total / len(lengths):.1f} |")
     print(f"| both workers wait | {2e3 * length - (took['simulate'] + took['send results']) / len(lengths):.1f} |")
