@@ -8,6 +8,7 @@ the same clock. Of the middle generations, the picture shows two whose time is t
 
 import argparse
 import json
+import select
 import statistics
 import subprocess
 import sys
@@ -62,8 +63,6 @@ def work(endpoint: str) -> None:
 
 
 def _closed() -> bool:
-    import select
-
     return bool(select.select([sys.stdin], [], [], 0.0)[0])
 
 
