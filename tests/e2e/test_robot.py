@@ -79,7 +79,7 @@ def test_without_mixed_a_device_is_refused(farm: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", *RUN, "--listen", endpoint, "--name", "r")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
-    wait_for(learner, "it is a device, whose numbers are not to be had again: start the learner with --mixed")
+    wait_for(learner, "it is a device, whose results cannot be repeated: start the learner with --mixed")
 
 
 def test_a_device_refuses_what_it_does_not_know(farm: Farm) -> None:
