@@ -1,10 +1,10 @@
-"""Settings x seeds: the runs of a sweep, and the folder that they are in.
+"""Settings x seeds: the runs of a sweep, and its folder.
 
-    sweep.json                 what is varied, the seeds, and each setting's configuration
+    sweep.json                 the varied settings, the seeds, and each setting's configuration
     SETTING-sSEED/             a run's folder each
     table.csv, .parquet, figure.svg      results
 
-Seeds may be added to a sweep later; nothing else may change.
+Seeds may be added to a sweep later; nothing else can be changed.
 """
 
 import itertools
@@ -39,7 +39,7 @@ class Setting:
     values: Mapping[str, str]
     """Varied values as given, by the flag's name with underscores."""
     config: RunConfig
-    """Of seed 0."""
+    """The configuration with seed 0."""
 
     @property
     def label(self) -> str:
@@ -63,7 +63,7 @@ class Sweep:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The settings' parts of run names: the varied values, or a number if these make no valid name."""
+        """Each setting's part of its runs' names: the varied values, or a number if those give no valid name."""
         plain = [_plain(setting.values) for setting in self.settings]
         count = Counter(plain)
         return tuple(
@@ -87,7 +87,7 @@ class Sweep:
         """Make the folder, or continue with it; seeds may be added.
 
         Raises:
-          ConfigError: it belongs to another sweep, or is not a sweep's folder.
+          ConfigError: it belongs to a different sweep, or is not a sweep's folder.
         """
         file = self.path / "sweep.json"
         with writing(f"to {self.path}", ConfigError):
@@ -122,7 +122,7 @@ class Sweep:
 
 
 def _plain(values: Mapping[str, str]) -> str:
-    """Varied values as part of a run's name; a file without its path."""
+    """Varied values as part of a run's name; files without their folder."""
     parts = [f"{name}-{value.rpartition('/')[2]}" for name, value in values.items()]
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", "-".join(parts))
 

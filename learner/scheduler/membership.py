@@ -43,7 +43,7 @@ class Admission:
         )
 
     def counted(self, canary: str) -> bool:
-        """Note an accepted result of a machine with this canary; return whether it was the first, which sets the run's."""
+        """Note an accepted result from a machine with this canary; return whether it was the first of the run."""
         if self.canary is not None or not canary:
             return False
         self.canary = canary
@@ -95,7 +95,7 @@ class Attendance:
         if want.worker in self._there:
             return True
         if want.worker not in self._early and len(self._early) >= _ASKING:
-            raise MessageError(f"{_ASKING} others ask whose tokens are not there", "absent")
+            raise MessageError(f"there are already {_ASKING} requests of workers without a token", "absent")
         self._early[want.worker] = want, self._early.get(want.worker, (want, now))[1]
         return False
 
