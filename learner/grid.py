@@ -94,7 +94,7 @@ class Sweep:
             if file.exists():
                 self._check_same(file)
             elif self.path.exists() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} holds something else and no sweep.json: give another --out")
+                raise ConfigError(f"{self.path} holds something else and no sweep.json: give a different --out")
             self.path.mkdir(parents=True, exist_ok=True)
             made = [configs.to_dict(setting.config) for setting in self.settings]
             told = {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": made}
@@ -111,13 +111,15 @@ class Sweep:
             raise ConfigError(f"{file} is not of version {_VERSION}")
         if told.get("vary") != self.vary:
             there, here = _words(told.get("vary")), _words(self.vary)
-            raise ConfigError(f"{self.path} varies {there}; here it is {here}: give the same, or another --out")
+            raise ConfigError(f"{self.path} varies {there}; here it is {here}: give the same or a different --out")
         if missing := [str(seed) for seed in told["seeds"] if seed not in self.seeds]:
-            raise ConfigError(f"{self.path} has seeds {', '.join(missing)} as well: give them too, or another --out")
+            raise ConfigError(
+                f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different --out"
+            )
         for setting, kept in zip(self.settings, told["settings"], strict=False):
             for name, old, new in configs.changes(configs.from_dict(kept, str(file)), setting.config):
                 raise ConfigError(
-                    f"{self.path} was begun with --{name} {old}; here it is {new}: give the same, or another --out"
+                    f"{self.path} was started with --{name} {old}; here it is {new}: use the same, or a different --out"
                 )
 
 
@@ -146,7 +148,7 @@ def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
         if name in out:
             raise ConfigError(f"--vary {name} is given twice: give all of its values at once")
         if len(set(values)) < len(values):
-            raise ConfigError(f"--vary {word}: a value comes twice")
+            raise ConfigError(f"--vary {word}: a value is given twice")
         out[name] = values
     return out
 
@@ -163,7 +165,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise ConfigError(f"--seeds {text!r}: expected at most {MOST} seeds below 2^32")
         out += range(first, last + 1)
     if len(set(out)) < len(out):
-        raise ConfigError(f"--seeds {text!r}: a seed comes twice")
+        raise ConfigError(f"--seeds {text!r}: a seed is given twice")
     return tuple(out)
 
 

@@ -43,7 +43,7 @@ def test_what_it_cannot_begin_with_is_said_without_a_traceback(words: tuple[str,
     command = [sys.executable, str(EXAMPLES / "robot_worker.py"), *words]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2
-    assert "robot_worker.py: error: it cannot begin with these: " in ended.stderr
+    assert "robot_worker.py: error: it cannot start with these settings: " in ended.stderr
     assert "Traceback" not in ended.stderr
 
 

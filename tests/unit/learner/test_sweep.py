@@ -146,10 +146,10 @@ def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
     for other, said in (
         (made(out, "0.1", "0.2"), "has seeds 2 as well"),
         (made(out, "0.1", seeds=(0, 1, 2)), "varies initial_sigma=0.1,0.2; here it is initial_sigma=0.1:"),
-        (made(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was begun with --pairs 5; here it is 3"),
-        (made(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3), "was begun with --generations 90; here it is 3"),
+        (made(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was started with --pairs 5; here it is 3"),
+        (made(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3), "was started with --generations 90; here it is 3"),
     ):
-        with pytest.raises(ConfigError, match="another --out") as error:
+        with pytest.raises(ConfigError, match="a different --out") as error:
             other.prepare()
         assert said in str(error.value)
 
@@ -198,7 +198,7 @@ def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path
         read = list(csv.DictReader(file))
     assert list(read[0]) == ["initial_sigma", *outcomes.COLUMNS]
     assert [(r["initial_sigma"], r["seed"], r["state"]) for r in read] == [
-        ("0.1", "0", "finished"), ("0.1", "1", "finished"), ("0.2", "0", "diverged"), ("0.2", "1", "not begun"),
+        ("0.1", "0", "finished"), ("0.1", "1", "finished"), ("0.2", "0", "diverged"), ("0.2", "1", "not started"),
     ]  # fmt: skip
     assert (read[0]["generations"], read[0]["rollouts"], read[0]["seconds"]) == ("2", "60", "4.0")
     assert (read[0]["first_mean_policy_return"], read[2]["mean_policy_return"]) == ("-5.0", "")
