@@ -111,7 +111,9 @@ class Sweep:
             raise ConfigError(f"{file} is not of version {_VERSION}")
         if told.get("vary") != self.vary:
             there, here = _words(told.get("vary")), _words(self.vary)
-            raise ConfigError(f"{self.path} varies {there}; here it is {here}: give the same or a different --out")
+            raise ConfigError(
+                f"{self.path} varies {there}; here it is {here}: use the same values, or a different --out"
+            )
         if missing := [str(seed) for seed in told["seeds"] if seed not in self.seeds]:
             raise ConfigError(
                 f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different --out"
@@ -119,7 +121,7 @@ class Sweep:
         for setting, kept in zip(self.settings, told["settings"], strict=False):
             for name, old, new in configs.changes(configs.from_dict(kept, str(file)), setting.config):
                 raise ConfigError(
-                    f"{self.path} was started with --{name} {old}; here it is {new}: use the same, or a different --out"
+                    f"{self.path} was started with --{name} {old}; here it is {new}: use that, or a different --out"
                 )
 
 
