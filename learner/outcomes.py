@@ -45,7 +45,7 @@ def _row(path: Path, seed: int) -> dict[str, Any]:
         last = progress[-1]
         row |= {"generations": last.generation, "rollouts": last.rollouts, "seconds": last.seconds}
         row["first_mean_policy_return"] = progress[0].mean_policy_return
-    row["state"] = summary.get("state") or ("unfinished" if progress else "not started")
+    row["state"] = summary.get("state") or ("unfinished" if progress else "not begun")
     return row
 
 

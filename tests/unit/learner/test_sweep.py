@@ -198,7 +198,7 @@ def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path
         read = list(csv.DictReader(file))
     assert list(read[0]) == ["initial_sigma", *outcomes.COLUMNS]
     assert [(r["initial_sigma"], r["seed"], r["state"]) for r in read] == [
-        ("0.1", "0", "finished"), ("0.1", "1", "finished"), ("0.2", "0", "diverged"), ("0.2", "1", "not started"),
+        ("0.1", "0", "finished"), ("0.1", "1", "finished"), ("0.2", "0", "diverged"), ("0.2", "1", "not begun"),
     ]  # fmt: skip
     assert (read[0]["generations"], read[0]["rollouts"], read[0]["seconds"]) == ("2", "60", "4.0")
     assert (read[0]["first_mean_policy_return"], read[2]["mean_policy_return"]) == ("-5.0", "")
