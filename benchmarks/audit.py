@@ -1,8 +1,8 @@
-"""What spot checks cost: rollouts/s of two hosts with and without them, in turns; one table.
+"""Cost of spot checks: rollouts/s of two hosts, alternately with and without them; one table.
 
     python benchmarks/audit.py [--generations 60] [--repeats 5]
 
-Two workers of different names on this machine, the finger gait as `farm run` learns it, without recording.
+Two workers with different host names on this machine learn the finger gait as `farm run` does, without recording.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def _rate(config: RunConfig, audit: float) -> float:
-    """Exploring rollouts per second, from the tenth part of the generations on."""
+    """Exploring rollouts per second, without the first tenth of the generations."""
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
     flags = ["--connect", place.listen, "--log-level", "WARNING"]
     times: list[float] = []

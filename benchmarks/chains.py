@@ -1,11 +1,11 @@
-"""Four gaits, and how long they chain: learnt one by one, then in turn without losing the bar; two tables.
+"""Learns four gaits, then runs them in turn and counts how long the bar is not lost; two tables.
 
     python benchmarks/chains.py [--seeds 20,21,22,23,24] [--policy constant] [--out runs/chains]
 
-The gaits are the presets middle-on, index-off, index-on and middle-off, learnt by the farm. A gait's rollouts are those
-after which the mean policy succeeds on at least 95 of 100 perturbed starts, and from then on each time it is looked at:
-after every generation of the first 200 rollouts, and at the end. The chain is tried on 50 other starts for 1000 control
-steps (100 s). What is there already is not learnt again.
+The gaits are the presets middle-on, index-off, index-on and middle-off. The first table has the number of rollouts
+after which the mean policy succeeds on at least 95 of 100 perturbed starts in this and every later test; it is tested
+after every generation of the first 200 rollouts, and at the end. The chain is tried on 50 different starts for 1000
+control steps (100 s). Finished runs are not repeated.
 """
 
 import argparse
@@ -28,10 +28,10 @@ SETTINGS: Final[dict[str, dict[str, Any]]] = {
     "weighted-kernel": {"generations": 25},
     "constant": {"policy": "constant", "initial_sigma": 0.2, "generations": 80},
 }
-"""What is other than in the presets, by policy: 500 rollouts for each gait, or 1600."""
+"""Settings that differ from the presets, by policy: 500 or 1600 rollouts per gait."""
 TRIALS: Final = 100
-ENOUGH: Final = 95  # of them
-FIRST: Final = 200  # rollouts after each generation of which it is looked at, and then at the end
+ENOUGH: Final = 95  # successes required
+FIRST: Final = 200  # rollouts during which the mean policy is tested after each generation
 STARTS: Final = 50
 STEPS: Final = 1000
 
@@ -65,13 +65,13 @@ def _learnt(run: Path, gait: str, seed: int, changed: dict[str, Any]) -> None:
     if (run / "summary.json").exists():
         return
     if run.exists():
-        raise ConfigError(f"{run} is not finished: remove it, or give another --out")
+        raise ConfigError(f"{run} is not finished: remove it, or give a different --out")
     for _ in learn(configure("finger-gait", gait, seed=seed, **changed), run):
         pass
 
 
 def _since(run: Path, policy: LoadedPolicy) -> str:
-    """After how many rollouts the mean policy is robust for good."""
+    """Number of rollouts from which on every tested mean policy is robust."""
     folder, robust = RunFolder.open(run), []
     progress = [line for line in folder.progress() if line.rollouts <= FIRST or line.generation == policy.generation]
     starts = [seeds.trial(0, i) for i in range(TRIALS)]

@@ -1,9 +1,9 @@
-"""After how many rollouts a preset's mean policy succeeds, in this process (results are in docs/seeds.md).
+"""Number of rollouts after which a preset's mean policy succeeds (results are in docs/seeds.md). Uses one process.
 
     python benchmarks/early.py [--preset default] [--first 20] [--seeds 10] [--policy constant]
 
 The mean policy is tried on 100 perturbed starts after every generation of the first 500 rollouts, then after every 15th
-and the last; on the nominal start after every 5th. `--policy constant` learns 8 numbers that do not see the state.
+and the last; on the nominal start after every 5th. `--policy constant` learns 8 joint commands without feedback.
 """
 
 import argparse
@@ -25,11 +25,11 @@ DENSE = 500  # rollouts
 
 
 class Constant(Policy):
-    """a = theta, whatever is seen."""
+    """a = theta, for every observation."""
 
     @property
     def size(self) -> int:
-        """One number an action."""
+        """One number per action."""
         return self.spec.action
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:  # noqa: ARG002
@@ -39,13 +39,13 @@ class Constant(Policy):
 
 @dataclass
 class Curve:
-    """What the mean policy was worth, by exploring rollouts so far."""
+    """Results of the mean policy, by number of exploring rollouts."""
 
     robust: list[tuple[int, int]]
     nominal: list[tuple[int, float]]
 
     def look(self, runner: Runner, mu: FloatArray, rollouts: int, *, robust: bool, nominal: bool) -> None:
-        """Try a mean."""
+        """Test a mean policy."""
         if robust:
             trials = [seeds.trial(0, i) for i in range(TRIALS)]
             found = runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), trials)
@@ -98,7 +98,7 @@ def _learnt(config: Any, runner: Runner | None) -> tuple[Curve, Runner]:  # noqa
 
 
 def _since(values: list[tuple[int, Any]], least: float) -> str:
-    """The first number of rollouts from which on all are enough."""
+    """The first number of rollouts from which on all results are good enough."""
     below = [at for at, (_, value) in enumerate(values) if value < least]
     first = below[-1] + 1 if below else 0
     return str(values[first][0]) if first < len(values) else "-"

@@ -1,9 +1,9 @@
-"""Rollouts a second of Gymnasium's environments: its own loop, the farm's environments one by one, and in a batch.
+"""Rollouts per second of Gymnasium environments: in its own loop, in the farm's one by one, and in the farm's batches.
 
     python benchmarks/environments.py [--rollouts 64] [--steps 200] [--repeats 3]
 
-One process, one thread, a linear policy of the same random parameters in all three, no early ends (the rewards and
-observations are computed, the ends are not obeyed). Best of the repeats.
+One process, one thread, a linear policy with the same random parameters in all three. No rollout ends early: rewards
+and observations are computed, but `terminated` is ignored. The best of the repeats is shown.
 """
 
 import argparse

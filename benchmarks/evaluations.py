@@ -1,4 +1,4 @@
-"""What the backends of peers.py evaluate; a module of its own, so that their workers can import it."""
+"""The evaluations that peers.py times; a separate module, so that the workers of each backend can import it."""
 
 import functools
 import os
@@ -12,7 +12,7 @@ from learner.config import configure
 from learner.setup import problem
 
 STILL = 50.0
-"""Every parameter: so far from any joint position that the kernel is zero; no rollout ends early."""
+"""Value of every parameter: so far from any joint position that the kernel is zero and no rollout ends early."""
 
 
 @functools.cache
@@ -22,7 +22,7 @@ def runner() -> Runner:
 
 
 def gait(theta: FloatArray) -> FloatArray:
-    """Returns of rollouts (B, P), the two of a pair from one perturbed start."""
+    """Returns of rollouts with parameters (B, P); both rollouts of a pair have the same perturbed start."""
     return runner().rollouts(theta, [(row // 2,) for row in range(len(theta))]).returns
 
 
@@ -32,6 +32,6 @@ def nothing(theta: FloatArray) -> FloatArray:
 
 
 def pid(_: int = 0) -> int:
-    """Where a worker runs."""
+    """The process in which a worker runs."""
     time.sleep(0.1)
     return os.getpid()

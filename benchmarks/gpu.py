@@ -1,11 +1,11 @@
-"""Physics steps per second of the backend `warp`, beside MuJoCo on this machine's processor; one table.
+"""Physics steps per second of the backend `warp`, compared with MuJoCo on this machine's processor; one table.
 
     python benchmarks/gpu.py [--worlds 1024,4096,16384] [--tasks finger-gait,gym:Ant-v5,gym:HalfCheetah-v5]
         [--steps 20] [--threads 2,16]
 
-Rollouts of a random linear policy, from perturbed starts, with everything that a control step needs: observation,
-action, reward. Steps before the start (closing a grip) take time but are not counted; compiling takes none. Without a
-GPU, MuJoCo Warp simulates on the processor, slowly: take few worlds.
+Rollouts of a random linear policy, from perturbed starts, with all parts of a control step: observation, action,
+reward. Physics steps before the start (closing a grip) take time but are not counted; compilation is not timed.
+Without a GPU, MuJoCo Warp simulates slowly on the processor: use few worlds.
 """
 
 import argparse
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--worlds", default="1024,4096,16384")
     parser.add_argument("--tasks", default="finger-gait,gym:Ant-v5,gym:HalfCheetah-v5")
     parser.add_argument("--steps", type=int, default=20, help="control steps of a rollout")
-    parser.add_argument("--threads", default="2,16", help="of MuJoCo on the processor")
+    parser.add_argument("--threads", default="2,16", help="numbers of threads of MuJoCo on the processor")
     chosen = parser.parse_args()
     print("| task | simulated by | together | physics steps/s |\n|---|---|---|---|")
     for name in chosen.tasks.split(","):
@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def threads(count: int, size: int) -> MakeEngine:
-    """Engines of MuJoCo on so many threads."""
+    """Makes MuJoCo engines with this number of threads."""
     make: Callable[..., BatchEngine] = BatchEngine
     return lambda model: make(model, size, count)
 

@@ -1,4 +1,4 @@
-"""How well the grips hold by themselves: each is closed, released and left alone for 3 s; one table.
+"""How well each grip holds the object without a policy: it is closed, released and held for 3 s; one table.
 
 python benchmarks/grips.py [--object bar] [--pose opposed]
 """
@@ -21,12 +21,12 @@ SECONDS = (0.0, 0.5, 1.0, 2.0, 3.0)
 
 
 def main() -> None:
-    """Hold, and print what was felt and how far the object went."""
+    """Hold each grip, and print the forces and the object's motion."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--object", default="bar")
     parser.add_argument("--pose", choices=tuple(POSES), default="opposed")
     parser.add_argument(
-        "--option", default="", help="of MJCF, in place of the pose's: impratio=3 | noslip_iterations=5"
+        "--option", default="", help="MJCF option to use instead of the pose's: impratio=3 | noslip_iterations=5"
     )
     arguments = parser.parse_args()
     name, _, value = arguments.option.partition("=")
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def hold(object_name: str, pose: str, grip: str, options: Mapping[str, str] | None = None) -> Rollouts:
-    """A rollout whose actions are zero: the start grip's commands stay as they are."""
+    """A rollout with zero actions: the commands of the start grip do not change."""
     steps = round(SECONDS[-1] / CONTROL_PERIOD)
     config = FingerGaitConfig(object=object_name, pose=pose, start_grip=grip, goal_grip=grip, steps=steps)
     own = POSES[pose] if options is None else replace(POSES[pose], options=options)

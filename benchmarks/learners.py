@@ -1,10 +1,10 @@
-"""Every algorithm with every policy, at an equal budget: the gait and three environments.
+"""Every algorithm with every policy, each with the same budget: the gait and three environments.
 
     python benchmarks/learners.py [--tasks gait,Reacher-v5] [--seeds 5] [--out FILE.jsonl]
 
-Nothing is tuned here: a policy has one start and one first sigma for all algorithms, population and rates are the
-algorithms' own, and PGPE is that of Toklu 2020 (ranks, ClipUp with the speed that follows from sigma). The seeds of a
-row are simulated side by side in this process; the numbers are those of runs.
+Nothing is tuned here: a policy has the same start and initial sigma with all algorithms, population and learning rates
+are the algorithms' defaults, and PGPE is that of Toklu 2020 (ranks, ClipUp with a speed derived from sigma). The seeds
+of a row are simulated together in this process; the results are the same as those of `farm run`.
 """
 
 import argparse
@@ -38,7 +38,7 @@ ALGORITHMS: Final[Mapping[str, dict[str, Any]]] = {
     "cma-es": {"population": 20},
     "sep-cma": {"population": 20},
 }
-"""Settings besides start and sigma; twenty rollouts per generation."""
+"""Settings of each algorithm, apart from start and sigma; twenty rollouts per generation."""
 
 GAIT: Final[Mapping[str, dict[str, Any]]] = {
     "constant": {"initial_mu": 0.0, "initial_sigma": 0.2},
@@ -51,7 +51,7 @@ OTHERS: Final[Mapping[str, dict[str, Any]]] = {
     "mlp": {"normalise": True, "layers": (16,), "initial_mu": 0.0, "initial_sigma": 0.05},
     "rbf": {"normalise": True, "bandwidth": 3.0, "initial_mu": 0.0, "initial_sigma": 0.2},
 }
-"""Policies, and where their search begins."""
+"""Policies, and the start of their search."""
 
 TASKS: Final[Mapping[str, tuple[str, int, Mapping[str, dict[str, Any]]]]] = {
     "gait": ("finger-gait", 900, GAIT),
@@ -62,8 +62,8 @@ TASKS: Final[Mapping[str, tuple[str, int, Mapping[str, dict[str, Any]]]]] = {
 """Task, exploring rollouts, policies."""
 
 ENOUGH: Final = 0.95
-LOOK: Final = 150  # rollouts between two looks at the gait
-STARTS: Final = 40  # of a look
+LOOK: Final = 150  # rollouts between two tests of the gait
+STARTS: Final = 40  # perturbed starts per test
 
 
 @dataclass
@@ -82,14 +82,14 @@ class Search:
 
 
 class SideBySide:
-    """Searches' policies in one batch: a row's last number says whose it is."""
+    """Policies of several searches in one batch: the last number of a row is the index of its search."""
 
     def __init__(self, searches: Sequence[Search]) -> None:
         self.policies = [search.problem.policy for search in searches]
         self.seen = np.stack([search.seen() for search in searches])
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """Nothing yet: each policy prepares its own rows as they act."""
+        """Return theta: each policy prepares its own rows in `act`."""
         return theta
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -98,7 +98,7 @@ class SideBySide:
         if self.seen.size:
             with np.errstate(over="ignore", invalid="ignore"):
                 x = (x - self.seen[owners, 0]) / self.seen[owners, 1]
-        policy = self.policies[0]  # constants of all seeds are the same: none of these draws any
+        policy = self.policies[0]  # the same for all seeds: none of these policies draws constants
         return policy.act(policy.prepare(np.ascontiguousarray(prepared[:, :-1])), x)
 
 
@@ -195,7 +195,7 @@ def _together(
 
 
 def _since(looks: Sequence[tuple[int, float]]) -> int | None:
-    """The first look from which on all are good enough."""
+    """The first test from which on all results are good enough."""
     below = [at for at, (_, good) in enumerate(looks) if good < ENOUGH]
     first = below[-1] + 1 if below else 0
     return looks[first][0] if first < len(looks) else None

@@ -1,8 +1,8 @@
-"""What a farm does under unusual loads: many learners, idle workers, huge and tiny generations; one table.
+"""A farm under unusual loads: many learners, idle workers, huge and tiny generations; one table.
 
     python benchmarks/load.py [--seconds 10] [--learners 40]
 
-Workers are the emulated ones of scaling.py, whose rollouts take no time, on this machine.
+Workers are emulated on this machine as in scaling.py; their rollouts take no time.
 """
 
 import argparse
@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--learners", type=int, default=40)
     arguments = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without ending what it began
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # exit normally, so that child processes are stopped
     print("| load | generations/s | rollouts/s | time per generation [ms] | learner: cores | learner MB |")
     print("|---|---|---|---|---|---|")
     for what, workers, pairs in (

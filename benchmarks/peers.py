@@ -1,13 +1,13 @@
-"""The farm beside a pool of processes, Ray, EvoTorch on Ray, and Dask: one table from one run.
+"""Compares the farm with a pool of processes, Ray, EvoTorch on Ray, and Dask; one table.
 
     python benchmarks/peers.py [--turns 3] [--only NAME]
 
-Each backend runs in a process of its own, in turn, several times. All evaluate the same: generations of 15 and of 100
-mirrored pairs of the finger gait, perturbed, held still so that no rollout ends early, and generations that take no
-time. Their rate of physics steps is divided by that of MuJoCo alone with two threads, measured in the same process
-just before and after. Peers get each worker's half of a generation in one call, which is the fastest; what they lack
-(an update, a checkpoint) they do not pay for. `farm run` pays for all of it, except the recording. What is not
-installed is left out, and said: `pip install ray distributed evotorch` adds all.
+Each backend runs several times, in turn with the others, in a separate process. All evaluate the same: generations of
+15 and of 100 mirrored pairs of the finger gait with perturbed starts, held still so that no rollout ends early, and
+generations of empty evaluations. Their rate of physics steps is divided by that of MuJoCo alone with two threads,
+measured in the same process just before and after. The other backends get each worker's half of a generation in one
+call, which is their fastest way, and without updates and checkpoints. The time of `farm run` includes these, but not
+recording. Packages that are not installed are reported and left out: `pip install ray distributed evotorch` adds all.
 """
 
 import argparse
@@ -47,7 +47,7 @@ from learner.run import Placement, open_run
 from learner.setup import problem
 
 PAIRS = (15, 100)
-SECONDS = 1.0  # of each measurement
+SECONDS = 1.0  # duration of each measurement
 GIVE_UP = 10.0  # [s] after which an evaluation counts as hanging
 ZERO = Path(__file__).with_name("zero_cost.py")
 
@@ -94,7 +94,7 @@ COLUMNS = {"gait15": ".2f", "gait100": ".2f", "zero15": ".2f", "zero100": ".2f",
 
 
 def _turn(name: str, *, kill: bool) -> dict[str, Any]:
-    """What a backend's own process says."""
+    """Run one backend in a separate process; return its results."""
     path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, __file__, "--only", name, "--begun", str(time.time())]
     command += ["--kill"] if kill else []
@@ -136,7 +136,7 @@ def _of_one(name: str, begun: float, *, kill: bool) -> None:
 
 
 def _times(call: Callable[[], object]) -> list[float]:
-    """Seconds of each call, for a while, the first one left out."""
+    """Durations of repeated calls [s], without the first."""
     call()
     taken: list[float] = []
     while sum(taken) < SECONDS:
@@ -147,7 +147,7 @@ def _times(call: Callable[[], object]) -> list[float]:
 
 
 def _steps(pairs: int, *, mean: bool) -> int:
-    """Physics steps of a generation: every start closes the grip first."""
+    """Physics steps of a generation, including those that close the grip before each start."""
     return (2 * pairs + mean) * configured().steps * SUBSTEPS + (pairs + mean) * CLOSING
 
 
@@ -167,7 +167,7 @@ def _physics() -> float:
 
 
 def _memory() -> float:
-    """Proportional set size of this process and all that descend from it [MB]."""
+    """Proportional set size of this process and all its descendants [MB]."""
     parents = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -190,7 +190,7 @@ def _memory() -> float:
 
 
 def _killed(evaluate: Callable[[], FloatArray], victim: Callable[[], int]) -> None:
-    """An evaluation in the middle of which a worker is killed."""
+    """An evaluation during which a worker is killed."""
     before = time.perf_counter()
     alone = evaluate()
     undisturbed = time.perf_counter() - before
@@ -221,7 +221,7 @@ def _theta(rows: int) -> FloatArray:
 
 
 def _pooled(evaluate: Evaluate, victim: Callable[[], int] | None) -> tuple[Callable[[str, int], object], Kill]:
-    """What is measured of something that evaluates."""
+    """Return the function that runs a generation of a kind and number of pairs, and how to kill a worker during one."""
     what = {"gait": gait, "zero": nothing}
     thetas = {pairs: _theta(2 * pairs) for pairs in (*PAIRS, 300)}
     kill = None if victim is None else ((lambda: evaluate(gait, thetas[300])), victim)
@@ -229,7 +229,7 @@ def _pooled(evaluate: Evaluate, victim: Callable[[], int] | None) -> tuple[Calla
 
 
 def _halves(theta: FloatArray) -> list[FloatArray]:
-    """One part for each worker, pairs kept together."""
+    """Split rows into one part per worker; pairs stay together."""
     half = (len(theta) // 2 + 1) // 2 * 2
     return [theta[:half], theta[half:]]
 
@@ -256,7 +256,7 @@ def of_multiprocessing() -> Opened:
 
 @contextmanager
 def of_ray() -> Opened:
-    """Ray, an actor for each core."""
+    """Ray, with one actor per core."""
     import ray
 
     class Actor:
@@ -346,7 +346,7 @@ _LINEAR: Any = {"policy": "linear"}
 
 @contextmanager
 def of_run() -> Opened:
-    """What `farm run` does, without the recording: learning included."""
+    """`farm run` without recording, but with learning."""
     runs: dict[tuple[str, int], Any] = {}
     with tempfile.TemporaryDirectory() as folder:
 

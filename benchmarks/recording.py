@@ -1,11 +1,11 @@
-"""What recording costs a learner, and how large recordings become.
+"""The learner's cost of recording, and the size of recordings.
 
     python benchmarks/recording.py [--blocks 10] [--repeats 3] [--long 500]
 
-A run at N 15 is recorded in the middle two of every four blocks of ten generations. So both kinds of blocks have the
-same share of a noisy machine and of the learning (rollouts take longer as fewer end early). It is recorded into a
-file, and live without a viewer, with one that watches, and with one that has stopped. The table compares the median
-time per generation, and the processor time of the learner's thread and of the recorder's.
+In a run with 15 pairs per generation, the middle two of every four blocks of ten generations are recorded. So a noisy
+machine and learning (rollouts take longer as fewer end early) affect both kinds of blocks alike. The run is recorded
+into a file, and live: without a viewer, with one that is connected, and with one that has disconnected. The table
+compares the median time per generation, and the processor time of the learner's thread and of the recorder's.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from learner.recording.run import RunRecording
 from learner.run import Placement, Run, open_run
 
 BLOCK = 10
-"""Generations of a block; the first of each is left out, and of every run the first four blocks."""
+"""Generations per block; the first of each block is left out, and the first four blocks of every run."""
 
 KINDS = {
     "into a file": "",
@@ -42,10 +42,10 @@ KINDS = {
 
 @dataclass
 class Times:
-    """Of generations, each list one number per generation [ms]."""
+    """Measured times; each list has one number per generation [ms]."""
 
     wall: list[float] = field(default_factory=list)
-    """From report to report."""
+    """Time from report to report."""
     thread: list[float] = field(default_factory=list)
     """Processor time of the learner's thread."""
     process: list[float] = field(default_factory=list)
@@ -55,9 +55,9 @@ class Times:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--blocks", type=int, default=10, help="pairs of blocks a run, an even number")
+    parser.add_argument("--blocks", type=int, default=10, help="pairs of blocks per run, an even number")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--long", type=int, default=500, help="generations of the recording whose size is told")
+    parser.add_argument("--long", type=int, default=500, help="generations of the recording whose size is printed")
     arguments = parser.parse_args()
     found = {name: (Times(), Times()) for name in KINDS}
     for repeat in range(arguments.repeats):
@@ -106,7 +106,7 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
 
 
 def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> None:
-    """Note what each generation took, but for the first of a block and those of the first four blocks."""
+    """Collect each generation's times, except the first of a block and those of the first four blocks."""
     before = _now()
     for report in run.learn():
         number = report.progress.generation
@@ -130,7 +130,7 @@ def _now() -> tuple[float, float, float]:
 
 @contextmanager
 def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
-    """A viewer without a window that watches, or has stopped doing so."""
+    """A viewer without a window that is connected, or has disconnected."""
     program, port = Path(rerun_cli.__file__).with_name("rerun"), free_endpoint().rpartition(":")[2]
     command = [str(program), uri, "--headless", "--bind", "127.0.0.1", "--port", port]
     with tempfile.TemporaryDirectory() as home:

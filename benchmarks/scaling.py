@@ -1,12 +1,12 @@
-"""How many workers a learner feeds: emulated ones, real in everything but physics; two tables.
+"""How many workers one learner can serve. The workers are emulated: real, but without physics. Prints two tables.
 
     python benchmarks/scaling.py [--workers 1,4,16,64,256,1000] [--pair 0.02] [--seconds 12]
 
-An emulated worker is the farm's own `Worker` with its own session. Instead of simulating, it makes up returns and
-sends them when simulating would be over. A learner process learns from them. All share this machine, so the emulation
-takes processor time that a real farm's learner would not have to share; the table has both. With more than 64 workers a
-pair takes longer, so that there are never more pairs per second than with 64. So the table then shows the cost of the
-workers, not of more rollouts.
+An emulated worker is the farm's `Worker` class with its own session. Instead of simulating, it makes up returns and
+sends them after the time that a simulation would take. A learner process learns from them. All share this machine, so
+the emulation takes processor time that a real farm's learner would not have to share; the table shows both. With more
+than 64 workers a pair takes longer, so that there are as many pairs per second as with 64: the table then shows the
+cost of more workers, not of more rollouts.
 """
 
 import argparse
@@ -45,20 +45,20 @@ from farm.sim.scene import Scene
 from farm.tasks.base import Task
 from workers.worker import IDLE, Worker, WorkerConfig
 
-TOGETHER = 32  # emulated workers a process
-MOST = 3200  # pairs per second that are tried
-PAIRS = 1000  # a generation; beyond 64 workers as many a worker as there
-LOOK = 1.0  # [s] between two looks at whether workers have nothing to do
+TOGETHER = 32  # emulated workers per process
+MOST = 3200  # largest number of pairs per second
+PAIRS = 1000  # per generation; with more than 64 workers in proportion to their number
+LOOK = 1.0  # [s] timeout of queries, and between two idle checks
 
 
 class MadeUp:
     """Runs a run's jobs as `Runner` does, but makes the numbers up, at once."""
 
     known: ClassVar[dict[str, "MadeUp"]] = {}
-    """By the specification's digest: all workers of a process share them."""
+    """By the specification's digest; shared by all workers of a process."""
 
     def __init__(self, task: Task, policy: Policy) -> None:
-        """Know the shapes that a learner expects."""
+        """Compute the shapes that the learner expects."""
         self.size, self.spec, self._parts = policy.size, policy.spec, task.substeps
         shapes = self.spec.shapes(len(Scene(task.model).bodies))
         self._plain = {name: shape for name, shape in shapes.items() if not name.startswith("channels/")}
@@ -83,7 +83,7 @@ class MadeUp:
 
 
 class Emulated(Worker):
-    """A worker that answers when one with a core of its own would have.
+    """A worker that answers at the time at which a real one on its own core would.
 
     A pair takes it so long, and reading jobs and writing results as long as they take the processor. That dozens of
     workers wait for each other on one core is not theirs; sending and Zenoh's threads are not counted either.
@@ -99,7 +99,7 @@ class Emulated(Worker):
         self._arrived = self._cpu = 0.0
 
     def turn_at(self, arrived: float) -> None:
-        """One turn, because something came then [s]."""
+        """Make one turn for an event that arrived at this time [s]."""
         self._arrived, self._cpu = arrived, time.thread_time()
         self.turn()
 
@@ -107,7 +107,7 @@ class Emulated(Worker):
         return sorted(self._session.events.waiting(0.0), key=lambda event: event.topic == "inbox")
 
     def _tell_idle(self) -> None:
-        if time.monotonic() >= self._until + IDLE:  # until then it is simulating, as it were
+        if time.monotonic() >= self._until + IDLE:  # until then it pretends to simulate
             super()._tell_idle()
 
     def _runner(self, header: RoundHeader) -> Any:  # noqa: ANN401  in the place of a Runner
@@ -126,35 +126,35 @@ class Emulated(Worker):
 
 
 class Noted(Events):
-    """Events of which somebody is told, unless they wake nobody."""
+    """Events that call a function on arrival, except those that wake no thread."""
 
     def __init__(self, tell: Callable[[], None]) -> None:
-        """Know how to tell."""
+        """Set the function to call."""
         super().__init__()
         self._tell = tell
 
     def put(self, event: Event, *, wake: bool = True) -> None:
-        """Append, and tell."""
+        """Append the event, and call the function."""
         super().put(event, wake=wake)
         if wake:
             self._tell()
 
 
 class Agenda:
-    """What a process full of workers has to do: on one thread, as dozens would fight for the interpreter."""
+    """The work of all emulated workers in a process: on one thread, as many would compete for the interpreter."""
 
     def __init__(self) -> None:
         self.came: queue.SimpleQueue[tuple[float, Emulated]] = queue.SimpleQueue()
-        """For whom something came, and when [s]"""
+        """Time of arrival of each event [s], and its worker"""
         self._due: list[tuple[float, int, Callable[[], None]]] = []
-        self._number = itertools.count()  # of equals the first
+        self._number = itertools.count()  # orders entries with the same time
 
     def add(self, at: float, send: Callable[[], None]) -> None:
-        """Send something at that time [s]."""
+        """Call a function at this time [s]."""
         heapq.heappush(self._due, (at, next(self._number), send))
 
     def follow(self, workers: Sequence[Emulated], over: threading.Event) -> None:
-        """Let them work."""
+        """Run the workers."""
         look = 0.0
         while not over.is_set():
             now = time.monotonic()
@@ -172,30 +172,30 @@ class Agenda:
 
 @dataclass
 class Measured:
-    """One farm, while it worked."""
+    """Measurements of one farm."""
 
     joined: float
     pairs_per_second: float
     latency: float
     cpu: float
-    """Of the learner, share of one core."""
+    """Processor time of the learner, in cores."""
     megabytes: float
     emulation: float
     """Processor time of all emulated workers, in cores."""
 
 
 def main() -> None:
-    """Measure and print; or be a process full of workers."""
+    """Measure and print; with --emulate, run a process of emulated workers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", default="1,4,16,64,256,1000")
-    parser.add_argument("--pair", type=float, default=0.02, help="what a pair takes [s]")
-    parser.add_argument("--seconds", type=float, default=12.0, help="a farm is measured for so long")
+    parser.add_argument("--pair", type=float, default=0.02, help="duration of a pair [s]")
+    parser.add_argument("--seconds", type=float, default=12.0, help="duration of each measurement [s]")
     parser.add_argument("--emulate", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.emulate:
         _emulate(arguments.emulate[0], int(arguments.emulate[1]), arguments.pair)
         return
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # not without ending what it began
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # exit normally, so that child processes are stopped
     counts = [int(word) for word in arguments.workers.split(",")]
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}\n")
     print("| workers | ms per pair | N | all joined after [s] | rollouts/s | ideal | efficiency | learner: cores | "
@@ -218,7 +218,7 @@ def main() -> None:
 
 
 def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
-    """Let a farm of so many workers work for a while."""
+    """Measure a farm with this number of workers."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         endpoint, run = free_endpoint(), Path(folder, "runs/r")
         words = ["--listen", endpoint, "--name", "r", "--pairs", str(pairs), "--generations", "100000", "--no-record"]
@@ -246,8 +246,8 @@ def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
 
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
-    """A process full of workers, until its standard input closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for the process that began us
+    """Run a process of emulated workers until its standard input closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the parent process stops this one
     Emulated.pair, over, agenda = pair, threading.Event(), Agenda()
     with ExitStack() as stack:
         emulated: list[Emulated] = []
@@ -256,7 +256,7 @@ def _emulate(endpoint: str, workers: int, pair: float) -> None:
             link = stack.enter_context(session.connect(config.connect, None, over.is_set))
             emulated.append(Emulated(config, link, agenda))
             emulated[-1].join()
-        gc.freeze()  # dozens of workers are many objects to look through for garbage
+        gc.freeze()  # otherwise garbage collection would search the many objects of all workers
         threading.Thread(target=_until_closed, args=(over,), daemon=True).start()
         agenda.follow(emulated, over)
 
@@ -268,7 +268,7 @@ def _until_closed(over: threading.Event) -> None:
 
 @contextmanager
 def process(words: list[str], folder: str) -> "Iterator[subprocess.Popen[bytes]]":
-    """A Python process that ends with the block."""
+    """A Python process that is stopped at the end of the block."""
     with Path(folder, "said").open("ab") as said:
         process = subprocess.Popen(
             [sys.executable, *words], cwd=folder, stdin=subprocess.PIPE, stdout=said, stderr=said,
@@ -305,7 +305,7 @@ def _wait(run: Path, generations: int, *processes: "subprocess.Popen[bytes]") ->
 
 
 def pause(*processes: "subprocess.Popen[bytes]") -> None:
-    """Wait a moment; end if one of the processes has."""
+    """Wait a moment; exit if one of the processes has ended."""
     time.sleep(0.05)
     if any(process.poll() is not None for process in processes):
         sys.exit("a learner or a process full of workers ended before its time")

@@ -1,4 +1,4 @@
-"""How reliably a preset learns: runs of several seeds, one table (results are in docs/seeds.md).
+"""How reliably a preset learns: runs with several seeds, one table (results are in docs/seeds.md).
 
     python benchmarks/seeds.py [--preset default] [--seeds 10] [--out runs/seeds-default]
 

@@ -1,10 +1,10 @@
-"""A farm whose workers die and join at random, for as long as you like: memory, and the numbers in the end.
+"""Soak test: workers of a farm are killed and join at random, for as long as you like; checks results and memory.
 
     python benchmarks/soak.py [--minutes 60] [--every 3]
 
-A learner runs while, every few seconds, a worker is killed or another one joins (one to four at a time). Then the same
-number of generations is learnt again, undisturbed. The hashes must agree, and memory must not have grown, except by
-the rollouts that a learner keeps for recorders that join late. The exit status is 1 otherwise.
+While a learner runs, every few seconds a worker is killed or a new one joins (there are always one to four). Then the
+same number of generations is learnt again without disturbance. The hashes must agree, and memory must not have grown,
+except for the rollouts that a learner keeps for recorders that join late. Otherwise the exit status is 1.
 """
 
 import argparse
@@ -41,7 +41,7 @@ class Crowd:
         self._thread.start()
 
     def close(self) -> None:
-        """End them all."""
+        """Stop all workers."""
         self._over.set()
         self._thread.join()
         for worker in self._workers:
@@ -90,7 +90,7 @@ def main() -> None:
         f"| {'yes' if soaked['parameters_sha256'] == run.summary['parameters_sha256'] else 'NO'} |"
     )
     if soaked["parameters_sha256"] != run.summary["parameters_sha256"]:
-        sys.exit("other numbers than undisturbed")
+        sys.exit("the results differ from those without disturbance")
     if not _flat(learner, history.MEMORY / 1e6) or not _flat(crowd.megabytes):
         sys.exit("memory grows")
 
@@ -121,7 +121,7 @@ def _megabytes(pid: int) -> float:
 
 
 def _flat(megabytes: list[float], filling: float = 0.0) -> bool:
-    """Whether the last quarter needs hardly more than the first, but for what fills up to a bound in between."""
+    """Whether memory in the last quarter is hardly above that in the first, apart from buffers of bounded size."""
     quarter = max(1, len(megabytes) // 4)
     return max(megabytes[-quarter:]) < 1.1 * max(megabytes[:quarter]) + 10 + filling
 

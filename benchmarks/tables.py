@@ -1,12 +1,12 @@
-"""Published scores of linear policies beside ours: the settings, their score, ours, a line per seed.
+"""Published scores of linear policies compared with ours: settings, published score, our score; a line per seed.
 
     python benchmarks/tables.py TABLE ENVIRONMENT [--seed S ...] [--out FILE]
 
     python benchmarks/tables.py ars Hopper-v5 --seed 0 1 2
     python benchmarks/tables.py --list
 
-Runs of several seeds are simulated side by side in one batch, in this process; each gives the numbers of the command
-that is printed for it, to the last bit. The score is the mean return of the last mean policy from 100 other starts.
+Runs with several seeds are simulated together in one batch, in this process. For each a `farm run` command is printed
+that gives the same results to the last bit. The score is the mean return of the last mean policy from 100 new starts.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from farm.tasks import loop
 from learner import setup
 from learner.config import RunConfig, configure
 
-LOOKS: Final = 20  # lines of the learning curve
+LOOKS: Final = 20  # points of the learning curve
 
 
 @dataclass(frozen=True)
@@ -109,13 +109,13 @@ class Search:
 
     @property
     def over(self) -> bool:
-        """Whether its steps are spent."""
+        """Whether its budget of steps is used up."""
         spent = self.config.stop_after_steps is not None and self.steps >= self.config.stop_after_steps
         return spent or self.state.generation >= self.config.generations
 
     @property
     def algorithm(self) -> Any:  # noqa: ANN401
-        """The algorithm, of as many pairs as this generation has."""
+        """The algorithm, with the number of pairs of this generation."""
         return self.config.algorithm_of(self.pairs)
 
     def ask(self) -> tuple[FloatArray, list[loop.Seed]]:
@@ -126,7 +126,7 @@ class Search:
         return theta, [seeds.training(config.seed, generation, row // 2) for row in range(len(theta))]
 
     def tell(self, rollouts: loop.Rollouts, offsets: FloatArray) -> None:
-        """Learn from them."""
+        """Update the state from their returns."""
         returns = (rollouts.returns + offsets[rollouts.steps]).reshape(-1, 2)
         self.state = self.algorithm.tell(self.state, self.eps, returns)
         steps = int(rollouts.steps.sum())
@@ -147,7 +147,7 @@ class SideBySide:
         self.policy, self.size, self.d = policy, policy.size, policy.spec.observation
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """What of the parameters does not change in a rollout: nothing, of a linear policy."""
+        """Return theta: a linear policy needs no preparation."""
         return theta
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -164,8 +164,8 @@ def main() -> None:
     parser.add_argument("table", nargs="?", choices=tuple(TABLES))
     parser.add_argument("environment", nargs="?")
     parser.add_argument("--seed", type=int, nargs="+", default=[0])
-    parser.add_argument("--steps", type=int, help="another budget of environment steps per seed")
-    parser.add_argument("--starts", type=int, default=100, help="rollouts of the score")
+    parser.add_argument("--steps", type=int, help="budget of environment steps per seed, instead of the table's")
+    parser.add_argument("--starts", type=int, default=100, help="number of rollouts for the score")
     parser.add_argument("--out", type=Path, help="file to which each seed's numbers are added, as a line of JSON")
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
@@ -224,7 +224,7 @@ def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[li
 
 
 def _learn(searches: list[Search], runner: Runner) -> None:
-    """All seeds to their ends, a generation of each at a time."""
+    """Run all seeds to their end, one generation of each at a time."""
     config, task = searches[0].config, runner.task
     offset = config.task_config.reward_offset
     offsets = np.array([0.0, *itertools.accumulate([task.return_scale * offset] * task.steps)])

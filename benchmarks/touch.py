@@ -1,12 +1,12 @@
-"""Does touch decide? The fragile bar, learnt with it and without; a table, a figure, and the numbers.
+"""Is touch needed? Learns the fragile bar with and without it; writes a table, a figure, and the numbers.
 
     python benchmarks/touch.py [--seeds 20,21,22,23,24] [--bias 0.05] [--out docs/results/touch] [--rows forces,joints]
 
-Each row is learnt by the farm for 1280 rollouts, in runs of its own under runs/touch, and judged on 200 starts that no
-run trained on: the average of its last ten means, and its last mean alone. Settings were chosen on seeds 0 to 14.
-Without touch: the best constant targets, a policy of time alone, the joints, the joints with their targets (the servos'
-deflection is a sensor of force), the joints with a memory, and an expert made by hand: close the middle finger at a
-constant rate until its joints lag behind by so much; rate and lag are the best of a grid on starts of its own.
+Each row is learnt by the farm for 1280 rollouts, in runs under runs/touch, and tested on 200 starts that were not used
+for training: the average of its last ten means, and its last mean alone. Settings were chosen on seeds 0 to 14.
+Without touch there are: the best constant targets, a function of time, the joints, the joints with their targets (a
+servo's deflection measures force), the joints with a memory, and a hand-made expert: it closes the middle finger at a
+constant rate until its joints lag by a given angle; rate and lag are the best of a grid on separate starts.
 """
 
 import argparse
@@ -37,30 +37,30 @@ from learner.setup import problem
 
 HERE = Path(__file__).resolve()
 STARTS: tuple[Seed, ...] = tuple((2, 0, 9, i) for i in range(200))
-"""Starts that are judged."""
+"""Starts of the test."""
 GRID: tuple[Seed, ...] = tuple((2, 0, 8, i) for i in range(100))
-"""Starts that the expert's rate and lag are chosen on."""
+"""Starts on which the expert's rate and lag are chosen."""
 BLIND = {"time": 1, "joints+targets": 16, "joints+memory": 16}
-"""Observations without touch that the task itself does not have, and their sizes."""
+"""Observations without touch that the task does not offer, and their sizes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlindConfig(FragileBarConfig):
-    """The fragile bar's settings, but for the state base."""
+    """The fragile bar's settings, with a different choice of observations."""
 
     sight: str = "time"
-    """What the policy sees: time | joints+targets | joints+memory."""
+    """The policy's observation: time | joints+targets | joints+memory."""
     memory: float = setting(0.7, least=0.0, below=1.0)
-    """Part of the memory that is kept at each control step."""
+    """Share of the memory that is kept at each control step."""
 
 
 class Blind(FragileBar):
-    """The fragile bar for policies that feel nothing."""
+    """The fragile bar for policies without touch."""
 
     Config = BlindConfig
 
     def spec(self) -> TaskSpec:
-        """As the fragile bar's, with another observation."""
+        """The fragile bar's specification, with this observation."""
         return TaskSpec(
             observation=BLIND[self.config.sight], action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
             terms=TERMS, success=True, channels=self.channels,
@@ -73,7 +73,7 @@ class Blind(FragileBar):
         return (size,) if size == 1 else (len(JOINTS), len(JOINTS))
 
     def observe(self, sim: Sim) -> FloatArray:
-        """Time, or readings of the joints with their targets or their running mean."""
+        """Time, or the joint readings with their targets or their running mean."""
         if self.config.sight == "time":
             return np.full((len(sim), 1), sim.t / self.steps)
         q = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)]
@@ -118,11 +118,11 @@ JUDGED: dict[str, dict[str, Any]] = {
     ", last mean": {"average": 1, "shuffle": False},
     ", shuffled": {"average": None, "shuffle": True},
 }
-"""What is judged of each run: the average of its last means, as the preset has it, and the last mean alone."""
+"""The tested policies of each run: the average of its last means, as in the preset, and the last mean alone."""
 
 
 def main() -> None:
-    """Learn, judge, and write down."""
+    """Learn, test, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="20,21,22,23,24")
     parser.add_argument("--bias", type=float, default=0.05)
@@ -157,7 +157,7 @@ def _percent(parts: Sequence[float]) -> str:
 
 
 def _learnt(name: str, seed: int, bias: float, *, average: int | None, shuffle: bool) -> float:
-    """Learn a row of the table, if that has not been done; its success, perhaps with the touch of another rollout."""
+    """Learn a row of the table, unless it exists; return its success, optionally with touch from a wrong rollout."""
     options = {"task": "fragile-bar", **ROWS[name], "bias": bias, "seed": seed}
     config = farm.configure(options.pop("task"), **options)
     folder = Path("runs/touch", f"{re.sub('[^a-z]+', '-', name)}-b{bias:g}-s{seed}")
@@ -172,7 +172,7 @@ def _learnt(name: str, seed: int, bias: float, *, average: int | None, shuffle: 
 
 
 def _success(runner: Runner, mean: FloatArray, *, shuffle: bool) -> float:
-    """Part of the new starts that succeed; perhaps each rollout sees what its neighbour feels."""
+    """Share of the new starts that succeed; optionally each rollout gets the touch of its neighbour in the batch."""
     done, size = [], runner.sim.engine.size
     for first in range(0, len(STARTS), size):
         starts = STARTS[first : first + size]
@@ -190,7 +190,7 @@ def _success(runner: Runner, mean: FloatArray, *, shuffle: bool) -> float:
 
 
 def _expert(bias: float) -> float:
-    """The best hand-made policy without touch: close at a rate until the middle finger's last joint lags so much."""
+    """The best hand-made policy without touch: close at a rate until the middle finger's last joint lags enough."""
     runner = problem(farm.configure("fragile-bar", bias=bias)).runner()
     middle = FINGER_JOINTS["middle"]
 
@@ -220,7 +220,7 @@ def _expert(bias: float) -> float:
 
 
 def draw(found: dict[str, list[float]], path: Path, bias: float) -> None:
-    """One figure: success by what a policy sees, a dot for each seed."""
+    """One figure: success by the policy's observation, one dot per seed."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,11 +1,11 @@
-"""A plate turned by regrasping: a script, not a policy, and what comes of it from perturbed starts; one table.
+"""A script, not a learnt policy, turns a plate by regrasping from perturbed starts; one table.
 
     python benchmarks/turning.py [--reach 4,6,8,10] [--cycles 8] [--starts 200] [--video FILE.gif] [--torsion 2]
 
-The plate lies on the thumb. Index and middle finger push it in opposite directions, then each of them is lifted,
-brought back and set down, while the other one holds. The script knows the model's kinematics and nothing of what
-happens. Reach and torsional friction are in mm; the film is of the first reach. Of several starts a row has the least
-turn and speed, the latest time, the largest tilt and drift.
+The plate lies on the thumb. Index and middle finger push it in opposite directions; then each of them is lifted,
+brought back and set down, while the other one holds. The script uses the model's kinematics but no feedback. Reach and
+torsional friction are in mm; the film shows the first reach. A row has the worst values of all starts: the least turn
+and speed, the latest time, the largest tilt and drift.
 """
 
 import argparse
@@ -34,23 +34,23 @@ from farm.tasks.loop import Seed, again
 MOST_TILT: Final = 30.0
 """Tilt from which the plate counts as dropped [deg]."""
 TURN: Final = 360.0
-"""What is to be reached [deg]."""
+"""Turn to be reached [deg]."""
 SIDE: Final = (264, 216)
 """Width and height of the film [pixels]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Script:
-    """What the fingers do in a cycle."""
+    """Parameters of a cycle of the fingers."""
 
     reach: float = 0.006
     """How far from the plate's middle a stroke begins and ends [m]."""
     press: float = 2.0
-    """Force with which index and middle finger are told to press [N]."""
+    """Commanded force of index and middle finger [N]."""
     thumb: float = 3.0
-    """The thumb's [N]."""
+    """Commanded force of the thumb [N]."""
     pinch: float = 2.5
-    """The thumb's while one finger is lifted [N]."""
+    """Commanded force of the thumb while one finger is lifted [N]."""
     lift: float = 0.01
     """How high a finger is lifted [m]."""
     stroke: float = 0.5
@@ -60,7 +60,7 @@ class Script:
 
 
 class Keys:
-    """Joint targets of places over the plate, by the model's kinematics."""
+    """Computes joint targets for fingertip positions on the plate, by the model's kinematics."""
 
     def __init__(self, hand: Hand, script: Script) -> None:
         self.script = script
@@ -70,7 +70,7 @@ class Keys:
         self._height = {finger: float(self._reached(finger, grasping.contact)[2]) for finger in FINGERS}
 
     def targets(self, index: float, middle: float, lifted: str = "") -> FloatArray:
-        """Targets with the fingers so far along x from the plate's middle, one of them lifted or none, (8,)."""
+        """Targets (8,) with the fingers at these offsets along x from the plate's middle, at most one lifted."""
         script, out = self.script, np.empty(len(JOINTS))
         for finger, along in (("index", index), ("middle", middle)):
             own = 0.0 if finger == lifted else -script.press
@@ -91,7 +91,7 @@ class Keys:
         return values[joints] + jacobian[2, joints] * force / own.actuator_gainprm[joints, 0]
 
     def _reached(self, finger: str, values: FloatArray) -> FloatArray:
-        """Where a fingertip is [m]."""
+        """Position of a fingertip [m]."""
         self._data.qpos[: len(JOINTS)] = values
         mujoco.mj_kinematics(self._hand.model, self._data)
         mujoco.mj_comPos(self._hand.model, self._data)
@@ -102,7 +102,7 @@ class Keys:
 
 
 def phases(keys: Keys) -> list[tuple[FloatArray, float]]:
-    """A cycle: targets, and the time in which they are approached [s]."""
+    """A cycle: targets, and the time in which each is reached [s]."""
     script, far = keys.script, keys.script.reach
     return [
         (keys.targets(far, -far), script.stroke),
@@ -128,20 +128,20 @@ def script_of(keys: Keys, cycles: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Turned:
-    """What the plate did at each physics step after its release, in B rollouts."""
+    """The plate's motion at each physics step after its release, in B rollouts."""
 
     degrees: FloatArray
-    """About the vertical, counted on from turn to turn, clockwise seen from above, (B, T)."""
+    """Turn about the vertical [deg], clockwise seen from above, continuous beyond 360, (B, T)."""
     tilt: FloatArray
-    """Of the plate's upright axis [deg], (B, T)."""
+    """Tilt of the plate's upright axis [deg], (B, T)."""
     drift: FloatArray
-    """Of its centre from where it was released [m], (B, T)."""
+    """Distance of its centre from the point of release [m], (B, T)."""
     lost: BoolArray
-    """No fingertip touches it, or it is out of place, at this step or at one before, (B, T)."""
+    """Whether at this step or earlier no fingertip touched it, or it was out of place, (B, T)."""
     felt: BoolArray
     """Which fingertips touch it, (B, T, 3)."""
     qpos: FloatArray
-    """(B, T, nq)."""
+    """Positions, (B, T, nq)."""
 
     @classmethod
     def of(cls, qpos: FloatArray, felt: BoolArray) -> "Turned":
@@ -154,14 +154,14 @@ class Turned:
         return cls(np.pad(degrees, ((0, 0), (1, 0))), tilt, drift, lost, felt, qpos)
 
     def first(self, row: int) -> "Turned":
-        """One rollout until the plate was lost."""
+        """One rollout up to the loss of the plate."""
         steps = max(1, int(np.argmax(self.lost[row]))) if self.lost[row].any() else self.lost.shape[1]
         one = slice(row, row + 1)
         return Turned(*(getattr(self, field.name)[one, :steps] for field in fields(self)))
 
 
 def task(object_name: str = "plate", torsion: float | None = None) -> FingerGait:
-    """The finger gait's hand, three-finger grip and perturbations, with an object as it is or of other friction."""
+    """The finger gait's hand, three-finger grip and perturbations; the object's friction can be changed."""
     three = "index+middle+thumb"
     config = FingerGaitConfig(object=object_name, pose="between", start_grip=three, goal_grip=three)
     if torsion is None:
@@ -196,13 +196,13 @@ def turn(gait: FingerGait, targets: FloatArray, starts: Sequence[Seed]) -> Turne
 
 
 def main() -> None:
-    """Turn it, and print what came of it."""
+    """Turn the plate, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--object", default="plate")
-    parser.add_argument("--reach", default="6", help="half a stroke [mm], several with commas")
+    parser.add_argument("--reach", default="6", help="half the length of a stroke [mm]; several separated by commas")
     parser.add_argument("--torsion", type=float, help="torsional friction of the object [mm]; the plate has 2")
     parser.add_argument("--cycles", type=int, default=8)
-    parser.add_argument("--starts", type=int, default=200, help="perturbed ones")
+    parser.add_argument("--starts", type=int, default=200, help="number of perturbed starts")
     parser.add_argument("--video", type=Path, metavar="FILE", help="a film of the nominal start: .gif or .mp4")
     chosen = parser.parse_args()
     if chosen.video is not None:
@@ -237,7 +237,7 @@ def row(found: Turned, rows: slice) -> str:
 
 
 def film(gait: FingerGait, found: Turned) -> Iterator[rendering.Picture]:
-    """The first rollout in real time, until the plate is round."""
+    """The first rollout in real time, until the plate has made a full turn."""
     first = found.first(0)
     round_at = np.flatnonzero(first.degrees[0] >= TURN)
     poses = first.qpos[0, : round_at[0] + 1] if len(round_at) else first.qpos[0]

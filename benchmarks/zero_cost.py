@@ -1,4 +1,4 @@
-"""A task whose rollouts take next to nothing: one physics step of one body, for measuring what is around them."""
+"""A task whose rollouts take almost no time, for measuring the farm's overhead: one physics step of one body."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from farm import Task
 
 
 class ZeroCost(Task):
-    """One step, and the reward is the action."""
+    """One step; the reward is the action."""
 
     xml = """<mujoco><option timestep="0.01"/><worldbody><body>
       <joint name="hinge" axis="0 1 0"/><geom size="0.1"/></body></worldbody>

@@ -1,4 +1,4 @@
-"""A Problem of EvoTorch's on a pool of workers; its PGPE searches the finger gait.
+"""EvoTorch's PGPE searches the finger gait on a pool of workers.
 
     python examples/evotorch_search.py
 

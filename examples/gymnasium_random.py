@@ -1,8 +1,8 @@
-"""Random actions in the task as a Gymnasium environment.
+"""Random actions in the finger gait as a Gymnasium environment.
 
     python examples/gymnasium_random.py [--episodes 5] [--seed 0]
 
-Nothing of the farm is needed: any learner that speaks Gymnasium's interface can take its place.
+No learner or worker is needed: use the environment with any library that learns in Gymnasium environments.
 """
 
 import argparse

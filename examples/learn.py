@@ -1,4 +1,4 @@
-"""A run from Python: learn with two local workers, then read what came out.
+"""A run from Python: learn with two local workers, then read the summary.
 
     python examples/learn.py [--generations 60] [--out runs/example]
 

@@ -1,4 +1,4 @@
-"""A run from Python, its curves in TensorBoard; any other logger goes the same way.
+"""A run from Python with its curves in TensorBoard; other loggers can be used in the same way.
 
     python examples/log_tensorboard.py && tensorboard --logdir runs
 

@@ -1,4 +1,4 @@
-"""A method of Nevergrad's searches the finger gait on a pool of workers.
+"""Nevergrad's CMA searches the finger gait on a pool of workers.
 
     python examples/nevergrad_search.py
 

@@ -1,8 +1,8 @@
-"""A learnt policy in plain MuJoCo: needs mujoco and numpy, nothing of rolloutfarm.
+"""Plays a learnt policy in plain MuJoCo: needs mujoco and numpy, but not rolloutfarm.
 
     python play_policy.py POLICY.npz
 
-`farm export RUN POLICY.npz` writes the file; docs/export.md says what is in it.
+`farm export RUN POLICY.npz` writes the file; docs/export.md describes its contents.
 """
 
 import json
@@ -12,7 +12,7 @@ import sys
 import mujoco
 import numpy as np
 
-# Parts of pi and ln 2, and coefficients, of the functions below.
+# Pi and ln 2, each as a sum of parts, and coefficients of the functions below.
 PI = tuple(map(float.fromhex, ("0x1.921fb54400000p+1", "0x1.0b4611a600000p-33", "0x1.3198a2e037073p-68")))
 LN2 = tuple(map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
 SINE = (
@@ -23,7 +23,7 @@ COTH = (-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 /
 
 
 def cos(x: np.ndarray) -> np.ndarray:
-    """Cosine of |x| < 10^6, with the same bits on every processor; numpy's differs on some."""
+    """Cosine for |x| < 10^6, with the same bits on every processor; numpy's differs on some."""
     k = np.floor(x * (1.0 / math.pi))
     r = (k + 0.5) * PI[0] - x + (k + 0.5) * PI[1] + (k + 0.5) * PI[2]
     r = np.where(k % 2 == 0, r, -r)
@@ -31,14 +31,14 @@ def cos(x: np.ndarray) -> np.ndarray:
 
 
 def exp(x: np.ndarray) -> np.ndarray:
-    """e^x of |x| < 700, the same way."""
+    """e^x for |x| < 700, with the same bits on every processor."""
     k = np.rint(x * float.fromhex("0x1.71547652b82fep+0"))
     r = x - k * LN2[0] - k * LN2[1]
     return np.ldexp(1.0 + 2.0 * (r / (np.polyval(COTH, r * r) - r)), k.astype(int))
 
 
 def tanh(x: np.ndarray) -> np.ndarray:
-    """Hyperbolic tangent, the same way: (e^2|x| - 1) / (e^2|x| + 1)."""
+    """Hyperbolic tangent, with the same bits on every processor: (e^2|x| - 1) / (e^2|x| + 1)."""
     y = np.minimum(2.0 * np.abs(x), 40.0)
     k = np.rint(y * float.fromhex("0x1.71547652b82fep+0"))
     r = y - k * LN2[0] - k * LN2[1]
@@ -48,7 +48,7 @@ def tanh(x: np.ndarray) -> np.ndarray:
 
 
 def powers(centres: np.ndarray, x: np.ndarray, bandwidth: float) -> np.ndarray:
-    """-|c - x|^2 / (2 h^2) of each row of centres."""
+    """-|c - x|^2 / (2 h^2) for each row c of centres, h the bandwidth."""
     difference = np.ascontiguousarray(centres) - x
     return (difference * difference).sum(axis=-1) * (-0.5 / bandwidth**2)
 
@@ -73,12 +73,12 @@ class Policy:
             self.theta = maps[self.p["policy"]](self.theta)
 
     def reset(self) -> None:
-        """The moment of release: the fingers hold the object, and nothing else does."""
+        """Set the moment of release: only the fingers hold the object."""
         mujoco.mj_setState(self.model, self.data, self.p["state"], self.p["state_kind"])
         self.x, self.last, self.released = self.p["x"], self.p["start_command"], self.data.qpos[8:].copy()
 
     def act(self) -> np.ndarray:
-        """One action (8,) [rad]; the servos' targets follow from it."""
+        """Compute one action (8,) [rad] and set the servos' targets from it."""
         x = self.x
         if "observation_mean" in self.p:
             x = (x - self.p["observation_mean"]) / self.p["observation_deviation"]
@@ -91,7 +91,7 @@ class Policy:
         return a
 
     def action(self, policy: str, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """The controller's action, (8,), of the state x (d,)."""
+        """The controller's action (8,) for the state x (d,)."""
         if policy == "kernel":
             return np.array([math.exp(power) for power in powers(theta, x, self.bandwidth)])
         if policy == "rbf":
@@ -101,7 +101,7 @@ class Policy:
         if policy == "weighted-kernel":
             y, bandwidth = (x - self.p["origin"]) / self.p["spread"], self.config["width"] * np.sqrt(len(x))
             return self.config["weight_scale"] * theta[:, -1] * exp(powers(theta[:, :-1], y, bandwidth))
-        if policy in ("linear", "constant"):  # one sees everything, the other nothing
+        if policy in ("linear", "constant"):  # a constant policy has no weights for x
             return (theta[:, :-1] * x[: theta.shape[1] - 1]).sum(axis=-1) + theta[:, -1]
         if policy == "mlp":
             for units in (*self.config["layers"], 8):
@@ -120,7 +120,7 @@ class Policy:
         return np.sqrt(2.0 / len(angle)) * cos(angle)
 
     def feel(self) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Taxels (3, 18) [N], their centres of force (3, 3) [radii], and whether anything is touched at all."""
+        """Taxels (3, 18) [N], centres of force (3, 3) [fingertip radii], and whether there is any contact."""
         images, any_contact = np.zeros((3, 18)), False
         contacts = self.data.sensordata.reshape(3, -1, 7)  # found, force (3), position (3)
         for finger, site in enumerate(self.sites):
@@ -141,7 +141,7 @@ class Policy:
         return images, points, any_contact
 
     def step(self) -> tuple[float, bool]:
-        """One control step: its reward, and whether the object is still held."""
+        """Make one control step; return its reward, and whether the object is still held."""
         a = self.act()
         for _ in range(self.p["substeps"]):
             mujoco.mj_step(self.model, self.data)
@@ -163,7 +163,7 @@ class Policy:
         return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"], *moved])), held
 
     def moved(self) -> float:
-        """The cost of the object being away from where it was released."""
+        """The penalty for the object's shift and turn since its release."""
         shift, now = self.data.qpos[8:11] - self.released[:3], self.data.qpos[11:]
         distance, cosine = np.sqrt((shift * shift).sum()), np.abs((now * self.released[3:]).sum())
         squares = (distance / self.p["moved"]) ** 2 + (1.0 - cosine) / (1.0 - self.p["turned_cosine"])
@@ -171,7 +171,7 @@ class Policy:
 
 
 def main() -> None:
-    """Play it once and say how it went."""
+    """Play the policy once and print the result."""
     if len(sys.argv) != 2:
         sys.exit("usage: python play_policy.py POLICY.npz")
     try:

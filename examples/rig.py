@@ -1,4 +1,4 @@
-"""A pendulum to balance: a task that workers simulate, and that the rig of robot_worker.py does as well."""
+"""A pendulum to balance: a task for simulating workers and for the rig of robot_worker.py."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from farm import Task
 
 
 class Rig(Task):
-    """Balance a pendulum that starts 0.3 rad beside its upright; its motor is too weak to lift it from below."""
+    """Balance a pendulum that starts 0.3 rad from upright; its motor is too weak to swing it up from below."""
 
     xml = """<mujoco>
       <option timestep="0.005"/>

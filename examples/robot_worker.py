@@ -1,6 +1,6 @@
 """A robot as a worker, in plain Python with zenoh and msgpack: docs/protocol.md, "The worker's side, exactly".
 
-farm run --task rig.py:Rig --mixed --patience 10 --listen tcp/127.0.0.1:7447    # its workers do what a rig cannot
+farm run --task rig.py:Rig --mixed --patience 10 --listen tcp/127.0.0.1:7447    # local workers do jobs the rig cannot
 python robot_worker.py --connect tcp/127.0.0.1:7447
 """
 
@@ -20,11 +20,11 @@ import msgpack
 import zenoh
 
 SCHEMA = 5
-LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}  # struct's, of an array's numbers
+LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}  # array dtype -> format character of struct
 
 
 def rollout(theta: list[float], clock: float) -> float:
-    """The return of 50 steps of 50 ms by the rig's clock, or a RuntimeError: put your robot here."""
+    """The return of 50 steps of 50 ms by the rig's clock; raises RuntimeError if it fails. Put your robot here."""
     angle, speed, value, begun = 0.3 + random.uniform(-0.1, 0.1), 0.0, 0.0, time.monotonic()
     for step in range(1, 51):
         action = theta[0] * math.sin(angle) + theta[1] * math.cos(angle) + theta[2] * 0.1 * speed + theta[3]
@@ -39,19 +39,19 @@ def rollout(theta: list[float], clock: float) -> float:
 
 
 def array(dtype: str, shape: list[int], values: list[float]) -> msgpack.ExtType:
-    """Numbers as an array: the length of its head in a byte, the head (dtype and shape), their bytes."""
+    """Encode numbers as an array: one byte with the header's length, the header (dtype, shape), the numbers' bytes."""
     head = msgpack.packb([dtype, shape])
     return msgpack.ExtType(1, bytes([len(head)]) + head + struct.pack(f"<{len(values)}{LETTERS[dtype]}", *values))
 
 
 def numbers(_: int, data: bytes) -> list[float]:
-    """The numbers of an array, one after another."""
+    """Decode an array into a flat list of its numbers."""
     (dtype, _), raw = msgpack.unpackb(data[1 : 1 + data[0]]), data[1 + data[0] :]
     return struct.unpack(f"<{len(raw) // struct.calcsize(LETTERS[dtype])}{LETTERS[dtype]}", raw)
 
 
 class Worker:
-    """Joins a farm, does a job at a time, and says what it cannot do."""
+    """Joins a farm, does one job at a time, and reports jobs that it cannot do."""
 
     def __init__(self, session: zenoh.Session, name: str, clock: float) -> None:
         self.session, self.clock, self.id = session, clock, f"{name}/{os.getpid()}-{os.urandom(3).hex()}"
@@ -61,7 +61,7 @@ class Worker:
         self.token = session.liveliness().declare_token(f"farm/live/worker/{self.id}")  # last, or jobs are lost
 
     def serve(self) -> None:
-        """Handle events as they arrive; if there is none for a second, say that there is nothing to do."""
+        """Handle events as they arrive; after a second without any, report that this worker is idle."""
         while True:
             try:
                 sample = self.events.get(timeout=1.0)
@@ -81,17 +81,17 @@ class Worker:
         self.say(f"want/{self.id}", "WorkRequest", worker=self.id, credits=1, idle=list(idle), **own)
 
     def say(self, key: str, kind: str, **fields: object) -> None:
-        """Publish a message, and wait until it is on its way."""
+        """Publish a message; wait while the send queue is full."""
         payload = msgpack.packb({"schema": SCHEMA, "type": kind, **fields})
         self.session.put(f"farm/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def ask(self, run: str, what: str) -> bytes:
-        """What the run's learner answers, empty where it does not."""
+        """The answer of the run's learner to a query; empty if there is none."""
         said = self.session.get(f"farm/run/{run}/{what}", timeout=1.0)
         return next((reply.ok.payload.to_bytes() for reply in said if reply.ok), b"")
 
     def round(self, run: str) -> dict:
-        """The round that is on, and whether it is of a run that the rig knows."""
+        """The current round's header, and whether the rig can serve its run."""
         header, said = msgpack.unpackb(self.ask(run, "generation"), ext_hook=numbers), self.ask(run, "spec")
         if hashlib.sha256(said).hexdigest() != header["spec"]:
             raise ValueError("a specification that is not the round's")
@@ -100,7 +100,7 @@ class Worker:
         return header | {"fits": own == ("rig.py:Rig", "linear", 50, 1.0) and not header["normaliser"]}
 
     def chunk(self, chunk: dict) -> None:
-        """Do the jobs of a message, if they belong to the round that is on."""
+        """Do the jobs of a message, if they belong to the current round."""
         run, head = chunk["run"], {"worker": self.id} | {name: chunk[name] for name in ("run", "incarnation", "round")}
         if any(self.rounds.get(run, {}).get(name) != head[name] for name in ("incarnation", "round")):
             self.rounds[run] = self.round(run)
@@ -120,7 +120,7 @@ class Worker:
                 values = [rollout([o + sign * e for o, e in job], self.clock) for sign in signs if sign]
             except RuntimeError as error:
                 self.say(key, "Failure", **head, index=index, error=str(error))
-                self.want()  # who failed gets nothing until it asks again
+                self.want()  # a worker that failed gets no jobs until it asks again
                 continue
             n, own = len(values), {"trajectories": [], "traces": array("<f4", [0, 0, 0], [])}
             own |= {"returns": array("<f8", [n], values), "flags": array("|b1", [n, 4], [False] * 4 * n)}
@@ -132,11 +132,11 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="A simulated rig as a worker.")
     parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="where a learner or a router listens")
     parser.add_argument("--tls", type=Path, help="a folder worker-NAME of farm certificates")
-    parser.add_argument("--clock", type=float, default=10.0, help="the rig's, times real time; 0 does not wait")
+    parser.add_argument("--clock", type=float, default=10.0, help="the rig's speed, times real time; 0 does not wait")
     given, config, name = parser.parse_args(), zenoh.Config(), "rig"
     settings = {"mode": "client", "connect/endpoints": [given.connect], "connect/timeout_ms": -1}
     settings |= {"connect/retry": {"period_max_ms": 1000}, "transport/link/tls/enable_mtls": bool(given.tls)}
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, also while nobody answers
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C also stops a pending query
     try:
         if given.tls:
             name = json.loads((given.tls / "identity.json").read_text())["name"]
@@ -147,4 +147,4 @@ if __name__ == "__main__":
         with zenoh.open(config) as session:
             Worker(session, name, given.clock).serve()
     except (OSError, ValueError, KeyError, zenoh.ZError) as error:
-        parser.error(f"it cannot begin with these: {error}")
+        parser.error(f"it cannot start with these settings: {error}")

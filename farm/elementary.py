@@ -1,8 +1,8 @@
 """exp, cos, sin and tanh that give the same bits on every processor.
 
-Pure. numpy has versions of these functions for several processors, and each of them rounds in its own way. Here they
-are made of steps that IEEE 754 rounds exactly, one numpy operation each, so that no compiler can fuse two: sums,
-products, quotients, rounding to whole numbers, powers of two. An element's result depends on its value alone.
+Pure. numpy has versions of these functions for several processors, which round differently. Here each step is one
+numpy operation whose rounding IEEE 754 defines (sum, product, quotient, rounding to whole numbers, power of two), so
+that no compiler can fuse two of them. An element's result depends only on its value.
 
 Arguments are reduced with a constant split into short parts, whose products with a whole number are exact (Cody & Waite
 1980, Software Manual for the Elementary Functions). Of the reduced argument r, z = r^2:
@@ -24,11 +24,11 @@ import numpy as np
 
 from farm.arrays import FloatArray
 
-_BLOCK: Final = 8192  # elements worked on at a time: they and what is on the way stay in the cache of a core
+_BLOCK: Final = 8192  # elements per block: they and the intermediate results stay in a core's cache
 
 
 def _constants(*values: float) -> tuple[FloatArray, ...]:
-    """Arrays of no dimension: numpy takes them a third faster than Python's numbers, which counts in small arrays."""
+    """Zero-dimensional arrays: with small arrays numpy is a third faster than with Python's numbers."""
     return tuple(np.array(value) for value in values)
 
 
@@ -40,13 +40,13 @@ _SINE: Final = _constants(
 _HALF_TURNS, _HALF = _constants(1.0 / math.pi, 0.5)
 _EVEN, _ODD = _constants(1.5 * 2.0**52, 1.5 * 2.0**52 + 1.0)  # last bit of a whole number's sum with them: is it odd?
 _LAST_TO_SIGN: Final = np.array(63)
-_LARGE: Final = 1e6  # beyond it products with the parts of pi are not exact
+_LARGE: Final = 1e6  # above this, products with the parts of pi are not exact
 
 _LN2: Final = _constants(*map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
 _COTH: Final = _constants(-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 / 6, 2.0)
 _DOUBLINGS, _ONE, _TWO = _constants(float.fromhex("0x1.71547652b82fep+0"), 1.0, 2.0)
-_LEAST, _MOST = _constants(-750.0, 750.0)  # exp of them is zero, and overflows
-_FLAT: Final = np.array(40.0)  # 1 - tanh(x) < 2^-54 from half of it on
+_LEAST, _MOST = _constants(-750.0, 750.0)  # exp of the first is zero, exp of the second overflows
+_FLAT: Final = np.array(40.0)  # largest 2|x|: above it 1 - tanh(|x|) < 2^-54
 
 
 def exp(x: FloatArray) -> FloatArray:
@@ -60,12 +60,12 @@ def tanh(x: FloatArray) -> FloatArray:
 
 
 def cos(x: FloatArray) -> FloatArray:
-    """Cosine of any array [rad], (...) -> (...); nan of what is not finite."""
+    """Cosine of any array [rad], (...) -> (...); nan for elements that are not finite."""
     return _blockwise(_cos, x)
 
 
 def sin(x: FloatArray) -> FloatArray:
-    """Sine of any array [rad], (...) -> (...); nan of what is not finite."""
+    """Sine of any array [rad], (...) -> (...); nan for elements that are not finite."""
     return _blockwise(_sin, x)
 
 
@@ -89,7 +89,7 @@ def _exp(x: FloatArray, out: FloatArray) -> None:
 
 
 def _tanh(x: FloatArray, out: FloatArray) -> None:
-    """(e^2|x| - 1) / (e^2|x| + 1), where the numerator is made without a difference of nearly equal numbers."""
+    """(e^2|x| - 1) / (e^2|x| + 1), with a numerator that is not a difference of nearly equal numbers."""
     np.abs(x, out=out)
     out += out
     np.minimum(out, _FLAT, out=out)
@@ -103,7 +103,7 @@ def _tanh(x: FloatArray, out: FloatArray) -> None:
 
 
 def _grown(x: FloatArray) -> "np.ndarray[tuple[int, ...], np.dtype[np.intc]]":
-    """Put e^r - 1 in the place of x = k ln 2 + r, and say k."""
+    """Replace x = k ln 2 + r by e^r - 1, in place, and return k."""
     power = x * _DOUBLINGS
     np.rint(power, out=power)
     scratch = np.empty_like(x)
@@ -138,7 +138,7 @@ def _sin(x: FloatArray, out: FloatArray) -> None:
 
 
 def _sine(x: FloatArray, half_turns: FloatArray, odd: FloatArray, out: FloatArray) -> None:
-    """(-1)^odd sin(half_turns pi - x); odd counts in its last bit, and is used up."""
+    """(-1)^odd sin(half_turns pi - x); of `odd` only the last bit counts, and the array is overwritten."""
     np.multiply(half_turns, _PI[0], out=out)
     out -= x
     scratch = np.empty_like(out)
@@ -165,7 +165,7 @@ def _polynomial(coefficients: tuple[FloatArray, ...], z: FloatArray, out: FloatA
 
 
 def _otherwise(function: Callable[[float], float], x: FloatArray, out: FloatArray, scratch: FloatArray) -> None:
-    """Use the C library's function if the argument is too large for ours; this is rare, and need not be fast."""
+    """Use the C library's function for arguments that are too large for ours; this is rare and may be slow."""
     np.abs(x, out=scratch)
     if np.maximum.reduce(scratch) <= _LARGE:
         return

@@ -1,8 +1,8 @@
-"""Running mean and spread of observations: of one rollout, merged over many, and as given to policies. Pure.
+"""Running mean and standard deviation of observations: of one rollout, merged over many, and for policies. Pure.
 
 Moments of N observations (d,) are one row of 1 + 2 d numbers: N, their mean, and the sums of their squared deviations
-from it (M2). A row of zeros means no observations. All operations are elementwise and in a fixed order, so that
-equal observations give equal bits.
+from it (M2). A row of zeros means no observations. All operations are elementwise and in a fixed order, so the same
+observations give the same bits.
 """
 
 from typing import Final
@@ -18,7 +18,12 @@ class Moments:
     """Moments of the observations of B rollouts, updated in every step (Welford 1962)."""
 
     def __init__(self, rollouts: int, size: int) -> None:
-        """Start without observations; they have this size."""
+        """Start without observations.
+
+        Args:
+          rollouts: number of rollouts, B.
+          size: size of an observation, d.
+        """
         self.table = np.zeros((rollouts, 1 + 2 * size))
         """(B, 1 + 2 d)"""
         self._size = size
@@ -26,7 +31,7 @@ class Moments:
     def add(self, rows: IntArray, x: FloatArray) -> None:
         """Add an observation (n, d) to each of some rollouts (n,)."""
         table, mean, squares = self.table, slice(1, 1 + self._size), slice(1 + self._size, None)
-        with np.errstate(over="ignore", invalid="ignore"):  # `merged` leaves out what is not finite
+        with np.errstate(over="ignore", invalid="ignore"):  # `usable` and `merged` leave out values that are not finite
             table[rows, 0] += 1.0
             difference = x - table[rows, mean]
             table[rows, mean] += difference / table[rows, :1]
@@ -41,8 +46,8 @@ def usable(table: FloatArray) -> FloatArray:
 def merged(total: FloatArray, table: FloatArray) -> FloatArray:
     """Moments (1 + 2 d,) of all observations of `total` and, row by row in order, of a table (B, 1 + 2 d).
 
-    Chan, Golub & LeVeque 1979, Updating formulae and a pairwise algorithm for computing sample variances. A row with
-    which the sum would not be finite is left out.
+    Chan, Golub & LeVeque 1979, Updating formulae and a pairwise algorithm for computing sample variances. A row that
+    would make the result non-finite is left out.
     """
     size = len(total) // 2
     for row in table:
@@ -62,7 +67,7 @@ def merged(total: FloatArray, table: FloatArray) -> FloatArray:
 def normaliser(total: FloatArray) -> FloatArray:
     """Mean and standard deviation (2, d) of moments (1 + 2 d,).
 
-    Zeros and ones where nothing has been observed yet; a number that never changes has the standard deviation 1.
+    Zeros and ones if there are no observations; a number that never changes gets the standard deviation 1.
     """
     size = len(total) // 2
     if not len(total) or total[0] == 0.0:

@@ -1,7 +1,7 @@
-"""One look-up for tasks, policies, algorithms, backends, loggers and commands: built in, installed packages, files.
+"""Finds tasks, policies, algorithms, backends, loggers and commands: built in, from installed packages, or from files.
 
 finger-gait            built in: a line in BUILT_IN
-my-task                an installed package: an entry point of the group `rolloutfarm.tasks`
+my-task                from an installed package: an entry point of the group `rolloutfarm.tasks`
 pendulum.py:Pendulum   a class in a file, named by its path
 """
 
@@ -76,33 +76,33 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "certificates": "farm.commands.certificates:main",
     },
 }
-"""Kinds of plug-ins, and the built-in ones by name. Strings, because nothing in farm/ imports a learner or worker."""
+"""Kinds of plug-ins, and the built-in ones by name. Strings, because farm/ must not import learner/ or workers/."""
 
 SOURCE_LIMIT: Final = 1_000_000
 """Largest size of a file that is sent to workers [bytes]."""
 
-_LINES: Final = 40  # lines of a traceback that is sent to other machines
-_WIDTH: Final = 250  # characters of each
+_LINES: Final = 40  # most lines of a traceback that is sent to other machines
+_WIDTH: Final = 250  # most characters per line
 
-_MODULES: Final = "rolloutfarm_file_"  # prefix of the modules that files become
+_MODULES: Final = "rolloutfarm_file_"  # prefix of the names of modules made from files
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """A class, and where it comes from."""
+    """A class, and its origin."""
 
     kind: str
-    """One of BUILT_IN's."""
+    """One of BUILT_IN's keys."""
     name: str
-    """The name by which it is chosen; for a file its path, then a colon and the class."""
+    """The name by which it is chosen; for a file PATH:CLASS."""
     target: Any
-    """The class; of a command a function."""
+    """The class; for a command a function."""
     variant: str = ""
     """The part after the colon in a name with variants: `Swimmer-v5` of `gym:Swimmer-v5`."""
     release: str = ""
-    """Package and version that it comes from; empty for the farm's own and for files."""
+    """Name and version of its package; empty for built-in classes and for files."""
     file: Path | None = None
-    """The file that it comes from, if it is from a file."""
+    """Its file, if it comes from a file."""
     source: bytes = field(default=b"", repr=False)
     """That file's bytes as they were when it was imported."""
 
@@ -117,12 +117,12 @@ class Plugin:
         return str(self.file) if self.file else self.release or "built in"
 
     def digest(self) -> str:
-        """SHA-256 of its code: its file, or its module and all that this imports from the same package."""
+        """SHA-256 of its code: of its file, or of its module and everything that this imports from the same package."""
         return hashlib.sha256(self.source).hexdigest() if self.file else code_digest(self.target.__module__)
 
 
 def names(kind: str) -> dict[str, str]:
-    """Names of a kind that can be chosen, and where each is from; a file can be chosen as well."""
+    """Names of the plug-ins of a kind, and the origin of each; files are not listed."""
     found = dict.fromkeys(BUILT_IN[kind], "built in")
     for point in _points(kind):
         if point.name not in found:
@@ -131,10 +131,10 @@ def names(kind: str) -> dict[str, str]:
 
 
 def find(kind: str, name: str) -> Plugin:
-    """The plug-in of that name.
+    """The plug-in with this name.
 
     Raises:
-      ConfigError: there is none (says which there are), or it cannot be imported (says why).
+      ConfigError: there is none (the message lists the known ones), or it cannot be imported.
     """
     path, _, inside = name.rpartition(":")
     if path.endswith(".py"):
@@ -145,7 +145,7 @@ def find(kind: str, name: str) -> Plugin:
         try:
             found = Plugin(kind, name, getattr(load(module), attribute), variant)
         except ImportError as error:
-            package = (error.name or "").partition(".")[0].replace("_", "-")  # built-in ones miss extras only
+            package = (error.name or "").partition(".")[0].replace("_", "-")  # only optional packages can be missing
             raise ConfigError(f"{_one(kind)} {own!r} needs {package}: pip install {package}") from error
     else:
         found = _from_package(kind, own, variant)
@@ -195,7 +195,7 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
 
 @cache
 def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
-    """Import a file in its present state; its folder is on no import path, so that it can shadow nothing."""
+    """Import a file as it is now; its folder is not on the import path, so it cannot shadow other modules."""
     name = _MODULES + hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:12]
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
@@ -203,14 +203,14 @@ def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
     sys.modules[name] = module  # dataclasses look for their annotations there
     try:
         exec(compile(source, str(path), "exec"), vars(module))
-    except (Exception, SystemExit) as error:  # whatever the file may raise; its own traceback says where
+    except (Exception, SystemExit) as error:  # whatever the file may raise
         del sys.modules[name]
         raise ConfigError(f"{path} cannot be imported: {_where(error, path)}") from error
     return module
 
 
 def _where(error: BaseException, path: Path) -> str:
-    """An error and its line in a file."""
+    """An error as text, with its line in this file."""
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
     lines = [each.lineno for each in traceback.extract_tb(error.__traceback__) if each.filename == str(path)]
@@ -219,7 +219,7 @@ def _where(error: BaseException, path: Path) -> str:
 
 
 def author_frames(error: BaseException) -> list[str]:
-    """The part of a traceback that is in classes from files, as text; empty if there is none."""
+    """The frames of a traceback that are in plug-in files, as text; empty if there are none."""
     files = {module.__file__ for name, module in list(sys.modules.items()) if name.startswith(_MODULES)}
     return traceback.format_list([each for each in traceback.extract_tb(error.__traceback__) if each.filename in files])
 
@@ -232,7 +232,7 @@ def root(error: BaseException) -> BaseException:
 
 
 def author_traceback(error: BaseException) -> tuple[str, ...]:
-    """The traceback of an error from the first line that is not the farm's own, as printable lines for its author."""
+    """The traceback of an error in plug-in code, without the farm's own frames at its top, as printable lines."""
     error = root(error)
     ours = tuple(f"{Path(__file__).parent.parent / package}/" for package in ("farm", "workers", "learner"))
     frames = list(dropwhile(lambda each: each.filename.startswith(ours), traceback.extract_tb(error.__traceback__)))
@@ -250,10 +250,10 @@ def named_file(wire: str) -> str:
 
 
 def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:
-    """A class NAME.py:CLASS named by another machine, from one of these files with that name and digest.
+    """Load the class NAME.py:CLASS, which a learner named, from the permitted file with this name and digest.
 
     Raises:
-      UnservedError: none is allowed, or the one that is differs.
+      UnservedError: no permitted file has this name, or its contents differ from the learner's.
     """
     name, _, inside = wire.rpartition(":")
     for path in files:
@@ -273,7 +273,7 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
 
 @cache
 def code_digest(module: str) -> str:
-    """SHA-256 of a module's source and of all that it imports from its own top-level package, by module name."""
+    """SHA-256 of a module's source and of all modules that it imports from its own top-level package."""
     said = hashlib.sha256()
     for name, source in sorted(_sources(module).items()):
         said.update(name.encode() + b"\0" + source + b"\0")
@@ -281,7 +281,7 @@ def code_digest(module: str) -> str:
 
 
 def _sources(module: str) -> dict[str, bytes]:
-    """Sources of a module and of what it imports from its own package, however far."""
+    """Sources of a module and of all modules that it imports, directly or not, from its own package."""
     found: dict[str, bytes] = {}
     waiting = [module]
     while waiting:
@@ -333,10 +333,10 @@ def _release(point: EntryPoint) -> str:
 
 
 def load(module: str) -> Any:  # noqa: ANN401  a module
-    """Import a module of ours, also where a folder of the user's own is called `learner` or `workers`.
+    """Import a module of rolloutfarm, even if the working directory has a folder `learner` or `workers`.
 
     Raises:
-      ConfigError: a module of that name, which is not ours, has been imported before.
+      ConfigError: a different module with that name has been imported before.
     """
     package = module.partition(".")[0]
     init = Path(__file__).parent.parent / package / "__init__.py"

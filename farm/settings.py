@@ -1,4 +1,4 @@
-"""Settings as dataclasses: checked, read from flags and from JSON. The only module that imports tyro."""
+"""Settings as dataclasses: checked, and read from flags or JSON. Only this module and commands import tyro."""
 
 import contextlib
 import copy
@@ -24,7 +24,7 @@ _FRAME: Final = "│╭╮╰╯─ \n"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Base of frozen, keyword-only settings; every value is checked against its annotation and its `setting`."""
+    """Base of frozen, keyword-only settings; every value is checked against its annotation and bounds."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -43,10 +43,10 @@ def setting(
 
 
 def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
-    """Check each field of a frozen dataclass by its annotation and bounds; whole numbers become floats where wanted.
+    """Check each field of a frozen dataclass by its annotation and bounds; integers for float fields become floats.
 
     Raises:
-      ConfigError: names the first invalid value, and what was expected.
+      ConfigError: names the first invalid value and the expected ones.
     """
     hints = _hints(type(settings))
     for each in dataclasses.fields(settings):
@@ -125,10 +125,10 @@ def to_dict(settings: Any) -> dict[str, Any]:  # noqa: ANN401  any dataclass
 
 
 def from_dict(kind: type[C], values: object, where: str) -> C:
-    """Settings from a table of JSON; missing ones keep their defaults.
+    """Settings from a JSON table; missing ones keep their defaults.
 
     Raises:
-      ConfigError: unknown names, wrong types or impossible values; `where` is named.
+      ConfigError: an unknown name, a wrong type or an invalid value; the message begins with `where`.
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where} is {str(values)[:80]!r}; expected a table of settings")
@@ -152,18 +152,18 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
-    """Parse arguments into a dataclass; flags of nested dataclasses have no prefix, those of tuples are repeated.
+    """Parse arguments into a dataclass; flags of nested dataclasses have no prefix, flags of tuples are repeatable.
 
-    `--help` prints and exits with status 0.
+    `--help` prints the help and exits with status 0.
 
     Raises:
-      ConfigError: an unknown flag, or a value of the wrong type, in one line.
+      ConfigError: an unknown flag, or a value of the wrong type; the message is one line.
     """
-    import tyro  # not needed for reading configurations
+    import tyro  # only commands need it
 
     distinct(default, program)
     said = io.StringIO()
-    shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")  # tyro asks it for frames
+    shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")  # tyro reads its encoding
     extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, arguments)}
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(shown):
@@ -179,7 +179,7 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
 
 def _without_none(text: str) -> str:
-    """A help text of tyro without its remarks on optional settings; its columns stay aligned."""
+    """Tyro's help text without "None" as a default or choice; its columns stay aligned."""
     emptied = re.sub(_NO_DEFAULT, lambda found: re.sub(r"[^\s│]", " ", found[0]), text).splitlines(keepends=True)
     kept = [
         line for old, line in zip(text.splitlines(), emptied, strict=True) if line.strip("│ \n") or old == line[:-1]
@@ -196,7 +196,7 @@ def _without_none(text: str) -> str:
 
 
 def _emptied(default: C, arguments: Sequence[str]) -> C:
-    """The defaults, with empty tuples where arguments are given: tyro would append to the defaults."""
+    """The defaults, with empty tuples for flags that are given: tyro would append to the default."""
     given = {word.partition("=")[0] for word in arguments}
     out = copy.copy(default)
     for each in dataclasses.fields(default):  # type: ignore[arg-type]
@@ -209,7 +209,7 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
 
 
 def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
-    """Check that every flag exists only once: a plug-in's setting may have a command's name. Else a ConfigError."""
+    """Check that every flag exists only once; a ConfigError if a plug-in's setting has the name of another flag."""
     owners: dict[str, str] = {}
     waiting = [default] if dataclasses.is_dataclass(default) else []
     while waiting:

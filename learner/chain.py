@@ -1,7 +1,7 @@
-"""An upper level above learnt policies: one acts until its goal is reached, then the next.
+"""An upper level above learnt policies: each acts until its goal is reached, then the next one takes over.
 
 Plage 2016, 5.2: "an upper level control policy can then control the finger gaiting". A task can be chained if it
-defines where its rollouts begin and end (`ends`), when the end is reached (`reached`) and when a rollout is lost
+defines the names of its start and goal (`ends`), when the goal is reached (`reached`) and when a rollout has failed
 (`lost`).
 """
 
@@ -30,7 +30,7 @@ class Chained:
     """Rollouts of a chain."""
 
     changes: IntArray
-    """(B,) how often a goal was reached until the end, or until the rollout was lost."""
+    """(B,) number of goals reached before the rollout ended or failed."""
     acting: IntArray
     """(B, T) index of the policy that acted, -1 after the end."""
     rollouts: Rollouts
@@ -41,12 +41,12 @@ class Chained:
 
 @dataclass(frozen=True)
 class _Link:
-    """A policy, with its own observation and its own meaning of an action."""
+    """A policy of the chain, and the task that computes its observations and controls."""
 
     task: Task
     policy: Policy
     prepared: FloatArray
-    """Of its one parameter vector, (1, ...)."""
+    """The policy's parameters from `Policy.prepare`, (1, ...)."""
 
     @classmethod
     def of(cls, learnt: LoadedPolicy, steps: int) -> "_Link":
@@ -58,7 +58,7 @@ class _Link:
         return cls(task, policy, policy.prepare(learnt.mu[None]))
 
     def controls(self, sim: Sim) -> FloatArray:
-        """Controls of the rollouts still going, (n, nu)."""
+        """Controls of the rollouts that have not ended, (n, nu)."""
         action = self.policy.act(np.repeat(self.prepared, len(sim), axis=0), self.task.observe(sim))
         return self.task.act(sim, action)
 
@@ -67,9 +67,9 @@ def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *
     """Run policies in turn, each from where the previous one ended; the first follows the last.
 
     Args:
-      policies: of tasks that can be chained.
-      seeds: (B,) of the starts.
-      steps: control steps.
+      policies: learnt on tasks that can be chained.
+      seeds: seeds of the starts, (B,).
+      steps: largest number of control steps.
       every: physics steps between two frames; 0: one frame per control step.
 
     Raises:
@@ -94,7 +94,7 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
       ConfigError: one does not; names both.
     """
     if not policies:
-        raise ConfigError("a chain needs policies: give one run or more, in the order in which they act")
+        raise ConfigError("a chain needs policies: give one run or more, in the order in which their policies act")
     tasks: list[Any] = [policy.problem.task for policy in policies]
     for policy, task in zip(policies, tasks, strict=True):
         if task.ends is None:
@@ -147,7 +147,7 @@ def _run(
 
 
 def _controls(links: Sequence[_Link], sim: Sim, turn: IntArray) -> FloatArray:
-    """Controls of the rollouts still going, each by the policy whose turn it is, (n, nu)."""
+    """Controls of the rollouts that have not ended, each by the policy whose turn it is, (n, nu)."""
     before: Mapping[str, Any] = {name: np.array(values) for name, values in sim.own.items()}
     given, own = [], []
     for link in links:  # all policies for all rollouts: a row's result does not depend on the others

@@ -50,10 +50,10 @@ class RunConfig(Settings):
     stop_after_steps: int | None = setting(None, least=1)
     """End after the generation in which the exploring rollouts reach this total number of control steps."""
     average: int = setting(1, least=1)
-    """The final policy is the average of the means after this number of last generations."""
+    """Number of last generations whose means are averaged to give the final policy."""
     interactions: int | None = setting(None, least=1)
-    """Control steps that a generation should have. Each generation gets as many pairs as would have made this number
-    in the previous one, from --pairs to --most-pairs (Toklu 2020)."""
+    """Control steps that a generation should have: the number of pairs, from --pairs to --most-pairs, follows from the
+    steps per pair in the previous generation (Toklu 2020)."""
     most_pairs: int | None = setting(None, least=1)
     """With --interactions: largest number of pairs in a generation; by default eight times --pairs."""
     init_from: str | None = None

@@ -1,10 +1,10 @@
-"""Settings x seeds: the runs of a sweep, and the folder that they are in.
+"""Settings x seeds: the runs of a sweep, and its folder.
 
-    sweep.json                 what is varied, the seeds, and each setting's configuration
+    sweep.json                 the varied settings, the seeds, and each setting's configuration
     SETTING-sSEED/             a run's folder each
     table.csv, .parquet, figure.svg      results
 
-Seeds may be added to a sweep later; nothing else may change.
+Seeds may be added to a sweep later; nothing else can be changed.
 """
 
 import itertools
@@ -39,7 +39,7 @@ class Setting:
     values: Mapping[str, str]
     """Varied values as given, by the flag's name with underscores."""
     config: RunConfig
-    """Of seed 0."""
+    """The configuration with seed 0."""
 
     @property
     def label(self) -> str:
@@ -63,7 +63,7 @@ class Sweep:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The settings' parts of run names: the varied values, or a number if these make no valid name."""
+        """Each setting's part of its runs' names: the varied values, or a number if those give no valid name."""
         plain = [_plain(setting.values) for setting in self.settings]
         count = Counter(plain)
         return tuple(
@@ -87,14 +87,14 @@ class Sweep:
         """Make the folder, or continue with it; seeds may be added.
 
         Raises:
-          ConfigError: it belongs to another sweep, or is not a sweep's folder.
+          ConfigError: it belongs to a different sweep, or is not a sweep's folder.
         """
         file = self.path / "sweep.json"
         with writing(f"to {self.path}", ConfigError):
             if file.exists():
                 self._check_same(file)
             elif self.path.exists() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} holds something else and no sweep.json: give another --out")
+                raise ConfigError(f"{self.path} holds something else and no sweep.json: give a different --out")
             self.path.mkdir(parents=True, exist_ok=True)
             made = [configs.to_dict(setting.config) for setting in self.settings]
             told = {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": made}
@@ -111,18 +111,22 @@ class Sweep:
             raise ConfigError(f"{file} is not of version {_VERSION}")
         if told.get("vary") != self.vary:
             there, here = _words(told.get("vary")), _words(self.vary)
-            raise ConfigError(f"{self.path} varies {there}; here it is {here}: give the same, or another --out")
+            raise ConfigError(
+                f"{self.path} varies {there}; here it is {here}: use the same values, or a different --out"
+            )
         if missing := [str(seed) for seed in told["seeds"] if seed not in self.seeds]:
-            raise ConfigError(f"{self.path} has seeds {', '.join(missing)} as well: give them too, or another --out")
+            raise ConfigError(
+                f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different --out"
+            )
         for setting, kept in zip(self.settings, told["settings"], strict=False):
             for name, old, new in configs.changes(configs.from_dict(kept, str(file)), setting.config):
                 raise ConfigError(
-                    f"{self.path} was begun with --{name} {old}; here it is {new}: give the same, or another --out"
+                    f"{self.path} was started with --{name} {old}; here it is {new}: use that, or a different --out"
                 )
 
 
 def _plain(values: Mapping[str, str]) -> str:
-    """Varied values as part of a run's name; a file without its path."""
+    """Varied values as part of a run's name; files without their folder."""
     parts = [f"{name}-{value.rpartition('/')[2]}" for name, value in values.items()]
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", "-".join(parts))
 
@@ -146,7 +150,7 @@ def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
         if name in out:
             raise ConfigError(f"--vary {name} is given twice: give all of its values at once")
         if len(set(values)) < len(values):
-            raise ConfigError(f"--vary {word}: a value comes twice")
+            raise ConfigError(f"--vary {word}: a value is given twice")
         out[name] = values
     return out
 
@@ -163,7 +167,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise ConfigError(f"--seeds {text!r}: expected at most {MOST} seeds below 2^32")
         out += range(first, last + 1)
     if len(set(out)) < len(out):
-        raise ConfigError(f"--seeds {text!r}: a seed comes twice")
+        raise ConfigError(f"--seeds {text!r}: a seed is given twice")
     return tuple(out)
 
 

@@ -21,7 +21,7 @@ COLUMNS: Final = {
     "mean_policy_return": "number", "mean_policy_success": "truth", "robust_success_rate": "number",
     "robust_return": "number", "seconds": "number", "parameters_sha256": "text",
 }  # fmt: skip
-"""Columns of the table and their types, after the varied settings (text as given): names of summary.json, and the
+"""Columns of the table after the varied settings (text as given), and their types: fields of summary.json, and the
 return of the mean policy before learning."""
 
 INSTALL: Final = "it needs pyarrow: pip install pyarrow"
@@ -92,7 +92,7 @@ class Curve:
     rollouts: FloatArray
     """Exploring rollouts before this policy, (G,)"""
     returns: FloatArray
-    """(runs, G), nan after a run's end and where the simulation became unstable"""
+    """(runs, G); nan after a run's end and if the simulation became unstable"""
 
 
 def curves(sweep: Sweep) -> list[Curve]:

@@ -1,8 +1,8 @@
 """The reproduction of Plage 2016, from a checkout: experiments of many runs each, and their figures.
 
-python -m benchmarks.thesis NAME ...      an experiment's runs side by side, then its figure; thesis for all
-python -m benchmarks.thesis --list        what there is
-python -m benchmarks.thesis plot FOLDER   the figures again, from the recorded data
+python -m benchmarks.thesis NAME ...      does an experiment's runs together, then draws its figure; thesis: all
+python -m benchmarks.thesis --list        lists the experiments
+python -m benchmarks.thesis plot FOLDER   draws the figures again, from the recorded data
 """
 
 import sys
@@ -29,30 +29,30 @@ from learner.figure import INSTALL, available
 from learner.sweep import Sharing
 
 ALL: Final = "thesis"
-"""All experiments."""
+"""Name that stands for all experiments."""
 
 PROGRAM: Final = "python -m benchmarks.thesis"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentCommand:
-    """An experiment's runs side by side, then its figure; run it again to continue.
+    """Does an experiment's runs together, then draws its figure; run it again to continue.
 
     `plot FOLDER` instead of a name draws the figures of such a folder again, from its recorded data.
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Of --list, one or more, or thesis for all."""
+    """Names of experiments (see --list), or thesis for all."""
     list: bool = False
-    """List the experiments, and end."""
+    """List the experiments, and exit."""
     trials: int = TRIALS
     """Runs of each set-up, with seeds 0, 1, ..."""
     generations: int | None = None
-    """Make every run this short."""
+    """Shorten every run to this number of generations."""
     out: Path | None = None
     """Folder for runs, data and figures; None: runs/NAME."""
     sharing: Sharing = field(default_factory=Sharing)
-    """Where the runs are done."""
+    """Workers of the runs."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -67,7 +67,7 @@ class PlotCommand:
     """The figures of an experiment again, from its recorded data: PNG and SVG."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder that an experiment was done in."""
+    """Folder of an experiment."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -108,17 +108,17 @@ def _plot(words: Sequence[str]) -> int:
 
 
 def check_matplotlib() -> None:
-    """Whether matplotlib is there; it is an extra.
+    """Check that matplotlib, an optional package, is installed.
 
     Raises:
-      ConfigError: it is not; says what to install.
+      ConfigError: it is not; the message says what to install.
     """
     if not available():
         raise ConfigError(INSTALL)
 
 
 def draw(folder: ExperimentFolder) -> None:
-    """Measure what is missing, draw every figure, and say what came out."""
+    """Measure what is missing, draw every figure, and print the findings."""
     for name in folder.experiments:
         _draw(folder, name)
     sys.stdout.flush()
@@ -135,7 +135,7 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
 
     experiment = EXPERIMENTS[name]
     if experiment.curves and all(series.empty for series in folder.data(experiment).series.values()):
-        sys.stdout.write(f"{name}: none of its runs has begun\n")
+        sys.stdout.write(f"{name}: none of its runs has started\n")
         return
     measure(folder, experiment)
     data = folder.data(experiment)
@@ -161,9 +161,9 @@ def _list() -> None:
     for name, experiment in EXPERIMENTS.items():
         table.add_row(name, experiment.question, *_cost(tuple(experiment.curves.values())))
     every = tuple(dict.fromkeys(s for e in EXPERIMENTS.values() for s in e.curves.values()))
-    table.add_row(ALL, "all of them; runs that several show are done once", *_cost(every))
+    table.add_row(ALL, "all of them; runs that several experiments share are done once", *_cost(every))
     Console().print(table)
-    sys.stdout.write(f"runs, rollouts and minutes on two cores are of {TRIALS} trials; --trials changes it\n")
+    sys.stdout.write(f"runs, rollouts and minutes on two cores are for {TRIALS} trials; --trials changes it\n")
 
 
 def _cost(setups: tuple[str, ...]) -> tuple[str, str, str]:
@@ -173,7 +173,7 @@ def _cost(setups: tuple[str, ...]) -> tuple[str, str, str]:
 
 
 def _exit(words: Sequence[str]) -> int:
-    """The command's exit status, its mistakes as one line."""
+    """Run the command; return its exit status. Errors are printed as one line."""
     try:
         return main(words)
     except KeyboardInterrupt:

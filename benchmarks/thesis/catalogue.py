@@ -1,7 +1,7 @@
-"""Every experiment, by name. A new one is a few lines here: its set-ups, then the experiment.
+"""Every experiment, by name. To add one, write its set-ups (named configurations) and the experiment here.
 
-The set-up of the thesis' experiments is `--preset thesis` with what the figure's caption and text say; where they
-are silent the preset's value stays (docs/method.md says what that leaves open).
+The set-ups of the thesis' experiments are `--preset thesis` with the settings that the figure's caption and the text
+give; other settings keep the preset's value (docs/method.md lists what the thesis leaves open).
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ _FORMER: Final[Mapping[str, Any]] = {
     "pairs": 15, "initial_mu": 1.75, "initial_sigma": 0.8, "learning_rate_mu": 0.1, "learning_rate_sigma": 0.2,
     "sigma_floor": 1e-3, "generations": 150,
 }  # fmt: skip
-"""What the preset `default` was when the experiments were made."""
+"""The preset `default` as it was when the experiments were made."""
 
 
 def _default(**settings: Any) -> RunConfig:  # noqa: ANN401
@@ -113,7 +113,7 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "default-plain": _default(estimator="plain"),
     "default-plain-optimal-baseline": _default(estimator="plain", baseline="optimal"),
 }  # fmt: skip
-"""Configurations by name; a run is one of them and a seed, shared by all experiments that show it."""
+"""Configurations by name; a run has one of them and a seed, and all experiments that show it share it."""
 
 FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     f"{name}-{suffix}": (name, parts)
@@ -128,7 +128,7 @@ FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     )
     for name in names
 }
-"""Set-ups whose start fits the size of the state: name -> the set-up, and which of the two settings are fitted."""
+"""Set-ups with a fitted start: name -> the original set-up, and which of bandwidth and first sigma are fitted."""
 
 
 @cache
@@ -515,14 +515,14 @@ _QUESTIONS: Final = [
 ]
 
 EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for experiment in (*_CLAIMS, *_QUESTIONS)}
-"""By name, the thesis' own first."""
+"""By name; those of the thesis come first."""
 
 RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}
 """Rollouts per second of two cores, of the projected policy times its features; used only for estimates."""
 
 
 def _cheap(name: str) -> RunConfig:
-    """A configuration that costs as much as the set-up's."""
+    """A configuration that takes as long as the set-up's; used only for estimates."""
     return SETUPS[FITTED[name][0] if name in FITTED else name]
 
 
@@ -534,7 +534,7 @@ def rollouts(name: str) -> int:
 
 
 def minutes(names: tuple[str, ...]) -> float:
-    """About how long set-ups take on two cores, one trial each [min]."""
+    """Estimated duration of one trial of each set-up on two cores [min]."""
     seconds = 0.0
     for name in names:
         config = _cheap(name)

@@ -1,4 +1,4 @@
-"""What each claim of Plage 2016 asks of the data, and each question of ours: one function an experiment. Pure."""
+"""Tests of the claims of Plage 2016, and of our additional questions, on data: one function per experiment. Pure."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def race(data: Data) -> list[Finding]:
 
 
 def converges(data: Data) -> list[Finding]:
-    """Figure 4.2: sigma to 0, mu to values of its own in each trial."""
+    """Figure 4.2: sigma goes to 0, mu to different values in each trial."""
     (series,) = data.series.values()
     sigma, mu = series.end("sigma_2"), series.end("mu_2")
     wander = np.array([np.ptp(row[~np.isnan(row)][-20:]) for row in series.columns["mu_2"]])
@@ -204,7 +204,7 @@ def only_projected_recovers(data: Data) -> list[Finding]:
 
 
 def scale_free(data: Data) -> list[Finding]:
-    """3.5.2: scaled returns do not change learning; by a power of two, which rounds nothing, not a bit of it."""
+    """3.5.2: scaled returns do not change learning; with a power of two, which causes no rounding, not by one bit."""
     plain, exact, scaled = data.series.values()
     difference = np.abs(scaled.columns["return_mean"] / 100.0 - plain.columns["return_mean"])
     early = float(np.nanmax(difference[:, :20]))
@@ -243,7 +243,7 @@ def mostly_learnt(data: Data) -> list[Finding]:
 
 
 def transfer(data: Data) -> list[Finding]:
-    """Whether policies work on objects they were not learnt on."""
+    """Whether policies work on objects that were not used for learning."""
     rate = known_mean(data.measured["transfer"], axis=1)  # (learnt on, tried on), over the trials
     labels = list(data.series)
     off = rate[~np.eye(len(rate), dtype=bool)]
@@ -264,7 +264,7 @@ _MOST = 0.8  # of the trials
 
 
 def chain(data: Data) -> list[Finding]:
-    """How many changes of grip follow each other."""
+    """Number of successive changes of grip."""
     reached = known_mean(data.measured["reached"], axis=0)  # part of the rollouts that made at least 0, 1, ... changes
     said = ", ".join(
         f"{part:.0%} make {k}" for k, part in enumerate(reached) if k in (1, 2, 4, 8) or k == len(reached) - 1
@@ -275,7 +275,7 @@ def chain(data: Data) -> list[Finding]:
 
 
 def friction(data: Data) -> list[Finding]:
-    """How success depends on friction."""
+    """Success as a function of friction."""
     rate, factors = known_mean(data.measured["success"], axis=1), data.measured["factors"]
     out = []
     for label, row in zip(data.series, rate, strict=True):

@@ -1,4 +1,4 @@
-"""What an experiment is, and what recorded data says to its claim: parts with their numbers, and a verdict."""
+"""An experiment, and the result of testing its claim on recorded data: findings with numbers, and a verdict."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ class Curves:
     over: Literal["generations", "rollouts"] = "generations"
     """The horizontal axis."""
     scale: Literal["linear", "symlog"] = "linear"
-    """Of returns; symlog: logarithmic if they fall by orders of magnitude."""
+    """Scale of returns; symlog: logarithmic if they fall by orders of magnitude."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Friction:
     """Success of the learnt policies over friction."""
 
     factors: tuple[float, ...]
-    """Of every friction coefficient."""
+    """Factors of all friction coefficients."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class KernelError:
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """How many changes of grip an upper level gets out of two learnt policies, the first curve's and the second's."""
+    """Number of grip changes if an upper level alternates the policies learnt for the first and the second curve."""
 
     steps: int = 100
     """Control steps of a rollout."""
@@ -61,19 +61,19 @@ Figure = Curves | Transfer | Friction | Chain | KernelError
 
 @dataclass(frozen=True)
 class Data:
-    """All that is known of an experiment."""
+    """All data of an experiment."""
 
     series: Mapping[str, Series]
-    """By what the legend says."""
+    """Recorded series, by their label in the legend."""
     measured: Mapping[str, FloatArray]
-    """What was measured on the learnt policies."""
+    """Arrays measured on the learnt policies."""
     configs: Mapping[str, RunConfig]
-    """The set-ups, by what the legend says."""
+    """Configurations, by their label in the legend."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One part of a claim, and what came out."""
+    """One part of a claim, and its result."""
 
     part: str
     holds: bool
@@ -85,16 +85,16 @@ class Experiment:
     """A named set of runs (configurations x trials) with a question, and the figure that answers it."""
 
     name: str
-    """As in `python -m benchmarks.thesis NAME`; the thesis' figure or section, or the question in a word."""
+    """The name in `python -m benchmarks.thesis NAME`: the thesis' figure or section, or the question in a word."""
     title: str
     question: str
     claim: str = ""
-    """What Plage 2016 reports, and where; empty for additional questions."""
+    """What Plage 2016 reports, with the section; empty for additional questions."""
     curves: Mapping[str, str] = field(default_factory=dict)
-    """What a legend says -> name of the set-up (catalogue.SETUPS)."""
+    """Label in the legend -> name of the set-up (catalogue.SETUPS)."""
     figure: Figure = field(default_factory=Curves)
     find: Callable[[Data], list[Finding]] | None = None
-    """What the recorded data says to the claim."""
+    """Tests the claim on the recorded data."""
 
 
 def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunConfig:
@@ -108,7 +108,7 @@ Verdict = Literal["reproduced", "not reproduced", "in part", "open"]
 
 
 def judge(experiment: Experiment, data: Data) -> list[Finding]:
-    """What the data says to an experiment's claim; nothing before every trial of it is over."""
+    """Findings on an experiment's claim; none until all its trials have ended."""
     if experiment.find is None or not all(_over(series) for series in data.series.values()):
         return []
     return experiment.find(data)
@@ -119,7 +119,7 @@ def _over(series: Series) -> bool:
 
 
 def verdict(findings: Sequence[Finding]) -> Verdict:
-    """Over all parts of a claim; open if nothing is known of them."""
+    """The verdict on all parts of a claim; open if there are no findings."""
     if not findings:
         return "open"
     held = [finding.holds for finding in findings]
@@ -127,7 +127,7 @@ def verdict(findings: Sequence[Finding]) -> Verdict:
 
 
 def spread(values: FloatArray, digits: int = 2) -> str:
-    """Mean and range of what the trials gave."""
+    """Mean and range over the trials, as text."""
     known = values[~np.isnan(values)]
     if not len(known):
         return "none"
@@ -137,7 +137,7 @@ def spread(values: FloatArray, digits: int = 2) -> str:
 
 
 def counted(series: Series) -> str:
-    """How many trials learnt, and since when."""
+    """Number of trials that learnt, and from which generation on, as text."""
     since = series.since[series.learnt]
     when = f", each mean policy succeeding from generation {', '.join(f'{g:.0f}' for g in sorted(since))} on"
     return f"{int(series.learnt.sum())} of {series.trials} learnt{when if len(since) else ''}"

@@ -1,4 +1,4 @@
-"""The figures of experiments; the only module of the benchmarks that imports matplotlib."""
+"""The figures of experiments; only this module of benchmarks/thesis imports matplotlib."""
 
 import textwrap
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ _PANELS: Final[dict[Panel, tuple[str, str]]] = {
 
 _RETURNS: Final = ("return", "mean policy")
 
-_FALLEN: Final = -1000.0  # a mean return from which a linear axis would show nothing else
+_FALLEN: Final = -1000.0  # below this mean return the other values are too small to see on a linear axis
 
 
 def draw(experiment: Experiment, data: Data, folder: Path) -> tuple[Path, Path]:
@@ -70,7 +70,7 @@ def _canvas(panels: int, caption: str) -> tuple[Canvas, list[Axes]]:
 
 
 def _caption(experiment: Experiment, data: Data) -> str:
-    """The set-up as far as all curves share it, and what went wrong."""
+    """Caption: the settings that all curves share, and trials that did not finish."""
     trials = max(s.trials for s in data.series.values())
     said = ", ".join(common(list(data.configs.values()))) + f"; {trials} {'trials' if trials > 1 else 'trial'}"
     if isinstance(experiment.figure, Curves):
@@ -85,7 +85,7 @@ def _caption(experiment: Experiment, data: Data) -> str:
 
 
 def common(configs: Sequence[RunConfig]) -> list[str]:
-    """What set-ups share of what tells them apart, in words."""
+    """Settings common to all curves, as words of the caption."""
     told = (
         lambda c: c["policy"],
         lambda c: c["state"],
@@ -130,7 +130,7 @@ def _curves(experiment: Experiment, data: Data) -> Canvas:
 
 
 def _run_away(figure: Curves, data: Data) -> bool:
-    """Whether a trial's returns fell so far that a mean would hide the other trials."""
+    """Whether a trial's returns fell so far that it alone would determine the mean."""
     drawn = (series for series in data.series.values() if not series.empty)
     return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in drawn)
 
@@ -151,7 +151,7 @@ def _scale(axis: Axes, panel: Panel, low: float, high: float, *, run_away: bool)
 
 
 def _line(axis: Axes, i: int, name: str, values: FloatArray, step: int = 1, *, run_away: bool = False) -> FloatArray:
-    """The i-th line of a panel, its spread shaded: values (trials, generations), `step` apart; the line.
+    """Draw the i-th line of a panel, its spread shaded, and return it: values (trials, generations), `step` apart.
 
     Generations that no trial reached are left out. The mean and the standard deviation, where nothing has run away.
     """
@@ -172,7 +172,7 @@ def _line(axis: Axes, i: int, name: str, values: FloatArray, step: int = 1, *, r
 
 
 def _spread(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation over the trials that are there."""
+    """Mean and standard deviation over the trials that have data."""
     mean = known_mean(values, axis=0)
     return mean, np.sqrt(known_mean((values - mean) ** 2, axis=0))
 

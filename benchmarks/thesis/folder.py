@@ -1,12 +1,12 @@
-"""An experiment's folder: what it is for, its runs, and the data that outlives them.
+"""An experiment's folder: its settings, its runs, and the data kept from them.
 
-    experiment.json    which experiments, how many trials, how long
-    runs/SETUP-sN/     a run's folder each, shared by all experiments that show the set-up
-    data/SETUP.npz     what its trials recorded
-    data/NAME.npz      what was measured on the learnt policies
+    experiment.json    names of the experiments, number of trials and of generations
+    runs/SETUP-sN/     one run's folder, shared by all experiments that show the set-up
+    data/SETUP.npz     the series recorded by the set-up's trials
+    data/NAME.npz      measurements on the learnt policies
     NAME.svg, .png     the figure
 
-runs/ may be deleted: figures and findings need data/ alone.
+runs/ may be deleted: figures and findings need only data/.
 """
 
 import json
@@ -34,7 +34,7 @@ class ExperimentFolder:
     """Their names."""
     trials: int
     generations: int | None
-    """Shortens every run, None: as the set-ups say."""
+    """Number of generations of every run; None: that of its set-up."""
 
     @classmethod
     def open(cls, path: Path) -> "ExperimentFolder":
@@ -70,15 +70,15 @@ class ExperimentFolder:
         if (path / "experiment.json").exists():
             there = cls.open(path)
             if there.experiments != folder.experiments:
-                raise ConfigError(f"{path} holds {', '.join(there.experiments)}: give another --out")
+                raise ConfigError(f"{path} holds {', '.join(there.experiments)}: give a different --out")
             if there.generations != generations:
                 said = "all" if there.generations is None else there.generations
-                raise ConfigError(f"{path} was begun with {said} generations: give the same, or another --out")
+                raise ConfigError(f"{path} was started with {said} generations: use the same, or a different --out")
             if there.trials > trials:
-                raise ConfigError(f"{path} has {there.trials} trials: give as many or more, or another --out")
+                raise ConfigError(f"{path} has {there.trials} trials: give as many or more, or a different --out")
         try:
             if not (path / "experiment.json").exists() and path.exists() and any(path.iterdir()):
-                raise ConfigError(f"{path} holds something else and no experiment.json: give another --out")
+                raise ConfigError(f"{path} holds something else and no experiment.json: give a different --out")
             folder.check_runs(go_on=True)
             (path / "runs").mkdir(parents=True, exist_ok=True)
             (path / "data").mkdir(exist_ok=True)
@@ -100,39 +100,39 @@ class ExperimentFolder:
         return trial(catalogue.config(setup), number, self.generations)
 
     def run(self, setup: str, number: int) -> RunFolder:
-        """The folder of a trial, whether it is there or not."""
+        """The folder of a trial, which may not exist."""
         return RunFolder(self.path / "runs" / f"{setup}-s{number}")
 
     @property
     def runs(self) -> dict[Path, RunConfig]:
-        """Configurations by run folder, trial by trial: a first picture comes early."""
+        """Configurations by run folder, trial by trial, so that all set-ups have an early result."""
         pairs = [(setup, number) for number in range(self.trials) for setup in self.setups]
         return {self.run(*pair).path: self.config(*pair) for pair in pairs}
 
     def check_runs(self, *, go_on: bool = False) -> None:
-        """Check that the runs in the folder belong to the set-ups, and that none is missing whose data is kept.
+        """Check that the runs in the folder have the set-ups' configurations, and that no recorded run is missing.
 
-        To go on with the runs each has to be there; for data alone, all of a set-up may be gone.
+        To continue with the runs, each recorded one must exist; otherwise all runs of a set-up may be missing.
 
         Raises:
-          ConfigError: one is of another configuration, or gone.
+          ConfigError: a run has a different configuration, or is missing.
         """
         for setup in self.setups:
             folders = [self.run(setup, number) for number in range(self.trials)]
             there = [folder.path.exists() for folder in folders]
             for number, folder in enumerate(folders):
                 if there[number] and folder.read_config() != self.config(setup, number):
-                    raise ConfigError(f"{folder.path} is not of the set-up {setup} any more: give another --out")
+                    raise ConfigError(f"{folder.path} is not of the set-up {setup} any more: give a different --out")
             file = self.path / "data" / f"{setup}.npz"
             known = series.load(file).states if file.exists() and (go_on or any(there)) else ()
             for folder, exists, state in zip(folders, there, known, strict=False):
                 if state != "missing" and not exists:
                     raise ConfigError(
-                        f"{file} tells of {folder.path}, which is gone: put it back, or give another --out"
+                        f"{file} has data of {folder.path}, which is gone: put it back, or give a different --out"
                     )
 
     def gather(self) -> None:
-        """Bring data/ up to date with the runs that are there.
+        """Bring data/ up to date with the existing runs.
 
         Raises:
           ConfigError: as check_runs.
@@ -145,7 +145,7 @@ class ExperimentFolder:
                 series.save(file, series.read(folders, self.config(setup, 0)))
 
     def data(self, experiment: Experiment) -> Data:
-        """What is known of an experiment.
+        """The data of an experiment.
 
         Raises:
           ConfigError: nothing has been gathered.
@@ -158,7 +158,7 @@ class ExperimentFolder:
         )  # fmt: skip
 
     def measured(self, experiment: Experiment) -> Path:
-        """The file with what was measured on an experiment's policies."""
+        """The file with the measurements on an experiment's policies."""
         return self.path / "data" / f"{experiment.name}.npz"
 
 

@@ -1,7 +1,7 @@
-"""What an experiment measures on policies that its runs have learnt, beyond what they recorded.
+"""Measurements on the learnt policies of an experiment, in addition to what its runs recorded.
 
-Kept beside the recorded data with the hashes of the runs it is of, and what the figure asks for; measured anew when
-those change.
+They are stored beside the recorded data, with the hashes of the runs and the figure's settings, and repeated when
+these change.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,16 +30,16 @@ from learner.replay import load as load_policy
 from learner.run_folder import RunFolder
 
 _POINTS: Final = 40
-"""States whose kernel values are compared, all pairs of them."""
+"""Number of states; the kernel values of all pairs of them are compared."""
 
 _AT_LIMIT: Final = 1e-9  # [rad]
 
 
 def measure(folder: ExperimentFolder, experiment: Experiment) -> None:
-    """Measure what an experiment's figure needs, if that has not been done for these runs.
+    """Make the measurements for an experiment's figure, unless they exist for these runs.
 
     Raises:
-      ConfigError: it has not, and the runs are no longer there.
+      ConfigError: they do not exist, and neither do the runs.
     """
     measuring = _measuring(experiment)
     if measuring is None:
@@ -71,13 +71,13 @@ def _measuring(experiment: Experiment) -> Measuring | None:
 
 
 def _trials(folder: ExperimentFolder, setup: str) -> list[RunFolder | None]:
-    """A set-up's runs, None if there is no learnt policy."""
+    """A set-up's runs; None for a run without a learnt policy."""
     runs = [folder.run(setup, number) for number in range(folder.trials)]
     return [run if run.checkpoint.exists() else None for run in runs]
 
 
 def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """How large the mean policy's actions are, generation by generation.
+    """Size of the mean policy's actions, generation by generation.
 
     Returns:
       action: (set-ups, trials, generations) the largest of a rollout, in units of its joint's range;
@@ -142,7 +142,7 @@ class _OneFriction(FingerGait):
     """The task with the same friction in every rollout; mass, place and joint readings are perturbed as always."""
 
     factor = 1.0
-    """Of every friction coefficient."""
+    """Factor of all friction coefficients."""
 
     def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
         super()._set_conditions(sim, [replace(each, friction=self.factor) for each in drawn])
@@ -157,7 +157,7 @@ def _at_friction(policy: LoadedPolicy, factor: float) -> LoadedPolicy:
 
 
 def _success(policy: LoadedPolicy) -> float:
-    """Part of the evaluation's perturbed rollouts that succeed."""
+    """Share of the evaluation's perturbed rollouts that succeed."""
     theta = np.repeat(policy.mu[None], EVALUATION_ROLLOUTS, axis=0)
     return float(policy.runner.rollouts(theta, _drawn()).success.mean())
 

@@ -1,6 +1,6 @@
-"""What the runs of a set-up recorded, as arrays and as one compact file.
+"""The records of a set-up's runs, as arrays and as one compact file.
 
-Figures and findings come from these files alone, so that they can be had again without the runs.
+Figures and findings need only these files, so they can be made again without the runs.
 """
 
 import zipfile
@@ -20,7 +20,7 @@ from learner.run_folder import RunFolder
 COLUMNS: Final = (
     "return_mean", "mean_policy_return", "mean_policy_success", "success_rate", "sigma_mean", "mu_2", "sigma_2",
 )  # fmt: skip
-"""Quantities a generation: fields of progress.jsonl, and the second parameter's mu and sigma (thesis, figure 4.2)."""
+"""Quantities per generation: fields of progress.jsonl, and mu and sigma of the second parameter (figure 4.2)."""
 
 LEARNT: Final = 0.8
 """Robust success from which a run counts as learnt, if its last mean policy succeeds as well."""
@@ -90,18 +90,18 @@ class Series:
         return out
 
     def failures(self) -> list[str]:
-        """What has to be said of trials that did not end as they should."""
+        """Text for each trial that did not finish."""
         return [f"trial {i} {state}" for i, state in enumerate(self.states) if state != "finished"]
 
 
 def known_mean(values: FloatArray, axis: int) -> FloatArray:
-    """Mean over an axis of what is not nan; nan if there is nothing else."""
+    """Mean over an axis without nan values; nan if there are only these."""
     count = (~np.isnan(values)).sum(axis=axis)
     return np.where(count > 0, np.nansum(values, axis=axis) / np.maximum(count, 1), np.nan)
 
 
 def read(folders: Sequence[RunFolder], config: RunConfig) -> Series:
-    """The series of runs, a folder a trial; those that are missing or broken count as such."""
+    """The series of runs, one folder per trial; missing or broken runs get that state."""
     runs = [_run(folder) for folder in folders]
     generations = max([config.generations, *(len(columns["return_mean"]) for columns, _, _ in runs)])
     columns = {name: np.stack([_padded(own[name], generations) for own, _, _ in runs]) for name in COLUMNS}
@@ -125,7 +125,7 @@ def save(path: Path, series: Series) -> None:
         "final": series.final, "rollouts": np.array(series.rollouts), "seconds": series.seconds,
         "hashes": np.array(series.hashes),
     }  # fmt: skip
-    # As fine as a figure is, as far as four bytes go.
+    # Single precision is enough for figures.
     columns = {name: np.clip(values, -_MOST, _MOST).astype("<f4") for name, values in series.columns.items()}
     write_arrays(path, {**columns, **rest})
 
@@ -153,7 +153,7 @@ def load(path: Path) -> Series:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, "np.ndarray[Any, Any]"]) -> None:
-    """Write an .npz file as a whole or not at all.
+    """Write an .npz file atomically.
 
     Raises:
       RunError: it cannot be written.

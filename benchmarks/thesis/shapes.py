@@ -10,7 +10,7 @@ END_OF_START = 5
 
 
 def about(values: FloatArray, low: float, high: float) -> bool:
-    """Whether most trials are known and their median lies there."""
+    """Whether most trials have a value and their median is within these bounds."""
     known = values[~np.isnan(values)]
     return len(known) > len(values) / 2 and bool(low <= np.median(known) <= high)
 
@@ -44,7 +44,7 @@ def rise(series: Series) -> FloatArray:
 
 
 def largest_drop(series: Series) -> FloatArray:
-    """(trials,) the most that the smoothed return lost within 10 generations."""
+    """(trials,) the largest drop of the smoothed return within 10 generations."""
     out = []
     for row in first_and_best(series)[0]:
         kept = row[~np.isnan(row)]
@@ -53,6 +53,6 @@ def largest_drop(series: Series) -> FloatArray:
 
 
 def fallen(series: Series) -> BoolArray:
-    """(trials,) whether the return ended below its start, and below its best by more than half of the start's size."""
+    """(trials,) whether the return ended below its start, and below its best by more than half of |start|."""
     _, first, best = first_and_best(series)
     return np.asarray(best - series.end("return_mean") > np.maximum(best - first, 0.5 * np.abs(first)))

@@ -1,1 +1,1 @@
-"""Policies: parameters and observations to actions."""
+"""Policies: they map parameters and observations to actions."""

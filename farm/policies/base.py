@@ -14,26 +14,26 @@ from farm.tasks.base import TaskSpec
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyConfig(Settings):
-    """Settings that every policy has; a policy's own `Config` adds to them."""
+    """Settings of every policy; a policy's own `Config` adds to them."""
 
     normalise: bool = False
-    """Standardise each number of the observation by its mean and spread over all generations before."""
+    """Standardise each number of the observation by its mean and spread over all previous generations."""
 
 
 class Policy:
     """A deterministic controller for batches of B parameter vectors and observations.
 
-    A row's action must not depend on the other rows of its batch: spell sums out or run them row by row, because a
-    matrix product over a batch orders its sums by its shape.
+    A row's action must not depend on the other rows of its batch. So write sums out or compute them row by row: in a
+    matrix product over a batch the order of sums depends on the batch's size.
     """
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
-    """The policy's own settings: flags, help and config.json follow from its fields."""
+    """The policy's settings: its fields define flags, help and config.json."""
     standardised: ClassVar[bool] = False
-    """Whether its constants have `origin` and `spread` (d,) of the task's observation, measured as a run begins."""
+    """Whether its constants include `origin` and `spread` (d,) of the task's observation, measured as a run begins."""
 
     def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
-        """Take the settings, the task's sizes, and what `draw` gave."""
+        """Take the settings, the task's sizes, and the constants from `draw`."""
         self.config: Any = config
         self.spec = spec
         self.constants = constants
@@ -49,7 +49,7 @@ class Policy:
         raise NotImplementedError
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """Compute what does not change during a rollout from parameters (B, P); (B, ...)."""
+        """Compute from parameters (B, P) what is constant during a rollout, (B, ...)."""
         return theta
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -60,16 +60,16 @@ class Policy:
           x: (B, d) observations.
 
         Returns:
-          (B, A), of any size; the task says what they mean.
+          (B, A), of any magnitude; the task defines their meaning.
         """
         raise NotImplementedError
 
 
 def check_constants(constants: Mapping[str, FloatArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Check that a run's constants fit its task.
+    """Check that a run's constants have these shapes.
 
     Raises:
-      UnservedError: one is missing or has another shape.
+      UnservedError: one is missing or has a different shape.
     """
     for name, shape in shapes.items():
         if name not in constants or constants[name].shape != shape:

@@ -1,4 +1,4 @@
-"""Controllers on random Fourier features (thesis 3.2 and 3.5.4), and the kernel they approximate. Pure, batched.
+"""Controllers with random Fourier features (thesis 3.2 and 3.5.4), and the kernel they approximate. Pure, batched.
 
 One action a_i for each of A controlled joints or actuators:
 
@@ -9,7 +9,8 @@ One action a_i for each of A controlled joints or actuators:
 
     z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
 
-Numpy's exp and cos depend on the processor: these are the C library's, number by number, and `farm/elementary.py`'s.
+Numpy's exp and cos depend on the processor. So the kernel uses the C library's exp, and the features the cos of
+`farm/elementary.py`.
 """
 
 import math
@@ -36,7 +37,7 @@ class KernelConfig(PolicyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class FeaturesConfig(KernelConfig):
-    """Settings of controllers on random features."""
+    """Settings of controllers with random features."""
 
     features: int = setting(8000, least=1, most=10_000_000)
     """Number of random Fourier features, D."""
@@ -62,7 +63,7 @@ class Kernel(Policy):
             difference = np.ascontiguousarray(prepared) - np.ascontiguousarray(x)[:, None, :]
             squares = (difference * difference).sum(axis=-1)
         exponents = squares * (-0.5 / self.config.bandwidth**2)
-        # Number by number: of the few that one step has, numpy's calls for `elementary.exp` would take longer.
+        # Number by number: a step has only a few, for which the numpy calls of `elementary.exp` would take longer.
         return np.fromiter(map(math.exp, exponents.ravel().tolist()), float, exponents.size).reshape(exponents.shape)
 
 
@@ -76,7 +77,7 @@ class Direct(Policy):
         super().__init__(config, spec, constants)
         count = self.config.features
         check_constants(constants, {"frequencies": (count, spec.observation), "phases": (count,)})
-        # One contiguous row for each number of x: W x is then d multiply-adds of (D,) vectors, in order.
+        # One contiguous row per number of x: W x is then d multiply-adds of (D,) vectors, in order.
         self._rows = np.ascontiguousarray((constants["frequencies"] / self.config.bandwidth).T)
         self._scale = np.sqrt(2.0 / count)
 
@@ -98,7 +99,7 @@ class Direct(Policy):
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions; may be huge or not finite."""
-        weights = np.ascontiguousarray(prepared)  # sums of another memory order would round differently
+        weights = np.ascontiguousarray(prepared)  # a different memory order would change the rounding of sums
         with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([(w * self.features(row)).sum(axis=-1) for w, row in zip(weights, x, strict=True)])
 

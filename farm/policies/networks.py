@@ -1,12 +1,13 @@
-"""Controllers that are networks: linear, and a multilayer perceptron; and none at all. Pure, batched.
+"""Linear and neural network controllers, and a constant action for comparison. Pure, batched.
 
     constant  a = b
     linear    a = W x + b
     mlp       h_1 = tanh(W_1 x + b_1), ..., h_L = tanh(W_L h_(L-1) + b_L), a = W h_L + b
               (Rumelhart, Hinton & Williams 1986, Learning representations by back-propagating errors)
 
-Parameters are the layers one behind the other, each the rows (W_i, b_i) of its units. A unit's sum runs over its own
-row, in an order that the row's length decides alone; tanh is `farm/elementary.py`'s. Neither depends on the batch.
+Parameters are the layers one after another, each with one row (W_i, b_i) per unit. A unit's sum runs over its own row,
+in an order that depends only on the row's length; tanh is that of `farm/elementary.py`. So no result depends on the
+batch.
 """
 
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ class MlpConfig(PolicyConfig):
     """Settings of the multilayer perceptron."""
 
     layers: tuple[int, ...] = (32, 32)
-    """Units of each hidden layer, first to last; the flag is repeated."""
+    """Units of each hidden layer, first to last; repeat the flag for each layer."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -71,20 +72,20 @@ class Linear(Policy):
         for inputs, units in pairwise(self._sizes):
             end = first + units * (inputs + 1)
             rows = theta[:, first:end].reshape(len(theta), units, inputs + 1)
-            # Sums of another memory order would round differently.
+            # A different memory order would change the rounding of sums.
             yield np.ascontiguousarray(rows[:, :, :-1]), rows[:, :, -1]
             first = end
 
 
 class Constant(Linear):
-    """The same action always, whatever is observed; a controller that sees the state should beat it."""
+    """The same action for every observation: a baseline that a controller with feedback should beat."""
 
     @property
     def _sizes(self) -> tuple[int, ...]:
         return 0, self.spec.action
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
-        """Actions, the parameters."""
+        """Actions: the parameters."""
         return super().act(prepared, x[:, :0])
 
 

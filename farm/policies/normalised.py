@@ -1,4 +1,4 @@
-"""A policy that sees standardised observations."""
+"""A policy whose observations are standardised."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from farm.policies.base import Policy
 
 
 class Normalised(Policy):
-    """Wraps another policy, which gets (x - mean) / standard deviation of the observation x, number by number."""
+    """Wraps a policy, which then gets (x - mean) / standard deviation for each number of the observation x."""
 
     def __init__(self, policy: Policy, normaliser: FloatArray) -> None:
         """Take the policy, and mean and standard deviation (2, d)."""
@@ -21,7 +21,7 @@ class Normalised(Policy):
         return self._policy.size
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """What the wrapped policy prepares."""
+        """The result of the wrapped policy's `prepare`."""
         return self._policy.prepare(theta)
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:

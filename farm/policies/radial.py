@@ -4,12 +4,12 @@
                        K (d + A) parameters (Broomhead & Lowe 1988, Multivariable functional interpolation and
                        adaptive networks); the centres c_k serve all actions
     weighted-kernel    a_i = w_i exp(-|theta_i - y|^2 / (2 h^2)),  y = (x - m) / s,  h = width sqrt(d)
-                       A (d + 1) parameters (ours): the kernel controller, with a sign and in units of its own task
+                       A (d + 1) parameters (ours): the kernel controller with a sign, in units of the observation
 
 m is the observation at the nominal start and s its spread (`farm/tasks/standard.py`). In these units a search that
-begins with theta = 0, w = 0 and one spread for all parameters suits any task: w = scale v, and v is what is searched.
+begins with theta = 0, w = 0 and the same sigma for all parameters suits any task; it searches v in w = weight_scale v.
 
-A sum runs over its own row, in an order that the row's length decides alone; exp is `farm/elementary.py`'s.
+A sum runs over its own row, in an order that depends only on the row's length; exp is that of `farm/elementary.py`.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ class RbfConfig(PolicyConfig):
     centres: int = setting(8, least=1, most=100_000)
     """Number of radial functions, K."""
     bandwidth: float = setting(1.0, above=0.0)
-    """Width h of each, in units of the observation."""
+    """Width h of each function, in units of the observation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ class WeightedKernel(Policy):
     standardised: ClassVar[bool] = True
 
     def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
-        """Take m and s."""
+        """Take the settings, the task's sizes, and the constants m (`origin`) and s (`spread`)."""
         super().__init__(config, spec, constants)
         check_constants(constants, {"origin": (spec.observation,), "spread": (spec.observation,)})
         self._bandwidth = self.config.width * np.sqrt(spec.observation)

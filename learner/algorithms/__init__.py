@@ -1,4 +1,4 @@
-"""Learning algorithms: pure ask and tell on frozen states."""
+"""Learning algorithms: pure functions `ask` and `tell` on immutable states."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ State = TypeVar("State", bound=SearchState)
 
 @runtime_checkable
 class Algorithm(Protocol[State]):
-    """A configuration that learns: a frozen, keyword-only dataclass; everything that changes is in the state.
+    """An algorithm and its settings: a frozen, keyword-only dataclass; everything that changes is in the state.
 
-    Its fields become flags and a table of config.json, so their names must be no other setting's, nor `name`.
+    Its fields become flags and a table of config.json, so no other setting may have their names; `name` is reserved.
     """
 
-    if TYPE_CHECKING:  # `dataclasses.replace` asks for it; at run time a protocol of methods alone can be checked
+    if TYPE_CHECKING:  # `dataclasses.replace` needs it; isinstance works only for protocols of methods alone
         __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def signs(self) -> tuple[int, ...]:
-        """Rollouts of a row of eps: (1, -1) for mu + eps and mu - eps, (1,) for mu + eps alone."""
+        """Signs of eps in the rollouts of a row: (1, -1) for mu + eps and mu - eps, (1,) for mu + eps alone."""
         ...
 
     def init(self, size: int) -> State:
@@ -36,7 +36,7 @@ class Algorithm(Protocol[State]):
         ...
 
     def restore(self, values: Mapping[str, StateValue]) -> State:
-        """Return the state that its `to_dict` gave; a ValueError names a wrong key."""
+        """Return the state from which `to_dict` made these values; a ValueError names a wrong key."""
         ...
 
     def ask(self, state: State, rng: np.random.Generator) -> FloatArray:
@@ -44,5 +44,5 @@ class Algorithm(Protocol[State]):
         ...
 
     def tell(self, state: State, eps: FloatArray, returns: FloatArray) -> State:
-        """Return the state after one update, from returns (rows, signs); Diverged when it would not be finite."""
+        """Return the state after one update, from returns (rows, signs); raises Diverged if it would not be finite."""
         ...

@@ -3,8 +3,8 @@
     delta_n ~ N(0, I), n = 1..N;   r(+-,n) = return of mu +- nu delta_n
     mu += alpha / (b sigma_R) sum of (r(+,n) - r(-,n)) delta_n, over the b directions of the largest max(r(+,n), r(-,n))
 
-sigma_R is the standard deviation of these 2b returns. nu, here the state's sigma, never changes. With `--normalise` it
-is the paper's V2-t, without it V1-t. Shapes: P parameters, N pairs. Sums run over the directions in order, never
+sigma_R is the standard deviation of these 2b returns. nu, here the state's sigma, never changes. With `--normalise`
+this is the paper's V2-t, otherwise V1-t. Shapes: P parameters, N pairs. Sums run over the directions in order, never
 through BLAS.
 """
 
@@ -22,7 +22,7 @@ from learner.algorithms.state import SearchState, finite_rows, moved
 
 @dataclass(frozen=True, kw_only=True)
 class ARS(Mirrored):
-    """Augmented random search: steps along the best of random directions (Mania 2018)."""
+    """Augmented random search: steps along the best random directions (Mania 2018)."""
 
     pairs: int = setting(16, least=1)
     """Directions per generation, N; each is a pair of rollouts."""
@@ -40,11 +40,11 @@ class ARS(Mirrored):
             raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")
 
     def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
-        """Return the state after one update; if all used returns are equal, mu stays.
+        """Return the state after one update; if all used returns are equal, mu does not move.
 
         Args:
           state: the state `eps` was drawn from.
-          eps: what `ask` gave, (N, P).
+          eps: from `ask`, (N, P).
           returns: (N, 2), columns (+, -); all finite.
 
         Raises:

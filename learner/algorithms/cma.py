@@ -1,12 +1,12 @@
-"""CMA-ES and its separable form, by the library `cmaes` (Shibata). The door to it.
+"""CMA-ES and its separable form, by the library `cmaes` (Shibata). Only this module imports it.
 
 Hansen 2016, The CMA evolution strategy: a tutorial; Ros & Hansen 2008, A simple modification in CMA-ES achieving linear
 time and space complexity. The search distribution is N(mu, step^2 C): C is any covariance matrix, or a diagonal one.
 
-The library's object lives for one call: it is made from our state, which is arrays alone, asked or told, and read. Its
-products are BLAS's, its eigenvectors LAPACK's and its exponential numpy's, so that the last bits depend on the
-learner's kind of processor and its BLAS threads, unlike those of all other algorithms here. On one machine a run
-repeats, and is resumed, bit by bit; workers make no difference.
+The library's object exists for one call: it is made from our state, which consists of arrays, used, and read back. It
+uses BLAS, LAPACK and numpy's exponential, so the last bits depend on the learner's processor and its number of BLAS
+threads, unlike with all other algorithms here. On one machine a run can be repeated and resumed bit by bit; workers
+make no difference.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ _LARGEST: Final = 1000  # parameters with a full covariance: its update takes po
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CMAState(SearchState):
-    """The search distribution, and the paths that its covariance follows; sigma is step sqrt(diag C)."""
+    """The search distribution and its evolution paths; sigma is step sqrt(diag C)."""
 
     step: FloatArray
     """Step size, (1,)."""
@@ -66,7 +66,7 @@ class CMAES(Settings):
         """Return the state before the first generation, of `size` parameters.
 
         Raises:
-          ConfigError: cmaes is not installed, or does not do with so many parameters.
+          ConfigError: cmaes is not installed, or does not support this number of parameters.
         """
         least, most = self._sizes()
         if not least <= size <= most:
@@ -75,7 +75,7 @@ class CMAES(Settings):
         return CMAState(**self._read(begun))
 
     def restore(self, values: Mapping[str, StateValue]) -> CMAState:
-        """Return the state that `to_dict` gave."""
+        """Return the state from which `to_dict` made these values."""
         state = CMAState.from_dict(values)
         if state.covariance.size != self._entries(state.mu.size):
             raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self._name} does not have")
@@ -92,7 +92,7 @@ class CMAES(Settings):
 
         Args:
           state: the state `eps` was drawn from.
-          eps: what `ask` gave, (population, P).
+          eps: from `ask`, (population, P).
           returns: (population, 1); all finite.
 
         Raises:
@@ -150,11 +150,11 @@ class CMAES(Settings):
 
     @property
     def _covariance(self) -> str:
-        """The library's name of what we keep of C."""
+        """The library's attribute that holds C as it is stored here."""
         return "_c_1d"
 
     def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:
-        """Variances, (P,), of what we keep of C."""
+        """Variances, (P,), from the stored form of C."""
         return covariance[np.cumsum([0, *range(size, 1, -1)])]
 
 

@@ -1,8 +1,8 @@
-"""PGPE's equations: how much each row of eps counts, and the weighted sums over the rows.
+"""PGPE's equations: the weight of each row of eps, and the weighted sums over the rows.
 
 Shapes: P parameters; eps (R, P) and returns (R, 2) with columns (+, -) for pairs, (R, 1) for
-single rollouts. Sums run over the rows in index order and never through BLAS, so the same results
-give the same bits on any number of threads.
+single rollouts. Sums run over the rows in index order and never through BLAS, so the bits do not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def middle_returns(returns: FloatArray) -> FloatArray:
 
 
 def pair_contrast(returns: FloatArray, best: float, normaliser: Normaliser) -> FloatArray:
-    """r_T, what a pair says about mu: (N, 2) -> (N,) (Sehnke 2010, algorithm 1, symmetric).
+    """r_T, the weight of a pair in the step of mu: (N, 2) -> (N,) (Sehnke 2010, algorithm 1, symmetric).
 
-    sehnke: (r+ - r-) / (2m - r+ - r-). Derived from ((r+ - r-)/2) / (m - (r+ + r-)/2), as the
-    authors' own code has it: within [-1, 1], the same when all returns are shifted or scaled.
+    sehnke: (r+ - r-) / (2m - r+ - r-), from ((r+ - r-)/2) / (m - (r+ + r-)/2) as in the authors'
+    code: within [-1, 1], and unchanged when all returns are shifted or scaled.
     thesis: (r+ - r-) / (m - r+ - r-), as printed by Plage 2016, algorithm 1. The print lacks a
-    factor 2: its sign turns where r+ + r- passes m, which negative returns happen to avoid.
+    factor 2: its sign flips where r+ + r- exceeds m; negative returns happen to avoid that.
 
-    r+ = r- moves nothing, nor does a vanishing denominator.
+    The weight is 0 if r+ = r- or if the denominator is 0.
     """
     plus, minus = returns[:, 0], returns[:, 1]
     # 2m - r+ - r- in the order that keeps |r_T| <= 1 in floating point too.
@@ -52,10 +52,10 @@ def pair_contrast(returns: FloatArray, best: float, normaliser: Normaliser) -> F
 
 
 def baseline_contrast(middle: FloatArray, baseline: float, best: float) -> FloatArray:
-    """r_S = (r - b) / (m - b), what a row says about sigma: (R,) -> (R,).
+    """r_S = (r - b) / |m - b|, the weight of a row in the step of sigma: (R,) -> (R,).
 
-    Sehnke 2010, algorithm 1. A baseline made of returns has m >= b. Without one, b = 0, negative
-    returns would make m - b negative and so favour the worst; hence its size. m = b moves nothing.
+    Sehnke 2010, algorithm 1. A baseline computed from returns has m >= b. Without a baseline, b = 0, negative
+    returns would make m - b negative and so favour the worst; hence |m - b|. The weight is 0 if m = b.
     """
     if level(best, baseline):
         return np.zeros_like(middle)
@@ -70,12 +70,12 @@ def plain_contrast(middle: FloatArray, baseline: float) -> FloatArray:
 
 
 def level(best: float, baseline: float) -> bool:
-    """Whether m = b up to the rounding of b; then (r - b) / (m - b) would be only noise."""
+    """Whether m = b up to the rounding of b; then (r - b) / (m - b) would be noise."""
     return abs(best - baseline) <= _ROUNDING * max(abs(best), abs(baseline))
 
 
 def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Divide; the result is 0 if either vanishes."""
+    """Divide; the result is 0 if numerator or denominator is 0."""
     wanted = (numerator != 0.0) & (denominator != 0.0)
     return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=wanted)
 
@@ -85,18 +85,18 @@ def optimal_baseline(middle: FloatArray, eps: FloatArray, sigma: FloatArray) -> 
 
     g_n = |grad_(mu, sigma) log p(theta_n)|^2 with grad_mu = eps/sigma^2 and grad_sigma =
     (eps^2 - sigma^2)/sigma^3, here in z = eps/sigma: sum_i (z_i^2 + (z_i^2 - 1)^2) / sigma_i^2.
-    Both rollouts of a pair have the same g, so its mean return stands for both.
+    Both rollouts of a pair have the same g, so the pair enters with its mean return.
     """
     square = (eps / sigma) ** 2
     weights = ((square + (square - 1.0) ** 2) / (sigma * sigma)).sum(axis=1)
-    total = float(weights.sum())  # positive: z = 0 and z = 1 do not meet
+    total = float(weights.sum())  # positive: z^2 and (z^2 - 1)^2 are never both 0
     return float((middle * weights).sum()) / total
 
 
 def centred_ranks(returns: FloatArray) -> FloatArray:
     """Replace every return by its rank, over all rollouts, spread evenly over [-0.5, 0.5].
 
-    Equal returns share the mean of their ranks, so they have no contrast. Any shape; the same out.
+    Equal returns get the mean of their ranks, so they do not differ. Any shape; returns the same shape.
     """
     _, where, counts = np.unique(returns.ravel(), return_inverse=True, return_counts=True)
     ranks = np.cumsum(counts) - counts + (counts - 1) / 2.0

@@ -1,4 +1,4 @@
-"""What searches by mirrored samples have in common: N pairs mu + eps and mu - eps, eps ~ N(0, diag(sigma^2)).
+"""Base class of algorithms with mirrored samples: N pairs mu + eps and mu - eps, eps ~ N(0, diag(sigma^2)).
 
 Shapes: P parameters, N pairs.
 """
@@ -15,7 +15,7 @@ from learner.algorithms.state import SearchState, StateValue
 
 @dataclass(frozen=True, kw_only=True)
 class Mirrored(Settings):
-    """The configuration is the algorithm: `init` a state, `ask` for eps, `tell` the returns (a subclass's)."""
+    """Settings and methods `init` and `ask`; subclasses add `tell`."""
 
     pairs: int = setting(16, least=1)
     """Pairs of rollouts per generation, N."""
@@ -33,7 +33,7 @@ class Mirrored(Settings):
         return SearchState(mu=np.full(size, float(self.initial_mu)), sigma=np.full(size, float(self.initial_sigma)))
 
     def restore(self, values: Mapping[str, StateValue]) -> SearchState:
-        """Return the state that `to_dict` gave."""
+        """Return the state from which `to_dict` made these values."""
         return SearchState.from_dict(values)
 
     def ask(self, state: SearchState, rng: np.random.Generator) -> FloatArray:

@@ -1,7 +1,7 @@
-"""How a gradient moves mu (sgd, ClipUp, Adam) and sigma (three rules); all of them ascend.
+"""Steps of mu (ClipUp, Adam) and sigma (three rules) along a gradient; all of them ascend.
 
-Shapes: every array is (P,). Pure functions: what they remember comes in and goes out. Norms are
-written as plain sums, because BLAS may add in another order with another number of threads.
+Shapes: every array is (P,). Pure functions: their memory is an argument and a result. Norms are
+plain sums, because the order of sums in BLAS may depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def adam(
     learning_rate: float,
     decays: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return Adam's step and its two moments (Kingma & Ba 2015, algorithm 1); count is from 1."""
+    """Return Adam's step and its two moments (Kingma & Ba 2015, algorithm 1); `count` starts at 1."""
     first = decays[0] * moments[0] + (1.0 - decays[0]) * gradient
     second = decays[1] * moments[1] + (1.0 - decays[1]) * (gradient * gradient)
     mean = first / (1.0 - decays[0] ** count)
@@ -64,7 +64,7 @@ def adam(
 
 
 def step_sigma(sigma: FloatArray, step: FloatArray, rule: SigmaRule, *, cap: float, floor: float) -> FloatArray:
-    """Add a step to sigma; `capped` allows at most cap * sigma of it, the floor holds always."""
+    """Add a step to sigma; `capped` limits it to cap * sigma. The result is never below the floor."""
     if rule == "capped":
         step = np.clip(step, -cap * sigma, cap * sigma)
     return np.maximum(sigma + step, floor)

@@ -1,8 +1,8 @@
-"""PGPE, policy gradients with parameter-based exploration, as ask and tell on a frozen state.
+"""PGPE, policy gradients with parameter-based exploration, as `ask` and `tell` on an immutable state.
 
 Rollouts of theta = mu + eps and mu - eps are compared, and mu and sigma follow the better one
 (Sehnke 2010; Plage 2016, algorithm 1). The defaults are the paper's rule as the thesis states it;
-ranks with ClipUp (Toklu 2020) or Adam are the modern one. Shapes: P parameters, N pairs.
+ranks with ClipUp (Toklu 2020) or Adam are the modern variant. Shapes: P parameters, N pairs.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _empty() -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PGPEState(SearchState):
-    """The search distribution, and what the optimiser of mu remembers."""
+    """The search distribution, and the memory of the optimiser of mu."""
 
     velocity: FloatArray = field(default_factory=_empty)
     """ClipUp's velocity, (P,), or empty if it is not used."""
@@ -113,7 +113,7 @@ class PGPE(Settings):
         return PGPEState(mu=mu, sigma=sigma, baseline=None, best=None, generation=0, **memory)
 
     def restore(self, values: Mapping[str, StateValue]) -> PGPEState:
-        """Return the state that `to_dict` gave, checked against this configuration."""
+        """Return the state from which `to_dict` made these values; a ValueError if it does not fit these settings."""
         state = PGPEState.from_dict(values)
         self._check_memory(state)
         return state
@@ -121,17 +121,17 @@ class PGPE(Settings):
     def ask(self, state: PGPEState, rng: np.random.Generator) -> FloatArray:
         """Draw eps ~ N(0, diag(sigma^2)): (N, P) for pairs, (2N, P) for single rollouts.
 
-        The thesis prints eps ~ N(mu, I sigma^2), and theta- = mu eps without its minus; around mu
-        it has to be N(0, .), with theta+ = mu + eps and theta- = mu - eps.
+        The thesis prints eps ~ N(mu, I sigma^2), and theta- = mu eps without the minus. With theta+ = mu + eps
+        and theta- = mu - eps it must be N(0, .).
         """
         return state.sigma * rng.standard_normal((self.returns_shape[0], state.mu.size))
 
     def tell(self, state: PGPEState, eps: FloatArray, returns: FloatArray) -> PGPEState:
-        """Return the state after one update; the given one stays as it is.
+        """Return the state after one update; the given state is not changed.
 
         Args:
             state: the state `eps` was drawn from.
-            eps: what `ask` gave, (N, P) or (2N, P).
+            eps: from `ask`, (N, P) or (2N, P).
             returns: `returns_shape`, row n belongs to eps[n]; all finite.
 
         Raises:
@@ -145,13 +145,13 @@ class PGPE(Settings):
         best = float(returns.max()) if state.best is None else max(state.best, float(returns.max()))
         with np.errstate(all="ignore"):
             to_mu, to_sigma, baseline = self._factors(state, eps, returns, best)
-            # The thesis prints mu + alpha S r_T; it has to be T r_T with T_ij = eps_i^j.
+            # The thesis prints mu + alpha S r_T; it must be T r_T with T_ij = eps_i^j.
             gradient_mu = weighted_sum(to_mu, eps)
             gradient_sigma = weighted_sum(to_sigma, sigma_characteristic(eps, state.sigma))
             if self.shaping == "ranks":  # a mean; the paper's rule does not divide by N
                 gradient_mu, gradient_sigma = gradient_mu / rows, gradient_sigma / rows
             moved = self._moved(state, gradient_mu, gradient_sigma)
-            length = np.sqrt((moved["mu"] * moved["mu"]).sum())  # whoever reports it has to be able to
+            length = np.sqrt((moved["mu"] * moved["mu"]).sum())  # reports contain it, so it must be finite
         for value in (gradient_mu, gradient_sigma, *moved.values(), length, baseline or 0.0):
             if not np.isfinite(value).all():
                 raise Diverged(f"the update after generation {state.generation} is not finite")
@@ -161,7 +161,7 @@ class PGPE(Settings):
     def _factors(
         self, state: PGPEState, eps: FloatArray, returns: FloatArray, best: float
     ) -> tuple[FloatArray, FloatArray, float | None]:
-        """Return what each row counts for mu and for sigma, (R,) each, and the next baseline."""
+        """Return each row's weights for mu and for sigma, (R,) each, and the next baseline."""
         if self.shaping == "ranks":
             ranks = centred_ranks(returns)
             to_sigma, baseline = middle_returns(ranks), None
@@ -191,7 +191,7 @@ class PGPE(Settings):
         return to_mu, to_sigma, following
 
     def _baselines(self, state: PGPEState, eps: FloatArray, middle: FloatArray) -> tuple[float, float | None]:
-        """Return the baseline of this update and the one to remember."""
+        """Return the baseline of this update and the one to store."""
         if self.baseline == "none":
             return 0.0, None
         if self.baseline == "optimal":
@@ -229,7 +229,7 @@ class PGPE(Settings):
         return {"mu": mu, "sigma": sigma, "first_moment": first, "second_moment": second}
 
     def _memory(self) -> tuple[str, ...]:
-        """Name the state's arrays that this optimiser keeps."""
+        """Names of the state's arrays that this optimiser uses."""
         kept = {"sgd": (), "clipup": ("velocity",), "adam": ("first_moment", "second_moment")}
         return kept[self.optimiser]
 

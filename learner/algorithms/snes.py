@@ -3,7 +3,7 @@
 Wierstra, Schaul, Glasmachers, Sun, Peters & Schmidhuber 2014, Natural evolution strategies, algorithm 6.
 
     s_k ~ N(0, I),  theta_k = mu + sigma s_k,  k = 1..2N: pairs s and -s
-    u_k = max(0, ln(N + 1) - ln(rank of k)) / sum of these - 1 / 2N    (rank 1 is the best; equal returns share theirs)
+    u_k = max(0, ln(N + 1) - ln(rank of k)) / sum of these - 1 / 2N    (rank 1 is the best; ties get their mean u)
     mu    += eta_mu sigma sum_k u_k s_k
     sigma *= exp(eta_sigma / 2 sum_k u_k (s_k^2 - 1)),   eta_mu = 1, eta_sigma = (3 + ln P) / (5 sqrt(P))
 
@@ -42,7 +42,7 @@ class SNES(Mirrored):
 
         Args:
           state: the state `eps` was drawn from.
-          eps: what `ask` gave, (N, P).
+          eps: from `ask`, (N, P).
           returns: (N, 2), columns (+, -); all finite.
 
         Raises:
@@ -65,12 +65,12 @@ class SNES(Mirrored):
 
 
 def utilities(returns: FloatArray) -> FloatArray:
-    """The weight of each return by its rank, any shape; they add up to 0, and equal returns have equal ones."""
+    """Weights of returns by rank, any shape; they add up to 0, and equal returns have equal weights."""
     flat = returns.ravel()
     count = flat.size
     logs = [max(0.0, math.log(count / 2.0 + 1.0) - math.log(rank)) for rank in range(1, count + 1)]
     by_rank = np.array(logs) / math.fsum(logs) - 1.0 / count
-    _, group, sizes = np.unique(-flat, return_inverse=True, return_counts=True)  # the best is the first
+    _, group, sizes = np.unique(-flat, return_inverse=True, return_counts=True)  # the best comes first
     ends = np.cumsum(sizes)
     shared = np.array([math.fsum(by_rank[end - n : end]) / n for end, n in zip(ends, sizes, strict=True)])
     return shared[group.ravel()].reshape(returns.shape)

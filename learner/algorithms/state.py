@@ -1,7 +1,7 @@
-"""What an algorithm stores between two generations: frozen, checked, and given to a checkpoint as a dict.
+"""The state of an algorithm between two generations: immutable, checked, and stored in checkpoints as a dict.
 
-Shapes: P is the number of parameters. Every array is float64 and read-only, so a state that was
-handed to the algorithm, the recorder or a checkpoint is the same afterwards.
+Shapes: P is the number of parameters. Every array is float64 and read-only, so neither the
+algorithm nor the recorder can change a state.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _FIGURES: Final = ("baseline", "best", "generation")  # all other fields are vec
 
 
 class Diverged(ArithmeticError):  # noqa: N818  it says what happened
-    """An update would have made the state non-finite; the state before it is untouched."""
+    """An update would make the state non-finite; the previous state is unchanged."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchState:
-    """The search distribution N(mu, diag(sigma^2)) and the running figures around it.
+    """The search distribution N(mu, diag(sigma^2)), baseline, best return and generation.
 
-    Learner, recorder and checkpoint know no more of any algorithm. One that remembers more adds fields of its own in
-    a subclass: vectors, (P,), or empty where they are not used.
+    Learner, recorder and checkpoint need only these fields. An algorithm that stores more adds fields in a subclass:
+    vectors (P,), or empty ones if they are not used.
     """
 
     mu: FloatArray
@@ -38,7 +38,7 @@ class SearchState:
     sigma: FloatArray
     """Standard deviation of each parameter, (P,), positive."""
     baseline: float | None = None
-    """Return that counts as neither good nor bad; None until a generation has set it, or if there is none."""
+    """Return that counts as neither good nor bad; None before the first generation, or if it is not used."""
     best: float | None = None
     """Best return so far over the whole run (m); None before the first generation."""
     generation: int = 0
@@ -60,7 +60,7 @@ class SearchState:
 
     @classmethod
     def _vectors(cls) -> list[str]:
-        """Names of the fields that are vectors: mu, sigma, then a subclass' own."""
+        """Names of the fields that are vectors: mu, sigma, then those of a subclass."""
         return [each.name for each in fields(cls) if each.name not in _FIGURES]
 
     def _check_sizes(self) -> None:
@@ -74,12 +74,12 @@ class SearchState:
                 raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {found}")
 
     def to_dict(self) -> dict[str, StateValue]:
-        """Give every field by its name, for a checkpoint; `from_dict` takes it back bit by bit."""
+        """Every field by its name, for a checkpoint; `from_dict` restores the same bits."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @classmethod
     def from_dict(cls: type[S], values: Mapping[str, StateValue]) -> S:
-        """Build the state that `to_dict` gave.
+        """Build the state from which `to_dict` made these values.
 
         Raises:
             ValueError: a key is missing or unknown, or its value has a wrong type, shape or range;
@@ -94,7 +94,7 @@ class SearchState:
 
 
 def _read_only(name: str, value: object) -> FloatArray:
-    """Return an own, read-only copy of a finite float64 vector."""
+    """Return a read-only copy of a finite float64 vector."""
     if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.ndim != 1:
         found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else repr(value)
         raise ValueError(f"state: {name} must be a float64 vector, not {found}")
@@ -115,7 +115,7 @@ def _scalar(name: str, value: object) -> float | None:
 
 
 def moved(state: S, returns: FloatArray, **arrays: FloatArray) -> S:
-    """The next state: some of its arrays are new, and the best of these returns is noted.
+    """The next state: with these arrays replaced, and the best return updated.
 
     Raises:
       Diverged: an array is not finite, or a sigma is not positive.
@@ -128,7 +128,11 @@ def moved(state: S, returns: FloatArray, **arrays: FloatArray) -> S:
 
 
 def finite_rows(name: str, array: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Return the array in C order, so that sums over its rows run in index order."""
+    """Return the array in C order, so that sums over its rows run in index order.
+
+    Raises:
+      ValueError: the shape is wrong, or a value is not finite.
+    """
     array = np.ascontiguousarray(array, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} has the shape {array.shape}, expected {shape}")

@@ -1,1 +1,1 @@
-"""Which job of a round is where, over workers that come and go; pure."""
+"""Hands a round's jobs to workers that may join and leave, and collects the results."""

@@ -1,9 +1,9 @@
-"""Spot checks: some jobs of a round are done by a second host as well. Pure: time is an argument [s].
+"""Spot checks: a second host repeats some jobs of a round. Pure: time is an argument [s].
 
-Honest hosts of one run give the same bits; where machines of different numbers are mixed, those of one kind do, and
-devices are not checked. Two answers to a job that differ mean that one of the hosts is broken or lies, and a third
-host's answer says which. Which jobs are checked depends on the round, the indices and the returns,
-never on the clock; that they are checked changes no number.
+Honest hosts return the same bits for the same job. In a mixed run this holds only for machines of one kind, so only
+these are compared; devices are not checked. If two answers to a job differ, one of the hosts is broken or lies, and
+a third host's answer decides which. The choice of jobs depends on the round, the indices and the returns, never on
+the clock. Checks do not change any result.
 """
 
 from collections import Counter
@@ -17,7 +17,7 @@ from learner.scheduler.round import RoundResults
 
 
 class _Party(NamedTuple):
-    """A host's workers whose numbers are of one kind."""
+    """The workers of a host that round in the same way: they have the same canary."""
 
     host: str
     canary: str
@@ -29,12 +29,12 @@ class _Check:
     passed: set[str] = field(default_factory=set)
     """Workers that were asked and did not answer in time."""
     asked: str = ""
-    """The worker that is asked now."""
+    """The worker that has been asked and may still answer; empty if there is none."""
     since: float = 0.0
 
 
 def host(worker: str) -> str:
-    """The name that a worker's processes share."""
+    """The part of a worker's name that all workers of its host share."""
     return worker.partition("/")[0]
 
 
@@ -42,11 +42,11 @@ class Audit:
     """The spot checks of one round after another."""
 
     def __init__(self, part: float, canary: Callable[[str], str] | None = None) -> None:
-        """Check this part of the jobs, 0 to 1; 0: none at all.
+        """Start without a round.
 
         Args:
-          part: of the jobs.
-          canary: of a worker's numbers, empty for a device; None: all workers' numbers are the same.
+          part: share of the jobs to check, 0 to 1; 0: none.
+          canary: returns the digest of a worker's rounding, empty for a device; None: all workers round alike.
         """
         self._part, self._round, self._best = part, -1, -np.inf
         self._canary = canary or (lambda _: "one")
@@ -54,9 +54,9 @@ class Audit:
         self.begin(0)
 
     def begin(self, jobs: int) -> None:
-        """A round of so many jobs."""
+        """Start a round with this number of jobs."""
         self._round += 1
-        # Place in self._parties of the host whose answer counts; -1: a host that is not checked.
+        # For each job the index in self._parties of the party whose answer was accepted; -1: not checked.
         self._by = np.full(jobs, -1)
         self._checks: dict[int, _Check] = {}
         self._agreed: set[int] = set()
@@ -68,7 +68,7 @@ class Audit:
         return self._part > 0
 
     def counted(self, worker: str, indices: np.ndarray) -> None:
-        """These answers of a worker are the ones that count; a device's are not checked."""
+        """Note that this worker's answers to these jobs were accepted; a device's answers are not checked."""
         party = self._party(worker)
         if not party.canary:
             return
@@ -77,7 +77,7 @@ class Audit:
         self._by[indices] = self._parties.index(party)
 
     def passed(self, results: RoundResults, workers: Sequence[str]) -> bool:
-        """Whether the round, all of whose jobs are done, needs no further answer; chooses what to check at first."""
+        """Whether a round with all jobs done needs no further checks; the first call chooses the jobs to check."""
         if self.on and not self._chosen and len({host(worker) for worker in workers}) > 1:
             self._chosen = True
             for index in self._choose(results):
@@ -89,7 +89,7 @@ class Audit:
         return True
 
     def answered(self, worker: str, index: int, first: bytes, second: bytes) -> bool:
-        """Another answer to a job that is done; return whether it was asked for, not given to two workers anyway."""
+        """Take another answer to a job that is done; return whether a check had asked this worker for it."""
         party, known = self._party(worker), self._checks.get(index)
         asked = known is not None and known.asked == worker
         if not self.on or self._by[index] < 0 or (known is None and first == second):
@@ -103,7 +103,7 @@ class Audit:
         return asked
 
     def settle(self) -> dict[str, int]:
-        """Close the checks in which two hosts agree; who said something else, and at which job."""
+        """Close the checks in which two hosts agree; return each host that disagreed, and the job."""
         liars: dict[str, int] = {}
         for index, check in list(self._checks.items()):
             answer, agree = Counter(check.answers.values()).most_common(1)[0]
@@ -114,7 +114,7 @@ class Audit:
         return liars
 
     def expel(self, name: str) -> list[int]:
-        """A host's answers count no longer; its jobs of this round, to be done again."""
+        """Discard a host's answers; return its jobs of this round, which must be repeated."""
         theirs = [at for at, party in enumerate(self._parties) if party.host == name]
         jobs = np.flatnonzero(np.isin(self._by, theirs)).tolist()
         self._by[jobs] = -1
@@ -127,13 +127,16 @@ class Audit:
         return jobs
 
     def lost(self, worker: str) -> None:
-        """A worker is gone, or holds nothing any more: what it was asked is asked of another."""
+        """A worker has left, or is idle: its checks go to a different worker."""
         for check in self._checks.values():
             if check.asked == worker:
                 check.asked = ""
 
     def assign(self, workers: Sequence[str], now: float, patience: float) -> dict[str, list[int]]:
-        """Whom to ask what now. A check that nobody can answer is dropped, unless two answers differ: that waits."""
+        """Return the jobs to send now, by worker.
+
+        A check that no worker can answer is dropped, unless two answers differ; then it waits for one.
+        """
         asked: dict[str, list[int]] = {}
         parties = {name: self._party(name) for name in workers} if self._checks else {}
         for index, check in list(self._checks.items()):
@@ -158,7 +161,7 @@ class Audit:
 
     @property
     def disputed(self) -> str:
-        """Hosts whose answers differ, as long as no third host can settle it; empty where none do."""
+        """Hosts whose answers differ while there is no third host to decide; empty if there are none."""
         unasked = (check for check in self._checks.values() if len(check.answers) > 1 and not check.asked)
         return next((" and ".join(party.host for party in check.answers) for check in unasked), "")
 
@@ -169,7 +172,7 @@ class Audit:
         return self._parties[self._by[index]]
 
     def _choose(self, results: RoundResults) -> list[int]:
-        """The best of the run so far, always; then each host's best, in turn, and some of the rest."""
+        """The best job of the run so far, always; then the best job of each host in turn, and some of the others."""
         jobs = len(self._by)
         count = int((self._round + 1) * self._part * jobs) - int(self._round * self._part * jobs)
         returns = results.job_returns()

@@ -1,4 +1,4 @@
-"""How fast jobs go: the running median, and the chunk sizes and deadlines that follow from it."""
+"""The running median of the time per job, and the chunk sizes and deadlines that follow from it."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from statistics import median
 from farm.settings import Settings, setting
 
 _SAMPLES = 64
-_MESSAGES = 300.0  # chunks that a learner sends, and reads the results of, per second: a third of a core
+_MESSAGES = 300.0  # chunks that a learner sends and receives per second: this takes a third of a core
 
 
 @dataclass(frozen=True, kw_only=True)
 class SchedulerConfig(Settings):
-    """How jobs are handed out, and when one is given to a second worker or given up."""
+    """How jobs are handed out, when a job also goes to a second worker, and when it fails for good."""
 
     chunk_seconds: float = setting(0.2, above=0.0)
-    """Work sent to a worker in one message [s], by the running median; more where there are more than 60 workers."""
+    """Work sent to a worker in one message [s], by the running median; more if there are more than 60 workers."""
     least_seconds: float = setting(0.015, above=0.0)
     """Towards the end of a round chunks shrink down to this [s]: rollouts in small batches are slower."""
     short_seconds: float = setting(0.06, least=0.0)
-    """A round is short where a worker's share takes no longer; it goes out in one message [s]."""
+    """If a worker's whole share of a round takes at most this [s], it is sent in one message."""
     straggler_factor: float = setting(4.0, least=1.0)
-    """A job out longer than this many running medians is copied to another worker."""
+    """A job unanswered for this many times the running median also goes to another worker."""
     straggler_seconds: float = setting(1.0, above=0.0)
-    """A job is never copied sooner than this [s]."""
+    """Least time before a job also goes to another worker [s]."""
     copies: int = setting(3, least=1)
-    """Workers that may hold one job at once; 1 means no copies."""
+    """Largest number of workers that hold the same job; 1 means no copies."""
     max_errors: int = setting(3, least=1)
-    """Different workers that answer an error for one job before the run stops."""
+    """Number of hosts on which one job must fail before the run stops."""
     audit: float = setting(0.02, least=0.0, most=1.0)
-    """Part of the jobs that a second host does as well, where there is one; 0: no spot checks."""
+    """Share of the jobs that a second host repeats, if there is one; 0: no spot checks."""
 
 
 class Chunking:
@@ -41,8 +41,8 @@ class Chunking:
     def __init__(self, config: SchedulerConfig) -> None:
         self._config = config
         self._samples: deque[float] = deque(maxlen=_SAMPLES)
-        self._median: float | None = None  # until it is asked for
-        self._seconds = 0.0  # what the longest chunk of the round takes
+        self._median: float | None = None  # computed when it is needed
+        self._seconds = 0.0  # duration of the round's longest chunk
 
     def learn(self, seconds: float) -> None:
         """Take in one answer's time per job [s]."""
@@ -58,28 +58,27 @@ class Chunking:
 
     @property
     def patience(self) -> float:
-        """Time after which a job that is out counts as a straggler [s]; it may have waited behind a chunk."""
+        """Time after which an unanswered job is overdue [s]; allows for a wait behind another chunk."""
         factor = self._config.straggler_factor
         return max(self._config.straggler_seconds, factor * max(self.median or 0.0, self._seconds))
 
     def chunk(self, jobs: int, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.
 
-        Some `chunk_seconds` of work, or more where the learner could not answer so many workers in that time, but at
-        most half a worker's share of what waits, so that chunks shrink towards the end and all workers end together;
-        never below `least_seconds`,
-        unless a worker's whole share is less. In a short round each worker has its whole share at once: the time lost
-        when one ends later is less than what a batch in two parts takes longer. One job as long as nothing is known
-        about its duration.
+        About `chunk_seconds` of work, or more if there are so many workers that the learner could not serve them in
+        that time. At most half a worker's share of the pending jobs, so that chunks shrink towards the end and all
+        workers finish together. At least `least_seconds`, unless a worker's whole share is less. In a short round
+        each worker gets its whole share at once, because splitting it would cost more time than uneven finishing.
+        One job until the first duration is known.
 
         Args:
-            jobs: of the round.
-            waiting: of these, not given out yet.
-            workers: that take part.
+            jobs: number of jobs in the round.
+            waiting: number of these that are pending.
+            workers: number of workers.
         """
         if self.median is None:
             return 1
-        seconds = max(self.median, 1e-9)  # a median of 0 (a coarse clock) only says that the share decides
+        seconds = max(self.median, 1e-9)  # with a median of 0 (a coarse clock) the share decides
         share, half = (-(-waiting // (parts * max(workers, 1))) for parts in (1, 2))
         whole = -(-jobs // max(workers, 1)) * seconds
         if whole <= self._config.short_seconds:

@@ -1,6 +1,6 @@
-"""The learner's side of the network: gives a round's jobs to workers and collects what they gave.
+"""The learner's side of the network: sends a round's jobs to workers and collects the results.
 
-One thread, the caller's, owns the ledger and does all publishing; subscriptions fill a queue.
+Only the caller's thread uses the scheduler and publishes; subscriptions fill a queue that it reads.
 """
 
 import hashlib
@@ -30,22 +30,22 @@ from learner.scheduler.scheduler import Scheduler, SchedulerConfig, Verdict
 
 log = logging.getLogger(__name__)
 
-_WAIT: Final = 0.2  # [s] between two looks at whether to stop
-_STATUS: Final = 0.5  # [s] between two refreshments of the status, at least
-_STATUS_PART: Final = 0.02  # of the learner's time that they may take: with a thousand workers one takes long
-_ASK: Final = 0.5  # [s] for a token that may be there
-_LOOKS: Final = 5  # tokens that are asked for at a time: for all at once Zenoh needs 9 s where there are 30 000
+_WAIT: Final = 0.2  # [s] at most between two checks whether to stop
+_STATUS: Final = 0.5  # [s] at least between two updates of the status
+_STATUS_PART: Final = 0.02  # largest share of the learner's time for these: with a thousand workers one takes long
+_ASK: Final = 0.5  # [s] timeout of a query for one token
+_LOOKS: Final = 5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
 _CHUNK: Final = 32 << 20  # [bytes] of eps in one message, unless one job alone has more
-_REFUSED: Final = 10_000  # workers that are remembered to be refused
-_PATIENCE: Final = 3.0  # [s] without workers before the user is told
+_REFUSED: Final = 10_000  # number of refused workers that are remembered
+_PATIENCE: Final = 3.0  # [s] without workers before the user is warned
 
 
 class Stopped(Exception):  # noqa: N818  not an error
-    """The user asked to end."""
+    """The user asked the run to stop."""
 
 
 class Dispatcher:
-    """Rounds of jobs, one after the other, on whichever workers there are."""
+    """Runs rounds of jobs, one after another, on the workers that are connected."""
 
     def __init__(
         self,
@@ -65,22 +65,22 @@ class Dispatcher:
           session: an open session; this dispatcher reads its events.
           farm: name of the farm.
           spec: what the run simulates.
-          generations: until its end, for people who ask.
-          how_to_join: the command by which workers join, for when there are none; None where they join by themselves.
-          stopped: asked now and then, true ends the collecting.
-          admission: who may take part.
+          generations: number of generations of the run, for `farm status`.
+          how_to_join: the command that starts workers, shown when there are none; None if they are local.
+          stopped: called regularly; if it returns true, `collect` raises Stopped.
+          admission: decides which workers may take part.
           sizes: shape of a trace, and of a frame of each of a trajectory's arrays.
-          scheduler: how jobs are cut into chunks, and when they are given out again.
+          scheduler: how jobs are cut into chunks, and when they are sent again.
         """
         self.run = spec.run
         self.ignored: Counter[str] = Counter()
-        """Messages not counted, by kind: stale, doubled, unasked, foreign, absent, refused, bad, large, version,
-        flood."""
+        """Number of ignored messages, by kind: stale, doubled, unasked, foreign, absent, refused, bad, large,
+        version, flood."""
         self.admission = admission
         self._session, self._farm, self._stopped = session, farm, stopped
         scheduler = scheduler or SchedulerConfig()
         self._scheduler = Scheduler(scheduler)
-        self._expelled: dict[str, str] = {}  # hosts, and why
+        self._expelled: dict[str, str] = {}  # hosts and reasons
         self._how_to_join = how_to_join
         self._trace, self._shapes = sizes
         self._incarnation = secrets.token_hex(8)
@@ -110,7 +110,7 @@ class Dispatcher:
 
     @property
     def incarnation(self) -> str:
-        """Which start of the run's learner this is."""
+        """Random identifier of this start of the run's learner."""
         return self._incarnation
 
     @property
@@ -119,12 +119,12 @@ class Dispatcher:
         return tuple(sorted(self._scheduler.workers))
 
     def census(self) -> tuple[WorkerStatus, ...]:
-        """Workers that take part, with what they did lately."""
+        """Workers that take part, with their recent rates."""
         return self._census.status(time.monotonic())
 
     @property
     def reissued(self) -> int:
-        """Jobs given out again since the start."""
+        """Number of jobs sent again since the start."""
         return self._scheduler.reissued
 
     def begin(
@@ -138,13 +138,13 @@ class Dispatcher:
         """Announce a round and hand out its first jobs.
 
         Args:
-          generation: updates done.
-          mu: (P,).
-          jobs: all of them, by index.
-          traces: which traces of the exploring rollouts are wanted, one of TRACES.
-          normaliser: of the observations, as a RoundHeader has it, (2, 2, d).
+          generation: number of updates done.
+          mu: mean of the search distribution, (P,).
+          jobs: all jobs of the round, by index.
+          traces: which traces of the exploring rollouts workers must send, one of TRACES.
+          normaliser: of the observations, as in RoundHeader, (2, 2, d).
         """
-        if self._round is not None:  # who said between two rounds that it has nothing to do does not mean this one
+        if self._round is not None:  # take idle reports that were sent before this round
             for event in self._session.events.waiting(0.0):
                 self._take(event)
         self._header = RoundHeader(
@@ -163,7 +163,7 @@ class Dispatcher:
 
         Raises:
           RunError: a job failed on several workers.
-          Stopped: the user asked to end.
+          Stopped: the user asked the run to stop.
         """
         assert self._round is not None
         for _ in self.progress():
@@ -171,7 +171,7 @@ class Dispatcher:
         return self._round
 
     def progress(self) -> Iterator[RoundResults]:
-        """The round that has begun, each time that something came, until all its jobs are done and checked."""
+        """Yield the current round after each batch of events, until all its jobs are done and checked."""
         assert self._round is not None
         while not self._over():
             for event in self._events():
@@ -185,7 +185,7 @@ class Dispatcher:
             yield self._round
 
     def _over(self) -> bool:
-        """Whether all jobs are done and checked; asks for the checks that are open."""
+        """Whether all jobs are done and checked; sends the checks that are still open."""
         assert self._round is not None
         if not self._scheduler.complete:
             return False
@@ -198,13 +198,13 @@ class Dispatcher:
         self._send(asked.items())
         if self._audit.disputed:
             self._warn(
-                f"{self._audit.disputed} give different numbers for the same job, and no third host is there to say "
-                "which is right: the run waits for a worker on one more machine"
+                f"{self._audit.disputed} returned different numbers for the same job, and there is no third host to "
+                "decide which is right: the run waits for a worker on one more machine"
             )
         return False
 
     def _events(self) -> list[Event]:
-        """What came, after waiting for it until the next deadline."""
+        """Events that arrived; waits for one until the next deadline at most."""
         due = self._scheduler.next_deadline(time.monotonic())
         return self._session.events.waiting(_WAIT if due is None else max(0.001, min(due, _WAIT)))
 
@@ -224,7 +224,8 @@ class Dispatcher:
         try:
             want = _decode(event, WorkRequest)
         except MessageError as error:
-            # It cannot read why either, but will say that it cannot. Who takes part has our release: that was another.
+            # A worker of another release cannot read the refusal either, but it logs that. A sender that already
+            # takes part has our release, so this message is not its own.
             if error.kind == "version" and sender not in self._scheduler.workers:
                 self._refuse(sender, str(error))
             raise
@@ -251,7 +252,7 @@ class Dispatcher:
         self._census.asked(want, now)
 
     def _refuse(self, worker: str, reason: str) -> None:
-        """Tell both sides; the worker every time it asks, or it may never hear it."""
+        """Log the refusal here, and send it to the worker each time it asks, in case a message was lost."""
         self._warn(f"worker {worker} is refused: {reason}")
         if len(self._refused) < _REFUSED:
             self._refused[worker] = reason
@@ -268,7 +269,7 @@ class Dispatcher:
         self._declined.discard(worker)
         if worker in self._scheduler.workers:
             again = self._forget(worker)
-            log.info("worker %s left%s", worker, f"; {again} of its jobs go to others" if again else "")
+            log.info("worker %s left%s", worker, f"; {again} of its jobs are sent again" if again else "")
 
     def _came(self, worker: str) -> None:
         early = self._attendance.came(worker)
@@ -276,7 +277,7 @@ class Dispatcher:
             self._admit(early)
 
     def _look_who_is_there(self, now: float) -> None:
-        """Of who asks without a token, ask Zenoh: its word that a token came is now and then missed."""
+        """Query the tokens of workers that ask for work without one: Zenoh sometimes misses a new token."""
         for worker in self._attendance.early(_LOOKS):
             if self._session.present(keys.worker_token(self._farm, worker), _ASK):
                 try:
@@ -284,7 +285,7 @@ class Dispatcher:
                 except MessageError as error:
                     self._ignore(error.kind, f"of {worker}: {error}")
         for worker in self._attendance.absent(now):
-            self._ignore("absent", f"of {worker}, whose liveliness token is not there")
+            self._ignore("absent", f"of {worker}, whose liveliness token is missing")
 
     def _result(self, event: Event) -> None:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
@@ -324,11 +325,11 @@ class Dispatcher:
             self._compare(message, verdicts)
         self.ignored.update(verdict for verdict in verdicts if verdict != "new")
         if "unasked" in verdicts:
-            self._warn(f"worker {message.worker} answers jobs that it was not given; they do not count")
+            self._warn(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
         self._census.did(message.worker, len(message.returns), time.monotonic())
 
     def _decide_numbers(self, worker: str) -> None:
-        """The first result that counts says which machines' numbers are the run's: others leave."""
+        """The first accepted result decides the kind of machine of the run; workers of a different kind are refused."""
         if not self.admission.counted(self._census.canary(worker)):
             return
         for want in self._census.requests():
@@ -338,7 +339,7 @@ class Dispatcher:
                 self._refuse(want.worker, refusal)
 
     def _compare(self, message: Results, verdicts: list[Verdict]) -> None:
-        """Two hosts did the same jobs, asked to or by chance: they must agree to the bit."""
+        """Compare results of jobs that two hosts did, for a check or after a copy: they must agree to the bit."""
         assert self._round is not None
         for at, (job, verdict) in enumerate(zip(message.jobs.tolist(), verdicts, strict=True)):
             if verdict == "doubled":
@@ -350,9 +351,9 @@ class Dispatcher:
             self._expel(name, job)
 
     def _expel(self, name: str, job: int) -> None:
-        """A host's numbers are wrong: its jobs of this round are done again, and it takes part no longer."""
+        """A host's numbers are wrong: exclude it, and repeat its jobs of this round."""
         assert self._round is not None
-        reason = f"host {name} gave other numbers than two other hosts for job {job} of round {self._header.round}"
+        reason = f"host {name} gave different numbers than two other hosts for job {job} of round {self._header.round}"
         self._expelled[name] = reason
         for worker in self.workers:
             if host(worker) == name:
@@ -361,7 +362,7 @@ class Dispatcher:
         jobs = self._audit.expel(name)
         self._scheduler.reopen(jobs, name)
         self._round.forget(jobs)
-        log.error("%s; it is expelled, and %d of its jobs are done again", reason, len(jobs))
+        log.error("%s; it is expelled, and %d of its jobs are repeated", reason, len(jobs))
 
     def _failed(self, failure: Failure) -> None:
         if failure.index is None:
@@ -379,25 +380,25 @@ class Dispatcher:
             )
 
     def _does_not_serve(self, failure: Failure) -> None:
-        """A worker that is here but does not serve this run: others may."""
+        """A connected worker does not serve this run; a different one may."""
         if failure.worker in self._scheduler.workers:
             self._warn(f"worker {failure.worker} does not serve this run: {failure.error}", failure.traceback)
             self._declined.add(failure.worker)
             self._forget(failure.worker)
 
     def _forget(self, worker: str) -> int:
-        """It takes part no longer; how many of its jobs go to others."""
+        """Remove a worker from the run; return how many of its jobs are sent again."""
         again = self._scheduler.lost(worker)
         self._census.left(worker)
         self._audit.lost(worker)
         return again
 
     def _send(self, assigned: Iterable[tuple[str, Sequence[int]]]) -> None:
-        """Jobs into workers' inboxes."""
+        """Send jobs to the inboxes of workers."""
         assert self._round is not None
-        # Without block: a frozen host must not hold up the others; the deadlines cover what is lost.
+        # Without block: a frozen host must not delay the others; deadlines cover lost messages.
         head = {"run": self.run, "incarnation": self._incarnation, "round": self._header.round}
-        size = self._header.mu.nbytes + self._header.normaliser.nbytes  # of eps, and of what comes back
+        size = self._header.mu.nbytes + self._header.normaliser.nbytes  # of a job's eps, and of its results
         most = max(1, _CHUNK // max(1, size))
         for worker, indices in assigned:
             for first in range(0, len(indices), most):
@@ -405,11 +406,11 @@ class Dispatcher:
                 self._session.publish(keys.inbox(self._farm, worker), chunk, block=False)
 
     def report(self, progress: GenerationStats) -> None:
-        """Take in how the last generation went, for people who ask."""
+        """Store the last generation's statistics for `farm status`."""
         self._progress = progress
 
     def _tell_status(self) -> None:
-        """Keep the answer to status queries fresh; they are answered on another thread, which may not look here."""
+        """Refresh the answer to status queries; Zenoh's thread answers them and must not read other fields."""
         now = time.monotonic()
         if now < self._status_due:
             return
@@ -438,7 +439,7 @@ class Dispatcher:
         if self._scheduler.workers:
             self._alone = now
         elif now - self._alone > _PATIENCE and self._how_to_join is None:
-            if self._refused:  # those that the run was started with, and nobody else knows where it listens
+            if self._refused:  # the run's own workers; no others can join, as its port is not announced
                 raise RunError(f"no worker takes part: {next(iter(self._refused.values()))}")
         elif now - self._alone > _PATIENCE:
             log.warning("no workers; start some with: %s", self._how_to_join)
@@ -449,7 +450,7 @@ class Dispatcher:
         self._warn(f"ignored a message {text}")
 
     def _warn(self, text: str, traceback: tuple[str, ...] = ()) -> None:
-        """Say something once; a traceback, which many workers may send, below the first that brings it."""
+        """Log a text once; a traceback, which many workers may send, only with the first of them."""
         text = brief(text)
         if text not in self._told and len(self._told) < 1000:
             self._told.add(text)

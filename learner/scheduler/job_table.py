@@ -1,7 +1,7 @@
-"""The books of one round: where each job is and what each worker holds, without any policy.
+"""The table of one round: the state of each job, and the jobs that each worker holds.
 
-A job that is not done is in exactly one place: pending, out, full or failed. `Scheduler` decides
-what moves; here it moves. Times are seconds of the ledger's clock.
+A job that is not done is in exactly one state: pending, out, full or failed. `Scheduler` decides on
+the changes; this module makes them. Times are seconds of the scheduler's clock.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Worker:
-    """What we believe about a worker."""
+    """The learner's view of a worker, which may be out of date."""
 
     credits: int
     """Jobs it is willing to hold at once."""
     held: dict[int, float] = field(default_factory=dict[int, float])
-    """Job and when it was sent [s]; done or given-up jobs stay until the worker speaks of them."""
+    """Time at which each job was sent [s]; done or given-up jobs stay until the worker answers them."""
     answered: float = -math.inf
-    """When it last spoke of its work [s]."""
+    """Time of its last message about its jobs [s]."""
     proven: bool = False
-    """It has brought a result."""
+    """It has sent a result."""
     benched: bool = False
-    """It failed at a job, or was late when its round ended: as long as others are there, it gets nothing until it
-    speaks again."""
+    """It failed at a job, or was late when a round ended: while there are other workers, it gets no jobs until it
+    sends a message."""
 
 
 class JobTable:
@@ -41,18 +41,18 @@ class JobTable:
     def begin(self, jobs: int, late: float = math.inf) -> None:
         """Forget every job; 0..jobs-1 are pending, and no worker holds anything.
 
-        Who held a job out since before `late` [s] is benched.
+        A worker that still holds a job sent before `late` [s] is benched.
         """
         self.size = jobs
-        # Jobs that are not done, and who is expected to answer, in the order of issue.
+        # Jobs that are not done, and the workers expected to answer, in the order of issue.
         self.open: dict[int, list[str]] = {index: [] for index in range(jobs)}
-        self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)  # answers to a job, by worker
-        self.given: defaultdict[str, set[int]] = defaultdict(set)  # what each worker was ever given, gone or not
-        self._pending = list(range(jobs))  # a heap; jobs done meanwhile leave it at the top
-        # Job and since when [s]; oldest first, as the clock is monotonic.
-        self.out: dict[int, float] = {}  # may have one more copy
+        self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)  # number of errors per job and worker
+        self.given: defaultdict[str, set[int]] = defaultdict(set)  # every job sent to a worker, connected or not
+        self._pending = list(range(jobs))  # a heap; done jobs are removed when they reach the top
+        # Job and the time of its change to this state [s]; oldest first, as the clock is monotonic.
+        self.out: dict[int, float] = {}  # one more copy is permitted
         self.full: dict[int, float] = {}  # all copies are out
-        self.failed: dict[int, float] = {}  # nobody holds it after an error
+        self.failed: dict[int, float] = {}  # no worker holds it after an error
         for worker in self.workers.values():
             worker.benched |= min(worker.held.values(), default=math.inf) <= late
             worker.held.clear()
@@ -76,16 +76,16 @@ class JobTable:
             index = heapq.heappop(pending)
             if index in self.open:
                 taken.append(index)
-                self.open[index].append(worker)  # the first: who is pending has none, and is in no queue
+                self.open[index].append(worker)  # a pending job has no holder and is in no queue
                 held[index] = queue[index] = now
         self.given[worker].update(taken)
         return tuple(taken)
 
     def give(self, index: int, worker: str, now: float) -> None:
-        """Give a worker a job that is in no queue, or out elsewhere as well."""
+        """Give a worker a job that is in no queue, or that other workers hold as well."""
         self._unqueue(index)
         holders = self.open[index]
-        if len(holders) >= self.copies:  # given up at the oldest, which keeps it as held
+        if len(holders) >= self.copies:  # drop the oldest holder; its `held` keeps the job
             del holders[0]
         holders.append(worker)
         self.given[worker].add(index)
@@ -108,14 +108,14 @@ class JobTable:
         return done
 
     def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
-        """Note an error; return whether it counts, and whether nobody holds the job any more."""
+        """Note an error; return whether it counts, and whether no worker holds the job any more."""
         known = self.workers.get(worker)
         if known is None or index not in self.given[worker]:
             return False, False
         known.benched = True
         held = known.held.pop(index, None) is not None
         if index not in self.open or (not held and worker in self.errors[index]):
-            return False, False  # done meanwhile, or a doubled message
+            return False, False  # done in the meantime, or a duplicate message
         self.errors[index][worker] += 1
         if not self._leave(worker, index, now):
             return True, False
@@ -123,7 +123,7 @@ class JobTable:
         return True, True
 
     def reopen(self, indices: Sequence[int], host: str) -> None:
-        """Jobs that are done are pending again, and nothing counts any more of that host's workers."""
+        """Make done jobs pending again; later results of that host's workers do not count."""
         for index in indices:
             self.open[index] = []
             heapq.heappush(self._pending, index)
@@ -131,7 +131,7 @@ class JobTable:
             del self.given[name]
 
     def release(self, worker: str, now: float) -> int:
-        """Take everything off a worker that will not answer; return how many are pending again."""
+        """Take all jobs from a worker that will not answer; return how many are pending again."""
         count = 0
         for index in self.workers[worker].held:
             if index in self.open and self._leave(worker, index, now):
@@ -141,7 +141,10 @@ class JobTable:
         return count
 
     def free(self, most: int) -> list[tuple[int, str]]:
-        """Return a heap of (jobs held, worker) over the workers that may hold one more; benched ones if all are."""
+        """Return a heap of (jobs held, worker) of the workers that may hold one more job.
+
+        Benched workers are left out, unless all are benched.
+        """
         all_benched = all(known.benched for known in self.workers.values())
         free = [
             (len(known.held), name)
@@ -152,7 +155,7 @@ class JobTable:
         return free
 
     def pick(self, index: int, free: list[tuple[int, str]], avoided: Container[str], most: int) -> str | None:
-        """Take from the heap the worker with the fewest jobs that may have this one, if any."""
+        """Take from the heap the worker with the fewest jobs that is neither avoided nor holds this job, if any."""
         passed: list[tuple[int, str]] = []
         picked = None
         while free and picked is None:
@@ -168,14 +171,14 @@ class JobTable:
         return picked
 
     def hopeless(self, index: int, most: int) -> bool:
-        """Say whether a job has failed at proven workers of `most` hosts, or so often and nobody is left to try."""
+        """Whether a job has failed on `most` hosts with proven workers, or as often and no worker is left to try."""
         errors = self.errors[index]
         hosts = {name.partition("/")[0] for name in errors if name in self.workers and self.workers[name].proven}
         nobody = all(name in errors or known.benched for name, known in self.workers.items())
         return len(hosts) >= most or (nobody and errors.total() >= most)
 
     def _leave(self, worker: str, index: int, now: float) -> bool:
-        """Strike a holder off; return whether it was the last one, the job then in no queue."""
+        """Remove a holder of a job; return whether it was the last one, in which case the job is in no queue."""
         holders = self.open[index]
         if worker not in holders:
             return False
@@ -183,7 +186,7 @@ class JobTable:
         if not holders:
             self._unqueue(index)
         elif self.full.pop(index, None) is not None:
-            self.out[index] = now  # one more copy is possible; those out have their full time
+            self.out[index] = now  # one more copy is permitted; the deadline starts anew
         return not holders
 
     def _unqueue(self, index: int) -> None:

@@ -1,4 +1,4 @@
-"""Which workers may join a run, which are connected, and what is known of each. Pure: time is an argument [s]."""
+"""Which workers may join a run, which are connected, and their statistics. Pure: time is an argument [s]."""
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
@@ -9,22 +9,22 @@ from farm.errors import MessageError
 from farm.net.messages import WorkRequest
 from farm.net.telemetry import WorkerStatus
 
-_MOST: Final = 10_000  # tokens; more workers than a learner feeds
-_MOST_OF_ONE: Final = 1000  # tokens of one name: nobody keeps others out by showing many of its own
-_ASKING: Final = 1000  # that ask before their token came
-_SOON: Final = 3.0  # [s] within which it does: token and request take different ways
-_WINDOW: Final = 10.0  # [s] over which a worker's rate is taken
+_MOST: Final = 10_000  # tokens; more workers than one learner can serve
+_MOST_OF_ONE: Final = 1000  # tokens per host name, so that one host cannot use up the limit for all
+_ASKING: Final = 1000  # workers whose request arrived before their token
+_SOON: Final = 3.0  # [s] within which the token must follow: token and request travel separately
+_WINDOW: Final = 10.0  # [s] over which a worker's rate is measured
 
 
 class Admission:
-    """Judges workers by what they say of themselves when they ask for work."""
+    """Admits or refuses workers by the properties in their requests for work."""
 
     def __init__(self, canary: str | None, *, mixed: bool = False) -> None:
-        """Know the run.
+        """Set the rules of a run.
 
         Args:
-          canary: digest of the numbers that the run's machines give; None until the first result counts.
-          mixed: admit machines whose numbers differ: the run is then not reproducible.
+          canary: digest of how the run's machines round; None until the first result is accepted.
+          mixed: also admit machines that round differently: the run is then not reproducible.
         """
         self.mixed, self.canary = mixed, canary
 
@@ -32,18 +32,18 @@ class Admission:
         """Why this worker may not take part, None if it may."""
         if not want.canary and not self.mixed:
             return (
-                "it is a device, whose numbers are not to be had again: start the learner with --mixed and do without "
-                "repeatable numbers"
+                "it is a device, whose results cannot be repeated: start the learner with --mixed; "
+                "the run is then not reproducible"
             )
         if self.canary in (None, want.canary) or self.mixed:
             return None
         return (
             "its machine rounds differently from those the run began with (another processor or library): "
-            "take a machine like them, or start the learner with --mixed and do without repeatable numbers"
+            "use a machine like them, or start the learner with --mixed; the run is then not reproducible"
         )
 
     def counted(self, canary: str) -> bool:
-        """A result of such a machine counted; say whether it was the first, which decides whose numbers the run has."""
+        """Note an accepted result from a machine with this canary; return whether it was the first of the run."""
         if self.canary is not None or not canary:
             return False
         self.canary = canary
@@ -51,7 +51,7 @@ class Admission:
 
 
 class Attendance:
-    """Tokens, and questions that came ahead of theirs."""
+    """Liveliness tokens of workers, and requests that arrived before their token."""
 
     def __init__(self) -> None:
         self._there: set[str] = set()
@@ -59,21 +59,21 @@ class Attendance:
         self._early: dict[str, tuple[WorkRequest, float]] = {}
 
     def came(self, worker: str) -> WorkRequest | None:
-        """A token appeared; return what its worker asked for before.
+        """A token appeared; return the request that its worker sent before, if any.
 
         Raises:
-          MessageError: there are too many.
+          MessageError: there are too many tokens.
         """
         if worker not in self._there:
             name = worker.partition("/")[0]
             if len(self._there) >= _MOST or self._names[name] >= _MOST_OF_ONE:
-                raise MessageError(f"{_MOST} workers, or {_MOST_OF_ONE} of its name, are there already", "absent")
+                raise MessageError(f"there are already {_MOST} workers, or {_MOST_OF_ONE} of its name", "absent")
             self._there.add(worker)
             self._names[name] += 1
         return self._early.pop(worker, (None, 0.0))[0]
 
     def early(self, most: int) -> list[str]:
-        """Some that have asked and whose token has not come, those of whom that was said longest ago first."""
+        """Some workers that asked but whose token has not come; those not returned for the longest time first."""
         names = list(islice(self._early, most))
         for name in names:
             self._early[name] = self._early.pop(name)
@@ -87,7 +87,7 @@ class Attendance:
         self._early.pop(worker, None)
 
     def asked(self, want: WorkRequest, now: float) -> bool:
-        """Say whether the worker that asks is connected; another's request is kept for a while, until it is.
+        """Return whether the worker that asks is connected; if not, keep its request until its token comes.
 
         Raises:
           MessageError: too many requests are kept already.
@@ -95,12 +95,12 @@ class Attendance:
         if want.worker in self._there:
             return True
         if want.worker not in self._early and len(self._early) >= _ASKING:
-            raise MessageError(f"{_ASKING} others ask whose tokens are not there", "absent")
+            raise MessageError(f"there are already {_ASKING} requests of workers without a token", "absent")
         self._early[want.worker] = want, self._early.get(want.worker, (want, now))[1]
         return False
 
     def absent(self, now: float) -> list[str]:
-        """Forget who asked and never came; their names."""
+        """Forget requests whose token did not follow in time; return the workers' names."""
         gone = [worker for worker, (_, since) in self._early.items() if now - since > _SOON]
         for worker in gone:
             del self._early[worker]
@@ -117,7 +117,7 @@ class _Known:
 
 
 class Census:
-    """Workers by name, with what they did lately."""
+    """Workers by name, with their recent work."""
 
     def __init__(self) -> None:
         self._known: dict[str, _Known] = {}
@@ -128,7 +128,7 @@ class Census:
         known.want, known.seen = want, now
 
     def did(self, worker: str, rollouts: int, now: float) -> None:
-        """A worker brought results."""
+        """A worker sent results."""
         known = self._known.get(worker)
         if known is not None:
             known.seen, known.rollouts = now, known.rollouts + rollouts
@@ -137,16 +137,16 @@ class Census:
                 known.recent.popleft()
 
     def canary(self, worker: str) -> str:
-        """The digest of a worker's numbers; empty where it is a device, or gone."""
+        """The digest of how a worker rounds; empty if it is a device or has left."""
         known = self._known.get(worker)
         return "" if known is None else known.want.canary
 
     def requests(self) -> list[WorkRequest]:
-        """What each worker asked for last."""
+        """The last request of each worker."""
         return [known.want for known in self._known.values()]
 
     def left(self, worker: str) -> None:
-        """A worker is gone."""
+        """A worker has left."""
         self._known.pop(worker, None)
 
     def status(self, now: float) -> tuple[WorkerStatus, ...]:
@@ -168,5 +168,5 @@ class Census:
 
 
 def _over(seconds: float) -> float:
-    """The time that a rate is taken over: the window, or as long as a worker has been here; a second at least."""
+    """Time over which a rate is measured: since the worker joined, but 1 s at least and the window at most."""
     return min(_WINDOW, max(1.0, seconds))

@@ -1,4 +1,4 @@
-"""A round's jobs, and what came of them: one array of each kind over all rollouts, in the jobs' order. Pure."""
+"""A round's jobs and their results: one array per quantity, over all rollouts in the order of the jobs. Pure."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from farm.sim.trajectory import Trajectory
 
 
 class RoundResults:
-    """Jobs 0..n-1 and their results, S rollouts in all; a result is written where it belongs, whenever it comes."""
+    """Jobs 0..n-1 and their results, S rollouts in all. Results may arrive in any order."""
 
     def __init__(
         self,
@@ -21,19 +21,19 @@ class RoundResults:
         shapes: Mapping[str, tuple[int, ...]],
         observation: int = 0,
     ) -> None:
-        """Make room.
+        """Allocate the arrays.
 
         Args:
-          jobs: all of them, by index.
-          traces: which traces are wanted, one of TRACES.
-          trace: shape of one, control steps and numbers.
-          shapes: of a trajectory's frames.
-          observation: size d of an observation whose moments are wanted; 0: of none.
+          jobs: all jobs of the round, by index.
+          traces: which traces workers must send, one of TRACES.
+          trace: shape of a trace: control steps, numbers per step.
+          shapes: shape of a frame of each of a trajectory's arrays.
+          observation: size d of the observation, if its moments are collected; else 0.
         """
         self.jobs, self._traces, self._trace, self._shapes = jobs, traces, trace, shapes
         self._rollouts, self._seen = jobs.rollouts, jobs.seen
         self._exploring = np.repeat(~self._seen, self._rollouts)
-        self._starts = [0, *np.cumsum(self._rollouts).tolist()]  # of each job's rows, and the end
+        self._starts = [0, *np.cumsum(self._rollouts).tolist()]  # first row of each job, and the end
         self._trajectories: dict[int, WireTrajectory] = {}
         count = len(self._exploring)
         self.returns: FloatArray = np.zeros(count)
@@ -43,31 +43,31 @@ class RoundResults:
         self.steps: IntArray = np.zeros(count, dtype=np.int64)
         """Control steps, (S,)"""
         self.moments: FloatArray = np.zeros((count, 1 + 2 * observation) if observation else (0, 0))
-        """Of the observations, as in `farm.moments`, (S, 1 + 2 d), or (0, 0)"""
+        """Moments of the observations, as in `farm.moments`, (S, 1 + 2 d), or (0, 0)"""
         self.done: BoolArray = np.zeros(len(jobs), dtype=bool)
-        """Jobs whose results are here, (J,)"""
+        """Jobs whose results have arrived, (J,)"""
         self.traces: dict[int, AnyArray] = {}
-        """Traces of the rollouts that brought one, (T, N) each"""
+        """Traces by rollout, (T, N) each; only of some rollouts"""
 
     def __len__(self) -> int:
-        """How many jobs."""
+        """Number of jobs."""
         return len(self.jobs)
 
     def rows(self, job: int) -> slice:
-        """Which rollouts are a job's."""
+        """Rows of a job's rollouts."""
         return slice(self._starts[job], self._starts[job + 1])
 
     def trajectory(self, job: int) -> Trajectory | None:
-        """What a job showed, if anything."""
+        """The trajectory of a job, None if it has none."""
         found = self._trajectories.get(job)
         return None if found is None else found.trajectory()
 
     def answer(self, job: int) -> bytes:
-        """What a job gave, bit for bit."""
+        """The stored results of a job, as bytes."""
         return _bits(self, self.rows(job))
 
     def given(self, results: Results, job: int) -> bytes:
-        """What results say of one of their jobs, in the form of `answer`."""
+        """The part of a message's results that belongs to one of its jobs, in the form of `answer`."""
         before = int(self._rollouts[results.jobs[results.jobs < job]].sum())
         return _bits(results, slice(before, before + int(self._rollouts[job])))
 
@@ -76,12 +76,12 @@ class RoundResults:
         return np.maximum.reduceat(self.returns, self._starts[:-1])
 
     def best(self) -> tuple[int, float]:
-        """The job with the best return among those that explore, and that return; -inf where none explores."""
+        """The exploring job with the best return, and that return; -inf if no job explores."""
         returns = np.where(self._seen, -np.inf, self.job_returns())
         return int(returns.argmax()), float(returns.max())
 
     def forget(self, jobs: list[int]) -> None:
-        """Drop what was shown of jobs that will be done again."""
+        """Drop trajectories and traces of jobs that will be repeated."""
         self.done[jobs] = False
         for job in jobs:
             self._trajectories.pop(job, None)
@@ -89,12 +89,12 @@ class RoundResults:
                 self.traces.pop(row, None)
 
     def place(self, results: Results) -> "Place | None":
-        """Where these belong.
+        """Rows to which these results belong.
 
-        None unless they are of jobs of this round, have their shapes, and the traces that are wanted of them.
+        None unless they are of jobs of this round, with the right shapes and the required traces.
         """
         jobs = results.jobs
-        first, last = int(jobs[0]), int(jobs[-1])  # they rise
+        first, last = int(jobs[0]), int(jobs[-1])  # in ascending order
         if first < 0 or last >= len(self):
             return None
         rows = np.arange(self._starts[first], self._starts[last + 1])
@@ -114,7 +114,7 @@ class RoundResults:
         return Place(rows, wanted, jobs[seen])
 
     def put(self, results: Results, place: "Place", chosen: BoolArray) -> None:
-        """Write down some of results that belong here; `chosen` (J,) says of which jobs."""
+        """Store the results of the chosen jobs; `chosen` has one entry per job of the message."""
         rows, new = place.rows, np.repeat(chosen, self._rollouts[results.jobs])
         some = slice(None) if chosen.all() else new
         self.returns[rows[some]] = results.returns[some]
@@ -132,16 +132,16 @@ class RoundResults:
 
 
 def _bits(of: RoundResults | Results, rows: slice) -> bytes:
-    """All that some rollouts gave and that a number may follow from."""
+    """All results of some rollouts that can influence the run's numbers, as bytes."""
     return b"".join(values[rows].tobytes() for values in (of.returns, of.flags, of.steps, of.moments))
 
 
 class Place(NamedTuple):
-    """Where results belong."""
+    """Rows of the round to which a message's results belong."""
 
     rows: IntArray
-    """Of their rollouts, in the round, (S,)"""
+    """Row of each of the message's S rollouts, (S,)"""
     traced: IntArray
-    """Which of their rollouts have a trace, (K,)"""
+    """Those of its rollouts that have a trace, (K,)"""
     shown: IntArray
-    """The jobs that their trajectories are of."""
+    """The job of each of its trajectories."""

@@ -1,10 +1,10 @@
-"""The ledger: which job of a round is where, over workers that come and go. No I/O, no clock.
+"""The scheduler: decides which worker gets which job of a round, and when again. No I/O, no clock.
 
-A round is a generation's jobs 0..n-1. Every message about a job may be lost, doubled or late: each
-job is counted once, by its first result, wherever we believed the job to be.
+A round is a generation's jobs 0..n-1. Messages may be lost, duplicated or late, and workers may join and leave.
+Each job is counted once, by its first result, even if that comes from a worker that was no longer expected to send it.
 
     pending --assign--> out --result--> done
-       ^                 | lost, idle, error: nobody holds it any more
+       ^                 | lost, idle, error: no worker holds it any more
        +-----------------+ overdue: a copy goes to another worker
 
 Times are seconds of one monotonic clock, passed in as `now`.
@@ -24,8 +24,8 @@ __all__ = ["Assignment", "Scheduler", "SchedulerConfig", "Verdict"]
 
 Verdict: TypeAlias = Literal["new", "doubled", "stale", "unasked"]
 
-# A job whose copies are all out is given up at its oldest holder after this many times the
-# straggler's patience: workers that hang but stay connected must not keep a round for ever.
+# If all copies of a job are out, the one of the oldest holder is replaced after this many times the
+# patience: workers that hang but stay connected must not block a round forever.
 _GIVE_UP = 10.0
 
 
@@ -37,7 +37,7 @@ class Assignment(NamedTuple):
 
 
 class Scheduler:
-    """The books of one round after another, and who gets what when."""
+    """Assigns the jobs of one round after another to workers."""
 
     def __init__(self, config: SchedulerConfig) -> None:
         self._config = config
@@ -46,11 +46,11 @@ class Scheduler:
         self._begun = False
         self._reissued = 0
         self._now = -math.inf
-        self._seen = -math.inf  # `assign` has looked after the deadlines up to here [s]
+        self._seen = -math.inf  # `assign` has handled the deadlines up to this time [s]
 
     @property
     def complete(self) -> bool:
-        """Whether a round has begun and all its jobs are done."""
+        """Whether a round has started and all its jobs are done."""
         return self._begun and not self._table.open
 
     @property
@@ -70,11 +70,11 @@ class Scheduler:
 
     @property
     def reissued(self) -> int:
-        """Jobs issued once more, over the ledger's life: after a loss, an error, or as a copy."""
+        """Number of jobs issued again, over all rounds: after a loss, an error, or as a copy."""
         return self._reissued
 
     def begin(self, jobs: int) -> None:
-        """Start a round of `jobs` jobs; the old one is forgotten, workers and credits stay."""
+        """Start a round of `jobs` jobs; the old round is dropped, workers and credits are kept."""
         if jobs < 0:
             raise ValueError(f"jobs is {jobs}, expected 0 or more")
         self._begun = True
@@ -82,14 +82,14 @@ class Scheduler:
         self._seen = -math.inf
 
     def want(self, worker: str, credits: int, now: float, *, idle: bool = False) -> None:
-        """Note that a worker is there and how many jobs it is willing to hold at once.
+        """Note that a worker is connected, and how many jobs it is willing to hold at once.
 
         Args:
-            worker: its name; an unknown one joins.
-            credits: jobs that are out there and the next chunk together stay within it.
+            worker: its name; an unknown worker joins.
+            credits: largest number of jobs that it may hold, a new chunk included.
             now: time [s].
-            idle: it has nothing to do: what we believed there, or its results, got lost on the way
-                and is pending again.
+            idle: it has nothing to do: jobs sent to it, or their results, were lost on the way, so they
+                are pending again.
         """
         if credits < 0:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
@@ -111,11 +111,11 @@ class Scheduler:
         return count
 
     def results(self, worker: str, indices: Sequence[int], now: float) -> list[Verdict]:
-        """Note the results that came in one message; return for each whether it counts.
+        """Note the results in a message; return a verdict for each.
 
-        "new" counts, "doubled" came before, "stale" is no job of this round, "unasked" was never given to that
-        worker in this round. A worker that left meanwhile still counts. Messages of other rounds are the caller's to
-        sort out.
+        Only "new" counts. "doubled": the job was done before; "stale": not a job of this round; "unasked": this
+        worker was never given it in this round. Results of a worker that has left count. The caller must drop
+        messages of other rounds.
         """
         self._tick(now)
         self._learn(worker, indices)
@@ -130,26 +130,26 @@ class Scheduler:
         ]  # fmt: skip
 
     def reopen(self, indices: Sequence[int], host: str) -> None:
-        """Have jobs that a host did done again by others; nothing that its workers say of this round counts."""
+        """Make a host's done jobs pending again; later results of its workers in this round do not count."""
         self._seen = -math.inf
         self._reissued += len(indices)
         self._table.reopen(indices, host)
 
     def lend(self, worker: str, indices: Sequence[int]) -> None:
-        """Note that a worker is asked for jobs that are done: its answers are "doubled"."""
+        """Note that a worker repeats jobs that are done: the verdict on its answers is "doubled"."""
         self._table.given[worker].update(indices)
 
     @property
     def patience(self) -> float:
-        """Time after which a worker that does not answer counts as late [s]."""
+        """Time after which an unanswered job is overdue [s]."""
         return self._chunking.patience
 
     def error(self, worker: str, index: int, now: float) -> bool:
-        """Note that a worker answered an error; return whether the run has to stop.
+        """Note that a job failed on a worker; return whether the run must stop.
 
-        It has to when the job failed on `max_errors` hosts that brought results before, or as often and
-        there is nobody left to try: what some machines lack must not end a run that others serve. Until
-        then it is issued again, elsewhere if possible. Who is not known counts for nothing.
+        It must if the job failed on `max_errors` hosts that have sent results before, or failed as often and
+        no worker is left to try: a defect of some machines must not stop a run that others can serve. Until
+        then the job is issued again, to a different worker if possible. Errors of unknown workers are ignored.
         """
         self._tick(now)
         counts, again = self._table.fail(worker, index, self._now)
@@ -161,8 +161,8 @@ class Scheduler:
     def assign(self, now: float) -> list[Assignment]:
         """Return the chunks to send now, within the credits, and count them as sent.
 
-        Workers with the fewest jobs come first, then by name. Each is kept at about two chunks,
-        one to work on and one to go on with; the rest waits here, so that all end together.
+        Workers with the fewest jobs come first, then by name. Each holds about two chunks, the one it works on and
+        the next one; the other jobs stay pending here, so that all workers finish together.
         """
         self._tick(now)
         size = self._chunking.chunk(self._table.size, self._table.waiting, len(self._table.workers))
@@ -175,9 +175,9 @@ class Scheduler:
         return chunks
 
     def next_deadline(self, now: float) -> float | None:
-        """Return the seconds until `assign` has something to do without any news, or None.
+        """Return the seconds until `assign` must be called again even if no message arrives, or None.
 
-        Overdue jobs that the last `assign` could not place wait for news: a result, a worker.
+        Overdue jobs that the last `assign` could not place wait for a message: a result or a new worker.
         """
         dues: list[float] = []
         for queue in (self._table.out, self._table.full, self._table.failed):
@@ -191,7 +191,7 @@ class Scheduler:
         self._seen = -math.inf
 
     def _learn(self, worker: str, indices: Sequence[int]) -> None:
-        """Learn the time per job: since the worker was able to begin, over the jobs it did."""
+        """Learn the time per job: from when the worker could start, divided by the number of jobs it did."""
         known = self._table.workers.get(worker)
         if known is None:
             return
@@ -201,7 +201,7 @@ class Scheduler:
             known.answered = self._now
 
     def _first_time(self, size: int) -> list[Assignment]:
-        """Hand out pending jobs in chunks, lowest index first; where there are too few for two chunks each, evenly."""
+        """Hand out pending jobs in chunks, lowest index first; evenly if there are not two chunks for each worker."""
         free = self._table.free(2 * size) if self._table.any_pending() else []
         load = sum(held for held, _ in free)
         chunks: list[Assignment] = []
@@ -213,7 +213,7 @@ class Scheduler:
             if held > chunk:
                 load -= held
                 continue
-            even = -(-(self._table.waiting + load) // (len(free) + 1)) - held  # until all hold as much
+            even = -(-(self._table.waiting + load) // (len(free) + 1)) - held  # until all hold the same number
             taken = self._table.take(name, min(chunk, even, credits - held), self._now)
             chunks.append(Assignment(name, taken))
             load -= held
@@ -233,7 +233,7 @@ class Scheduler:
                 break
             name = self._table.pick(index, free, self._avoided(index), 2 * size)
             if name is not None:
-                self._reissued += queue is not self._table.failed  # those were counted before
+                self._reissued += queue is not self._table.failed  # failed jobs were counted before
                 self._table.give(index, name, self._now)
                 chunks.setdefault(name, []).append(index)
         return [Assignment(name, tuple(taken)) for name, taken in chunks.items()]
@@ -254,7 +254,7 @@ class Scheduler:
         return due
 
     def _avoided(self, index: int) -> Container[str]:
-        """Return the workers that failed at a job, as long as another one may get to it soon."""
+        """Return the workers that failed at a job, while a different worker may still take it in time."""
         failed = self._table.errors[index]
         since = self._table.failed.get(index, -math.inf)
         if since + self._wait(self._table.failed) <= self._now:

@@ -43,7 +43,7 @@ def test_what_it_cannot_begin_with_is_said_without_a_traceback(words: tuple[str,
     command = [sys.executable, str(EXAMPLES / "robot_worker.py"), *words]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2
-    assert "robot_worker.py: error: it cannot begin with these: " in ended.stderr
+    assert "robot_worker.py: error: it cannot start with these settings: " in ended.stderr
     assert "Traceback" not in ended.stderr
 
 
@@ -79,7 +79,7 @@ def test_without_mixed_a_device_is_refused(farm: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", *RUN, "--listen", endpoint, "--name", "r")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
-    wait_for(learner, "it is a device, whose numbers are not to be had again: start the learner with --mixed")
+    wait_for(learner, "it is a device, whose results cannot be repeated: start the learner with --mixed")
 
 
 def test_a_device_refuses_what_it_does_not_know(farm: Farm) -> None:

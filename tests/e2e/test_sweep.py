@@ -46,7 +46,7 @@ def test_an_interrupted_sweep_goes_on_to_the_numbers_of_runs_one_after_another(f
     before = {path: path.stat().st_mtime_ns for path in (farm.folder / "s").glob("*/checkpoint")}
     assert "0 of 4 runs to do" in farm.call(*SHORT, "--out", "s")
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
-    assert "was begun with --pairs 6; here it is 7" in farm.call(*SHORT, "--pairs", "7", "--out", "s", status=2)
+    assert "was started with --pairs 6; here it is 7" in farm.call(*SHORT, "--pairs", "7", "--out", "s", status=2)
 
 
 @pytest.mark.slow

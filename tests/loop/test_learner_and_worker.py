@@ -124,7 +124,7 @@ def test_a_host_that_lies_by_a_last_bit_changes_nothing(
     config = configure(f"{cart}:Cart", **{**SMALL, "generations": 40})  # long enough for all three to join
     honest = learnt(config, tmp_path / "honest", 1, cart)
     shaded = learnt(config, tmp_path / "shaded", 3, cart, liars=1, audit=0.5)
-    assert "host w0 gave other numbers than two other hosts" in caplog.text
+    assert "host w0 gave different numbers than two other hosts" in caplog.text
     assert shaded["parameters_sha256"] == honest["parameters_sha256"]
 
 

@@ -117,7 +117,7 @@ def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, said in (
         (("fig-9",), "unknown experiment 'fig-9'; known are fig-4.1"),
         ((), "which experiment? python -m benchmarks.thesis --list shows them"),
-        (("fig-4.5", "--out", str(tmp_path / "side")), "side holds fig-4.3: give another --out"),
+        (("fig-4.5", "--out", str(tmp_path / "side")), "side holds fig-4.3: give a different --out"),
         (("fig-4.3", "--workers", "0"), "there would be no workers"),
         (("fig-4.3", "--trials", "0"), "trials is 0; expected 1 to 1000"),
         (("plot", "nowhere"), "nowhere is not an experiment's folder"),

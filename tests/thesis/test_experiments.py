@@ -253,9 +253,9 @@ def test_a_folder_is_one_experiments(tmp_path):
     ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)
     assert ExperimentFolder.open(out).setups == ("joints-D300", "joints-D1500", "joints-D8000")
     assert len(todo(ExperimentFolder.prepare(out, ["fig-4.3"], 3, None).runs)) == 9
-    with pytest.raises(ConfigError, match=r"holds fig-4\.3: give another --out"):
+    with pytest.raises(ConfigError, match=r"holds fig-4\.3: give a different --out"):
         ExperimentFolder.prepare(out, ["fig-4.5"], 3, None)
-    with pytest.raises(ConfigError, match="begun with all generations"):
+    with pytest.raises(ConfigError, match="started with all generations"):
         ExperimentFolder.prepare(out, ["fig-4.3"], 3, 5)
     with pytest.raises(ConfigError, match="has 3 trials"):
         ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)

@@ -1,1 +1,1 @@
-"""Simulation backends of workers."""
+"""The simulation backends of workers."""

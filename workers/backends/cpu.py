@@ -1,4 +1,4 @@
-"""The backend `cpu`: mujoco.batch on this machine's processor, on one thread per worker."""
+"""The backend `cpu`: MuJoCo on this machine's processor, with one thread per worker."""
 
 from typing import ClassVar
 
@@ -8,10 +8,10 @@ from farm.sim.engines import CAPACITY, BatchEngine
 
 
 class CpuBackend:
-    """Makes engines of mujoco.batch."""
+    """Makes engines that step a batch of MuJoCo simulations."""
 
     capacity: ClassVar[int] = CAPACITY
 
     def engine(self, model: mujoco.MjModel) -> BatchEngine:
-        """Make room for a model's simulations."""
+        """An engine for this model's simulations."""
         return BatchEngine(model, self.capacity)

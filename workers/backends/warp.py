@@ -1,7 +1,7 @@
-"""The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU; the only door to it.
+"""The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU.
 
-Everything on the device is in single precision, so the numbers are not those of the backend `cpu`. Arrays for tasks
-are in the host's memory, read back after control steps, not after each physics step.
+Only this module imports it. The device computes in single precision, so results differ from those of the backend
+`cpu`. Tasks read arrays in the host's memory, which are updated after each control step, not each physics step.
 """
 
 import copy
@@ -19,27 +19,27 @@ from farm.sim.sim import Rebound, failed_rows, own_value
 
 _Overflow: Final = mujoco_warp.OverflowType
 _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATIONS))
-"""What there was no room for; that a solver stops at its last iteration is no such thing."""
+"""Overflows of contacts or constraints; a solver that reaches its last iteration is not an overflow."""
 _MOST_ROOM: Final = 64
 _DERIVED: Final = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
     *("geom_aabb", "geom_rbound", "eq_data"),
 )
-"""Constants that follow from fields that may differ between rollouts."""
+"""Constants that MuJoCo derives from other fields, which may differ between rollouts."""
 
 
 class WarpBackend:
     """Makes engines of MuJoCo Warp, on the GPU if there is one.
 
-    Its workers take part in runs with `--mixed`. MuJoCo on the worker's processor simulates the mean policy and
-    whatever is shown: only exploring rollouts are the GPU's.
+    Its workers take part only in runs with `--mixed`. The GPU simulates exploring rollouts; MuJoCo on the worker's
+    processor simulates the mean policy and everything that is recorded.
     """
 
     capacity: ClassVar[int] = 4096
     exact: ClassVar[bool] = False
 
     def engine(self, model: mujoco.MjModel) -> "WarpEngine":
-        """Make room for a model's simulations."""
+        """An engine for this model's simulations."""
         return WarpEngine(model, self.capacity)
 
 
@@ -47,10 +47,10 @@ class WarpEngine:
     """Simulations of one model in MuJoCo Warp, each in a world of its own."""
 
     def __init__(self, model: mujoco.MjModel, size: int) -> None:
-        """Allow `size` rows; the device's memory is taken when they are used.
+        """Permit `size` rows; the device's memory is allocated when rows are used.
 
         Raises:
-          FarmError: MuJoCo Warp does not simulate such a model.
+          FarmError: MuJoCo Warp does not support this model.
         """
         warp.config.log_level = warp.LOG_WARNING
         self.model, self.size = model, size
@@ -79,7 +79,7 @@ class WarpEngine:
         return known
 
     def reset(self, ids: IntArray) -> None:
-        """Bring all rows to the model's own start."""
+        """Set all rows to the model's initial state."""
         self._put(len(ids))
         mujoco_warp.reset_data(self._device, self._data)
         self._read_all()
@@ -92,7 +92,7 @@ class WarpEngine:
         self._checked(ids)
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:
-        """Advance rows by one physics step for each of their controls."""
+        """Advance rows by one physics step per control."""
         self._write()
         row = np.zeros((self._worlds, self.model.nu), dtype=np.float32)
         for step in range(controls.shape[1]):
@@ -144,11 +144,11 @@ class WarpEngine:
         mujoco_warp.set_const(self._device, self._data)
 
     def close(self) -> None:
-        """Give the device's memory back."""
+        """Free the device's memory."""
         self._device = self._data = self._graph = None
 
     def _put(self, rows: int) -> None:
-        """Have at least so many worlds; states of those that there were are lost if there are more now."""
+        """Allocate at least this number of worlds; if it grows, all states are lost."""
         if rows <= self._worlds:
             return
         self._worlds = min(self.size, 1 << (rows - 1).bit_length())
@@ -183,11 +183,11 @@ class WarpEngine:
         warp.capture_launch(self._graph)
 
     def _checked(self, ids: IntArray) -> None:
-        """Read what is asked for back, unless there was no room for contacts or constraints.
+        """Read the requested arrays back, unless the buffers for contacts or constraints overflowed.
 
         Raises:
-          Rebound: the batch begins again with twice the room: what does not fit must not be left out silently.
-          FarmError: there is no end to it.
+          Rebound: they did; the batch must start again with buffers of twice the size, as no contact may be dropped.
+          FarmError: they overflowed at the largest permitted size.
         """
         full = int(np.bitwise_or.reduce(_numbers(self._data.overflow)[ids], initial=0)) & _FULL
         if not full:
@@ -202,7 +202,7 @@ class WarpEngine:
         return hasattr(self._data, name) and np.size(getattr(self._example, name)) > 0
 
     def _write(self) -> None:
-        """States as the host has them to the device; single precision back and forth changes nothing."""
+        """Copy the host's states to the device; rounding an unchanged state to single precision changes nothing."""
         for name, values in self._host.items():
             if name in STATE_FIELDS and self._has(name):
                 field = getattr(self._data, name)
@@ -219,7 +219,7 @@ class WarpEngine:
 
 
 def _numbers(values: Any) -> AnyArray:  # noqa: ANN401  a warp array
-    """On the host, a copy (worlds, ...)."""
+    """A copy on the host, (worlds, ...)."""
     return np.array(values.numpy())
 
 
@@ -230,6 +230,6 @@ def _like(values: AnyArray, field: Any) -> AnyArray:  # noqa: ANN401  a warp arr
 
 
 def _defaults(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts and constraints for which MuJoCo Warp makes room in a world unless told otherwise."""
+    """Numbers of contacts and constraints that MuJoCo Warp allocates per world by default."""
     made = mujoco_warp.make_data(model)
     return made.naconmax, made.njmax

@@ -146,10 +146,10 @@ def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
     for other, said in (
         (made(out, "0.1", "0.2"), "has seeds 2 as well"),
         (made(out, "0.1", seeds=(0, 1, 2)), "varies initial_sigma=0.1,0.2; here it is initial_sigma=0.1:"),
-        (made(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was begun with --pairs 5; here it is 3"),
-        (made(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3), "was begun with --generations 90; here it is 3"),
+        (made(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was started with --pairs 5; here it is 3"),
+        (made(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3), "was started with --generations 90; here it is 3"),
     ):
-        with pytest.raises(ConfigError, match="another --out") as error:
+        with pytest.raises(ConfigError, match="a different --out") as error:
             other.prepare()
         assert said in str(error.value)
 

@@ -103,12 +103,12 @@ def test_names_and_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     known = Attendance()
     for name in ("a/1", "b/1"):
         known.came(name)
-    with pytest.raises(MessageError, match="2 workers, or 1000 of its name, are there"):
+    with pytest.raises(MessageError, match="there are already 2 workers, or 1000 of its name"):
         known.came("c/1")
     known.came("b/1")
     for name in ("d/1", "e/1"):
         known.asked(want(name), 0.0)
-    with pytest.raises(MessageError, match="2 others ask"):
+    with pytest.raises(MessageError, match="2 requests of workers"):
         known.asked(want("f/1"), 0.0)
     assert not known.asked(want("d/1", 9), 0.0)
     known.left("a/1")

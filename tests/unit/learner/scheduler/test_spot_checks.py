@@ -1,4 +1,4 @@
-"""Hosts whose numbers are wrong are found out, and their jobs are done again."""
+"""Hosts whose numbers are wrong are found out, and their jobs are repeated."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_a_host_that_lies_is_found_and_its_jobs_are_done_again(learner: Learner,
     for _ in range(2):
         assert collected(learner, hosts, (honest, honest, lie)) == list(range(12))
     assert farm.workers == ("a/1", "b/1")
-    assert "host liar gave other numbers" in codec.decode(hosts[2].refused, Refusal).reason
+    assert "host liar gave different numbers" in codec.decode(hosts[2].refused, Refusal).reason
     assert "unasked" not in farm.ignored, "an honest host is blamed"
 
 
@@ -73,7 +73,7 @@ def test_two_hosts_that_differ_wait_for_a_third(learner: Learner, hire: Hire, ca
     for worker in hosts:
         worker.want(4)
     result = learner.collect(jobs(4))
-    while "no third host is there" not in caplog.text:
+    while "there is no third host" not in caplog.text:
         hosts[0].serve(learner)
         hosts[1].serve(learner, LIES["one percent of all"])
     assert not result.done()
