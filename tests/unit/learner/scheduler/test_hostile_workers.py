@@ -1,5 +1,6 @@
 """The learner's side of the network, against workers and sessions that are hostile; no physics."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -58,6 +59,7 @@ def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner
 def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membership, "_SOON", 0.0)
     monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
+    monkeypatch.setattr(dispatchers, "_STATUS_PART", math.inf)
     farm = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(30))
