@@ -451,7 +451,7 @@ def test_play_on_a_display(done: Farm, screen: str, monkeypatch: pytest.MonkeyPa
     process = done.start("play", "runs/a", "--speed", "10", "--hold", "0")
     assert process.stdout is not None
     assert "double-click a body" in process.stdout.readline()
-    assert "the first rollout is over" in process.stdout.readline()
+    assert "the first rollout ended after" in process.stdout.readline()
     process.send_signal(number)
     said, _ = process.communicate(timeout=30)
     assert process.returncode == 130, said
