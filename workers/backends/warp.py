@@ -20,6 +20,8 @@ from farm.sim.sim import Rebound, failed_rows, own_value
 _Overflow: Final = mujoco_warp.OverflowType
 _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATIONS))
 """Overflows of contacts or constraints; a solver that reaches its last iteration is not an overflow."""
+_MEANINGLESS: Final = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+"""Flags that Warp refuses and that change nothing there: it never resets by itself and has no midphase."""
 _MOST_ROOM: Final = 64
 _DERIVED: Final = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
@@ -55,7 +57,7 @@ class WarpEngine:
         warp.config.log_level = warp.LOG_WARNING
         self.model, self.size = model, size
         self._plain = copy.copy(model)
-        self._plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp never resets by itself
+        self._plain.opt.disableflags &= ~_MEANINGLESS
         self._host: dict[str, AnyArray] = {}  # (size, ...)
         self._expanded: dict[str, AnyArray] = {}  # (size, ...)
         self._example = mujoco.MjData(model)

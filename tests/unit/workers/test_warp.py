@@ -122,3 +122,12 @@ def test_a_model_that_it_cannot_simulate_is_refused_in_a_line() -> None:
     assert BatchEngine(model, 1).size == 1
     with pytest.raises(FarmError, match="MuJoCo Warp cannot simulate this model: Dense is unsupported"):
         warp.WarpEngine(model, 4)
+
+
+def test_flags_that_mean_nothing_there_are_no_obstacle() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option><flag midphase="disable" autoreset="disable"/></option>'
+        '<worldbody><body><freejoint/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    assert warp.WarpEngine(model, 4).field("qpos").shape == (4, 7)
+    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MIDPHASE, "only a copy is changed"
