@@ -90,12 +90,13 @@ def test_a_device_refuses_what_it_does_not_know(farm: Farm) -> None:
 
 
 def test_the_example_as_it_says(farm: Farm) -> None:
-    """Workers that simulate are beside it: the first job is one that the rig's guard stops."""
+    """Workers that simulate are beside it: its jobs are some that the rig's guard stops, however late it joins."""
     shutil.copy(EXAMPLES / "rig.py", farm.folder)
     run, robot = ((EXAMPLES / "robot_worker.py").read_text().splitlines()[at].split("#")[0].split() for at in (2, 3))
     endpoint = free_endpoint()
     _, command, *flags = [endpoint if word.startswith("tcp/") else word for word in run]
-    learner = farm.start(command, *flags, "--generations", "2000", "--no-record", "--name", "r")
+    still = ("--learning-rate-mu", "1e-9", "--learning-rate-sigma", "1e-9")  # soon the guard would stop none
+    learner = farm.start(command, *flags, *still, "--generations", "2000", "--no-record", "--name", "r")
     wait_for(learner, " 1/2000 ")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), robot[2], endpoint, "--clock", "50")
     wait_for(learner, "(release robot_worker)")
