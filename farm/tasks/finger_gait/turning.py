@@ -1,7 +1,7 @@
-"""Turning: a plate is turned about the vertical by regrasping, and slowly, so that no finger flicks it.
+"""Turning: the hand turns a plate about the vertical by regrasping it, slowly, without flicking it.
 
-The hand holds the plate with three fingers, the thumb below. A policy sees where in a cycle it is, and perhaps the
-joints and what the fingertips feel. Turning counts up to a wanted speed; what is faster costs as much again.
+Three fingers hold the plate, the thumb from below. The observation is the phase of a cycle and, if chosen, the joint
+positions and the fingertips' forces. The reward grows with the speed up to a wanted one; speed beyond it is penalised.
 """
 
 from collections.abc import Mapping
@@ -20,15 +20,15 @@ from farm.tasks.finger_gait.hand import FINGERS, JOINTS
 from farm.tasks.finger_gait.task import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, FingerGait, distance
 
 TERMS: Final = ("turn", "speed", "pose", "action", "drop")
-"""What the reward is made of."""
+"""Names of the reward terms."""
 
-_HARMONICS: Final = np.arange(1, 4)  # of the cycle's frequency, that are seen
+_HARMONICS: Final = np.arange(1, 4)  # multiples of the cycle's frequency in the observation
 _LEVEL: Final = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt from which the plate is lost
 _SIZES: Final = {"phase": 2 * len(_HARMONICS), "joints": len(JOINTS), "forces": len(FINGERS)}
-_FORCE: Final = 0.1  # of the forces that are seen [1 / N]
+_FORCE: Final = 0.1  # factor of the forces in the observation [1 / N]
 _ACTION: Final = 0.02  # reward per squared change of the targets [1 / rad^2]
-_POSE: Final = 0.6  # reward that a plate loses which is tilted or shifted so far that it is nearly lost
-_FASTEST: Final = 3.0  # times the wanted speed: what is faster costs no more
+_POSE: Final = 0.6  # reward lost per step at the largest tilt or shift permitted
+_FASTEST: Final = 3.0  # multiple of the wanted speed at which the penalty stops growing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class TurningConfig(TaskConfig):
     """Settings of turning."""
 
     state: Literal["phase", "phase+joints", "phase+forces", "phase+joints+forces"] = "phase+forces"
-    """What a policy sees besides the time in its cycle: nothing, the joints, the fingertips' forces, or both."""
+    """The observation: the phase alone, or also joint positions, fingertip forces, or both."""
     cycle: float = setting(2.0, least=0.2, most=100.0)
     """Time of a cycle [s]."""
     wanted: float = setting(60.0, above=0.0, most=360.0)
@@ -44,7 +44,7 @@ class TurningConfig(TaskConfig):
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
 
-    # What the finger gait has settings for, and is fixed here: no fields, so no flags.
+    # Settings of the finger gait that are fixed here: class attributes, so there are no flags for them.
     object = "plate"
     pose = "between"
     start_grip = "index+middle+thumb"
@@ -76,11 +76,11 @@ class Turning(FingerGait):
 
     @property
     def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
-        """Sizes of what is seen."""
+        """Sizes of the observation's parts."""
         return tuple(_SIZES[part] for part in self.config.state.split("+"))
 
     def setup(self, sim: Sim) -> None:
-        """Find the start grip; a ConfigError where it does not hold."""
+        """Find the start grip; a ConfigError if it does not hold."""
         self._find_start(sim)
 
     def observe(self, sim: Sim) -> FloatArray:
@@ -96,13 +96,13 @@ class Turning(FingerGait):
         return np.concatenate(seen, axis=1)
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where the plate is tilted or out of place, or no fingertip touches it."""
+        """Whether the plate is tilted too far, out of place, or touched by no fingertip, (B,)."""
         pose = sim.qpos[:, len(JOINTS) :]
         shift, _ = distance(pose, sim.own["released"])
         return super().ended(sim) | (shift > MAX_SHIFT) | (upright(pose) < _LEVEL)
 
     def score(self, record: Record) -> Score:
-        """Reward terms; a success is a plate that is still held and turned at half of the wanted speed or more."""
+        """Reward terms; success: the plate is still held, and turned at half the wanted speed or more on average."""
         pose, start = record.frames["qpos"][..., len(JOINTS) :], record.start["qpos"][:, None, len(JOINTS) :]
         wanted = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
         speed = turned(np.concatenate([start, pose], axis=1)) / wanted
