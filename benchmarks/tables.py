@@ -7,6 +7,8 @@
 
 Runs with several seeds are simulated together in one batch, in this process. For each a `farm run` command is printed
 that gives the same results to the last bit. The score is the mean return of the last mean policy from 100 new starts.
+
+`--state FILE` saves the runs to FILE every minute and on Ctrl-C; the same command continues them, to the same bits.
 """
 
 import argparse
@@ -14,7 +16,9 @@ import hashlib
 import itertools
 import json
 import shlex
+import signal
 import sys
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -135,6 +139,19 @@ class Search:
             self.moments = merged(self.moments, np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments)))
         self.curve.append((self.steps, float(rollouts.returns.mean())))
 
+    def saved(self) -> dict[str, Any]:
+        """Everything from which `restore` continues, by name."""
+        values = {"steps": self.steps, "pairs": self.pairs, "moments": self.moments, "curve": np.array(self.curve)}
+        return values | {f"state.{name}": value for name, value in self.state.to_dict().items() if value is not None}
+
+    def restore(self, values: Mapping[str, Any]) -> None:
+        """Continue from values of `saved`."""
+        own = {name.partition(".")[2]: value for name, value in values.items() if name.startswith("state.")}
+        empty = dict.fromkeys(self.state.to_dict())
+        self.state = self.state.from_dict(empty | {n: v if v.ndim else v.item() for n, v in own.items()})
+        self.steps, self.pairs, self.moments = int(values["steps"]), int(values["pairs"]), values["moments"]
+        self.curve = [(int(at), float(value)) for at, value in values["curve"]]
+
     def extended(self, theta: FloatArray) -> FloatArray:
         """Parameters (B, P), each row followed by mean and standard deviation of its observations, (B, P + 2 d)."""
         return np.hstack([theta, np.tile(normaliser(self.moments).ravel(), (len(theta), 1))])
@@ -167,6 +184,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="budget of environment steps per seed, instead of the table's")
     parser.add_argument("--starts", type=int, default=100, help="number of rollouts for the score")
     parser.add_argument("--out", type=Path, help="file to which each seed's numbers are added, as a line of JSON")
+    parser.add_argument("--state", type=Path, help="file from which interrupted runs continue, for example state.npz")
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
     if arguments.list or arguments.table is None:
@@ -180,8 +198,10 @@ def main() -> None:
     values = dict(row.settings) | ({"stop_after_steps": arguments.steps} if arguments.steps else {})
     task = f"gym:{arguments.environment}"
     searches, runner = _begun(task, values, arguments.seed)
-    begun = time.monotonic()
-    _learn(searches, runner)
+    if arguments.state and arguments.state.exists():
+        _load(arguments.state, searches)
+    begun, before = time.monotonic(), sum(search.steps for search in searches)
+    _learn(searches, runner, arguments.state)
     print(f"| environment | seed | settings | steps | published | ours, {arguments.starts} starts | parameters |")
     print("|---|---|---|---|---|---|---|")
     for search in searches:
@@ -202,7 +222,7 @@ def main() -> None:
         if arguments.out:
             with arguments.out.open("a") as file:
                 file.write(json.dumps(found) + "\n")
-    total = sum(search.steps for search in searches)
+    total = sum(search.steps for search in searches) - before
     values = {"generations": _MOST, **values}
     print(f"\nfarm run --task {task} {_flags(values)} --seed S    gives the same parameters")
     print(f"{total / (time.monotonic() - begun):.0f} steps/s in this process")
@@ -223,8 +243,26 @@ def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[li
     return searches, runner
 
 
-def _learn(searches: list[Search], runner: Runner) -> None:
+def _save(path: Path, searches: list[Search]) -> None:
+    arrays = {f"{s.config.seed}.{name}": value for s in searches for name, value in s.saved().items()}
+    aside = path.with_suffix(".new.npz")
+    np.savez(aside, allow_pickle=False, **arrays)
+    aside.replace(path)
+
+
+def _load(path: Path, searches: list[Search]) -> None:
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    for search in searches:
+        first = f"{search.config.seed}."
+        search.restore({name.removeprefix(first): value for name, value in arrays.items() if name.startswith(first)})
+
+
+def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) -> None:
     """Run all seeds to their end, one generation of each at a time."""
+    stopped = threading.Event()
+    for which in (signal.SIGINT, signal.SIGTERM) if saved else ():
+        signal.signal(which, lambda *_: stopped.set())
     config, task = searches[0].config, runner.task
     offset = config.task_config.reward_offset
     offsets = np.array([0.0, *itertools.accumulate([task.return_scale * offset] * task.steps)])
@@ -240,6 +278,10 @@ def _learn(searches: list[Search], runner: Runner) -> None:
         for search, (own, _) in zip(going, asked, strict=True):
             search.tell(rollouts.at(slice(first, first + len(own))), offsets)
             first += len(own)
+        if saved and (stopped.is_set() or time.monotonic() - shown > 60):
+            _save(saved, searches)
+        if stopped.is_set():
+            sys.exit(f"stopped; the same command continues from {saved}")
         if time.monotonic() - shown > 60:
             shown = time.monotonic()
             now = ", ".join(f"{s.steps / 1e6:.2f}M {s.curve[-1][1]:.0f}" for s in going)
