@@ -1,10 +1,10 @@
 """Makes docs/results.md and the pages under docs/results/ from a folder of `python -m benchmarks.thesis thesis`.
 
-    python -m docs.results runs/thesis [--machine SENTENCE]        (docs/results itself: pages and figures again)
+    python -m docs.results runs/thesis [--machine SENTENCE]     (docs/results as the folder: only pages and figures)
 
-Data is put beside what is there, and figures are drawn; every number in the tables comes from the data. What is written
-by hand is in docs/results/notes.md: under an experiment's name, what its result means; under `page NAME`, the answer at
-the top of a page. There `{NAME}` becomes an experiment's link and verdict.
+The folder's data is added to docs/results/data, and the figures are drawn. Every number in the tables comes from the
+data. The texts written by hand are in docs/results/notes.md: under an experiment's name, what its result means; under
+`page NAME`, the answer at the top of a page. There `{NAME}` becomes an experiment's link and verdict.
 """
 
 import argparse
@@ -34,60 +34,60 @@ PAGES: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "convergence": ("Does the search converge?", ("fig-4.2", "fig-4.2-fitted")),
     "features": ("How many features does the kernel need?", ("fig-4.3", "table-3.2", "why-features")),
     "state-bases": (
-        "What should the controller see?",
+        "What should the controller observe?",
         ("fig-4.4", "why-contacts", "equal-accuracy", "fig-4.4-fitted", "equal-accuracy-fitted"),
     ),
     "pairs": (
         "Few pairs per generation, or many?", ("fig-4.5", "fig-4.6", "fig-4.5-fitted", "fig-4.6-fitted"),
     ),
     "start": ("Where should the search begin?", ("text-8000", "why-start", "start-fitted", "why-fitted")),
-    "scaling": ("Does the size of the returns matter?", ("text-3.5.2",)),
-    "baselines": ("What are pairs and baselines worth?", ("baselines",)),
+    "scaling": ("Does the scale of the returns matter?", ("text-3.5.2",)),
+    "baselines": ("Do pairs and baselines help?", ("baselines",)),
     "objects": ("Does it work with other objects?", ("objects", "objects-between")),
     "chain": ("Can gaits be chained?", ("release", "chain")),
     "friction": ("How much friction does it take?", ("friction",)),
 }  # fmt: skip
-"""Pages by name: the question, and the experiments that answer it."""
+"""Pages by name: their question, and the experiments that answer it."""
 
 FUTURE: Final = "future-work"
-"""The page on what the thesis proposes (5.2)."""
+"""The page about the proposals of the thesis (5.2)."""
 
 HEAD = """# Results
 
 These pages test the claims of Plage 2016, and the questions that the thesis leaves open, with this project: one page
 per question. `docs/results.py` makes all of them from the data in `docs/results/`. From a checkout, `python -m
-benchmarks.thesis plot docs/results` draws the figures again from this data, and `python -m benchmarks.thesis NAME`
-repeats an experiment (`thesis` instead of a name repeats all; `--list` shows how long each takes).
+benchmarks.thesis plot docs/results` redraws the figures from this data, and `python -m benchmarks.thesis NAME` repeats
+an experiment (`thesis` instead of a name repeats all; `--list` shows how long each takes).
 
 | question | experiment | verdict |
 |---|---|---|
 {overview}
 
-What the thesis proposes as future work (5.2), and the result of each proposal: [{future}](results/{future}.md).
+The thesis proposes future work (5.2): [{future}](results/{future}.md) has the result of each proposal.
 
-Results that have pages of their own:
+Results with pages of their own:
 
 | question | answer |
 |---|---|
-| [Does touch decide?](touch.md) | {touch} |
-| [How many cycles does a chain of gaits make?](chain.md) | ten or more with each of five seeds |
+| [Is touch needed?](touch.md) | {touch} |
+| [How often can a chain of gaits be repeated?](chain.md) | ten times or more, with each of five seeds |
 | [Can an object be turned?](turning.md) | a plate, by 360 degrees: by a script, and by 14 of 16 learnt policies |
 | [How reliably do the presets learn?](seeds.md) | `default` with ten of ten seeds, `thesis` with eight of ten |
 | [How do the learners compare with published scores?](learners.md) | a table per environment |
 
 ## How to read the pages
 
-Each set-up is run with seeds 0 to {last}, its *trials*. Its settings are the preset `thesis` with the changes in the
-thesis' caption or text, or the former preset `default`: mu 1.75, sigma 0.8, N 15, alpha_mu 0.1
-([method.md](method.md) explains the symbols). **Learnt** means that the final mean policy succeeds on the nominal
-start and on at least 80 % of 100 perturbed ones. Numbers are means over the trials, with the smallest and the largest
-in brackets. For comparison (weights *projected*): holding still returns -5.4, and the three-finger grip's commands
-from the first step on return -0.07.
+Each set-up was run with the seeds 0 to {last}; these runs are its *trials*. Most set-ups are the preset `thesis` with
+the settings that the thesis gives in a caption or in the text. The others are the former preset `default`: mu 1.75,
+sigma 0.8, N 15, alpha_mu 0.1 ([method.md](method.md) explains the symbols). **Learnt** means that the final mean policy
+succeeds on the nominal start and on at least 80 % of 100 perturbed starts. Numbers are means over the trials, with the
+smallest and the largest in brackets. For comparison, with the weights *projected* a hand that holds still returns -5.4,
+and a hand that commands the three-finger grip from the first step on returns -0.07.
 
-Nothing was tuned to agree with the thesis. Verdicts are computed: each part of a claim is a comparison in
-`benchmarks/thesis/claims.py`; *reproduced* means that all hold, *in part* some, *not reproduced* none. Our own
-questions have no claim, so their tables show which set-ups learn. The text below a result explains it; the evidence
-is in the experiments whose names begin with `why-`.
+Nothing was tuned to agree with the thesis. Verdicts are computed: `benchmarks/thesis/claims.py` tests each part of a
+claim. *Reproduced* means that all parts hold, *in part* that some hold, and *not reproduced* that none holds. Our own
+questions have no claim, so their tables show which set-ups learn. A text below each result explains it. The evidence
+for these explanations is in the experiments whose names begin with `why-`.
 
 {machine}
 """
@@ -191,12 +191,13 @@ def said(experiment: Experiment, data: Data) -> str:
 
 
 def _grouped(found: Sequence[Finding]) -> list[str]:
-    """Parts with the same last words are named together."""
+    """Findings in a few words; parts with the same last words are joined."""
     end = os.path.commonprefix([f.part[::-1] for f in found])[::-1]
     _, space, verb = end.partition(" ")
     if len(found) < 2 or not space:
         return [f"{f.part}: {'yes' if f.holds else 'no'}" for f in found]
-    yes, no = ([f.part.removesuffix(f" {verb}") for f in found if f.holds is held] for held in (True, False))
+    named = [(f.part.removesuffix(f" {verb}").removesuffix(":"), f.holds) for f in found]
+    yes, no = ([name for name, holds in named if holds is held] for held in (True, False))
     if not yes:
         return [f"none {verb}"]
     if not no:
@@ -209,13 +210,13 @@ def _listed(parts: Sequence[str]) -> str:
 
 
 def touch(path: Path) -> str:
-    """What the fragile bar's data says."""
+    """The answer of the fragile bar's data."""
     found = {name: 100.0 * np.array(values) for name, values in json.loads(path.read_text("utf-8")).items()}
     felt, blind = found["forces"], {n: v for n, v in found.items() if not re.match("forces|cop|tactile", n)}
     best = max(np.median(values) for values in blind.values())
     return (
-        f"yes: with three forces {int((felt >= 95.0).sum())} of {len(felt)} seeds succeed on at least 95 % of the "
-        f"starts, median {np.median(felt):.3g} %; the best without touch has {best:.3g} %"
+        f"yes: with three contact forces, {int((felt >= 95.0).sum())} of {len(felt)} seeds succeed on at least 95 % "
+        f"of the starts (median {np.median(felt):.3g} %); without touch the best median is {best:.3g} %"
     )
 
 
@@ -236,7 +237,7 @@ def section(experiment: Experiment, data: Data, note: str) -> str:
     if experiment.claim:
         lines += [f"**Claim.** {experiment.claim}", "", f"**Verdict: {verdict(found)}.**", ""]
     if found:
-        lines += ["| | | numbers |", "|---|---|---|"]
+        lines += ["| statement | true? | numbers |", "|---|---|---|"]
         lines += [f"| {f.part} | {'yes' if f.holds else 'no'} | {f.numbers} |" for f in found]
         lines.append("")
     lines += [f"![{experiment.title}]({experiment.name}.svg)", ""]
@@ -250,10 +251,12 @@ def section(experiment: Experiment, data: Data, note: str) -> str:
         lines += [row(label, data) for label in data.series]
         lines.append("")
     if data.series:
-        lines += ["\\* wall time of its runs, four at a time on the same workers.", ""]
+        lines += ["\\* wall time of the set-up's runs; four runs shared the same workers.", ""]
     cost = f", about {minutes(tuple(experiment.curves.values())) * TRIALS:.0f} min on two cores" if data.series else ""
-    again = f"To repeat it: `python -m benchmarks.thesis {experiment.name}`{cost}"
-    lines += [f"{again}; the figure alone: `python -m benchmarks.thesis plot docs/results`."]
+    lines += [
+        f"To repeat it: `python -m benchmarks.thesis {experiment.name}`{cost}. To redraw only the figure: "
+        "`python -m benchmarks.thesis plot docs/results`."
+    ]
     return "\n".join(lines)
 
 

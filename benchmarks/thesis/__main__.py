@@ -1,8 +1,8 @@
 """The reproduction of Plage 2016, from a checkout: experiments of many runs each, and their figures.
 
-python -m benchmarks.thesis NAME ...      does an experiment's runs together, then draws its figure; thesis: all
+python -m benchmarks.thesis NAME ...      runs experiments, then draws their figures; thesis: all experiments
 python -m benchmarks.thesis --list        lists the experiments
-python -m benchmarks.thesis plot FOLDER   draws the figures again, from the recorded data
+python -m benchmarks.thesis plot FOLDER   redraws the figures from the recorded data
 """
 
 import sys
@@ -29,20 +29,20 @@ from learner.figure import INSTALL, available
 from learner.sweep import Sharing
 
 ALL: Final = "thesis"
-"""Name that stands for all experiments."""
+"""The name for all experiments."""
 
 PROGRAM: Final = "python -m benchmarks.thesis"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentCommand:
-    """Does an experiment's runs together, then draws its figure; run it again to continue.
+    """Does the runs of experiments side by side, then draws the figures; the same command continues after Ctrl-C.
 
-    `plot FOLDER` instead of a name draws the figures of such a folder again, from its recorded data.
+    `plot FOLDER` instead of a name redraws the figures of such a folder from its recorded data.
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names of experiments (see --list), or thesis for all."""
+    """Names of experiments (see --list); thesis means all."""
     list: bool = False
     """List the experiments, and exit."""
     trials: int = TRIALS
@@ -64,7 +64,7 @@ class ExperimentCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class PlotCommand:
-    """The figures of an experiment again, from its recorded data: PNG and SVG."""
+    """Redraws the figures of an experiment from its recorded data, as PNG and SVG."""
 
     folder: tyro.conf.Positional[Path]
     """Folder of an experiment."""
@@ -92,7 +92,7 @@ def main(words: Sequence[str]) -> int:
             complete = sweep.run(folder.runs, command.sharing, shown, stop.is_set)
         folder.gather()
         if stop.is_set():
-            sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command continues with them\n")
+            sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command continues\n")
             return INTERRUPTED
     draw(folder)
     return 0 if complete else 1
@@ -148,7 +148,7 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
     found = judge(experiment, data)
     lines += [f"  {'yes' if finding.holds else 'no '}  {finding.part}: {finding.numbers}" for finding in found]
     if folder.generations is not None:
-        lines.append(f"  runs are cut to {folder.generations} generations: that says little about the claim")
+        lines.append(f"  runs shortened to {folder.generations} generations say little about the claim")
     elif experiment.claim and found:
         lines.append(f"  {verdict(found)}")
     sys.stdout.write("\n".join(lines) + "\n")
@@ -161,9 +161,9 @@ def _list() -> None:
     for name, experiment in EXPERIMENTS.items():
         table.add_row(name, experiment.question, *_cost(tuple(experiment.curves.values())))
     every = tuple(dict.fromkeys(s for e in EXPERIMENTS.values() for s in e.curves.values()))
-    table.add_row(ALL, "all of them; runs that several experiments share are done once", *_cost(every))
+    table.add_row(ALL, "all experiments; a run that several of them share is done once", *_cost(every))
     Console().print(table)
-    sys.stdout.write(f"runs, rollouts and minutes on two cores are for {TRIALS} trials; --trials changes it\n")
+    sys.stdout.write(f"Runs, rollouts and minutes on two cores, for {TRIALS} trials (--trials changes it)\n")
 
 
 def _cost(setups: tuple[str, ...]) -> tuple[str, str, str]:

@@ -1,7 +1,7 @@
 """Every experiment, by name. To add one, write its set-ups (named configurations) and the experiment here.
 
-The set-ups of the thesis' experiments are `--preset thesis` with the settings that the figure's caption and the text
-give; other settings keep the preset's value (docs/method.md lists what the thesis leaves open).
+The set-ups of the thesis' experiments are the preset `thesis` with the settings given in the figure's caption and in
+the text. Other settings keep the preset's value (docs/method.md lists what the thesis leaves open).
 """
 
 from collections.abc import Mapping
@@ -113,7 +113,7 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "default-plain": _default(estimator="plain"),
     "default-plain-optimal-baseline": _default(estimator="plain", baseline="optimal"),
 }  # fmt: skip
-"""Configurations by name; a run has one of them and a seed, and all experiments that show it share it."""
+"""Configurations by name. A run has one of them and a seed; all experiments that show this run share it."""
 
 FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     f"{name}-{suffix}": (name, parts)
@@ -128,7 +128,7 @@ FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     )
     for name in names
 }
-"""Set-ups with a fitted start: name -> the original set-up, and which of bandwidth and first sigma are fitted."""
+"""Set-ups with a fitted start: name -> the original set-up, and which of bandwidth and initial sigma are fitted."""
 
 
 @cache
@@ -152,8 +152,8 @@ _CLAIMS: Final = [
         name="fig-4.1",
         title="Direct learning: late success, then a race to the bottom",
         question="What happens when the weights of the features are learnt directly?",
-        claim="Flat for 50 to 70 generations, a peak by about 100, then returns fall without end while actions grow to "
-        "100 times the joint range; the grip is not changed (4.1.1).",
+        claim="Returns are flat for 50 to 70 generations, peak by about generation 100, and then fall without bound, "
+        "while actions grow to 100 times the joint range. The grip does not change (4.1.1).",
         curves={"direct, D 100, N 50": "direct-contacts-N50"},
         figure=Curves(panels=("return", "action"), scale="symlog"),
         find=claims.race,
@@ -162,7 +162,7 @@ _CLAIMS: Final = [
         name="fig-4.2",
         title="Convergence of mu and sigma",
         question="Does the search distribution converge when parameters are projected?",
-        claim="Sigma goes to 0 and mu converges, to another value in each trial (4.2.1).",
+        claim="Sigma goes to 0 and mu converges, to a different value in each trial (4.2.1).",
         curves={"projected, joints+contacts, D 1500": "contacts-D1500"},
         figure=Curves(panels=("mu_2", "sigma_2")),
         find=claims.converges,
@@ -171,16 +171,17 @@ _CLAIMS: Final = [
         name="fig-4.3",
         title="Number of features",
         question="How does learning depend on the number of random features?",
-        claim="The more features, the faster, higher and more evenly it learns; 300 learn nothing in 150 generations "
-        "(4.2.2).",
+        claim="With more features learning is faster, ends with higher returns, and differs less between trials. With "
+        "300 features nothing is learnt in 150 generations (4.2.2).",
         curves={"D 300": "joints-D300", "D 1500": "joints-D1500", "D 8000": "joints-D8000"},
         find=claims.features,
     ),
     Experiment(
         name="fig-4.4",
         title="State bases",
-        question="Which of the hand's senses should the controller see?",
-        claim="Joint positions learn fastest and highest, joint positions with the tactile image slowest (4.2.3).",
+        question="Which state should the controller observe: joint positions, contact points, or the tactile image?",
+        claim="With joint positions learning is fastest and returns are highest; with joint positions and the tactile "
+        "image learning is slowest (4.2.3).",
         curves={
             "joints, D 1500": "joints-D1500",
             "joints+contacts, D 1500": "contacts-D1500",
@@ -192,17 +193,17 @@ _CLAIMS: Final = [
         name="fig-4.5",
         title="Pairs per generation",
         question="Few pairs and many updates, or many pairs and few updates?",
-        claim="N 50 rises at generation 30 to 40, drops and recovers; N 15 rises at 90, smoother and nearly as high "
-        "(4.2.4).",
+        claim="With N 50 returns rise at generation 30 to 40, drop, and recover. With N 15 they rise at generation 90, "
+        "more smoothly and nearly as high (4.2.4).",
         curves={"N 50": "contacts-D1500-N50", "N 15": "contacts-D1500"},
-        find=claims.pairs_a_generation,
+        find=claims.pairs_per_generation,
     ),
     Experiment(
         name="fig-4.6",
-        title="The same over rollouts",
-        question="Which N makes more of the same number of rollouts?",
-        claim="What counts is the number of rollouts; a small N learns sooner (4.2.4). The thesis counts histories, "
-        "of two rollouts each.",
+        title="Pairs per generation, over rollouts",
+        question="Which N learns more from the same number of rollouts?",
+        claim="What matters is the number of rollouts; with a small N learning is faster (4.2.4). The thesis counts "
+        "histories, which are two rollouts each.",
         curves={"N 50": "contacts-D1500-N50", "N 15": "contacts-D1500"},
         figure=Curves(over="rollouts"),
         find=claims.rollouts_count,
@@ -211,7 +212,8 @@ _CLAIMS: Final = [
         name="text-8000",
         title="The best set-up",
         question="Is the gait learnt within 90 generations?",
-        claim="Joint positions, D 8000, N 15: learnt in less than 90 generations, sigma converged after 50 (5, 5.2).",
+        claim="With joint positions, D 8000 and N 15 the gait is learnt in fewer than 90 generations, and sigma has "
+        "converged after 50 (5, 5.2).",
         curves={"joints, D 8000": "joints-D8000"},
         figure=Curves(panels=("return", "success", "sigma")),
         find=claims.learnt_within_90,
@@ -219,9 +221,10 @@ _CLAIMS: Final = [
     Experiment(
         name="text-4.1.1",
         title="Remedies for direct learning",
-        question="Do limits on actions or their punishment, or lower first values, keep direct learning stable?",
-        claim="No. With limited actions every action is at its limit within 10 generations and does not come back "
-        "in 100; lower first mu and sigma do not help (4.1.1).",
+        question="Is direct learning stable with limits on the actions, with a limited punishment of large actions, or "
+        "with lower initial values?",
+        claim="No. With limited actions every action reaches its limit within 10 generations and does not leave it "
+        "within 100. Lower initial mu and sigma do not help (4.1.1).",
         curves={
             "unlimited": "direct-contacts-N50",
             "clipped": "direct-contacts-N50-clipped",
@@ -235,8 +238,8 @@ _CLAIMS: Final = [
     Experiment(
         name="text-4.1.2",
         title="Direct learning: histories per generation",
-        question="Does N matter to direct learning, over 2000 histories?",
-        claim="No difference within 2000 histories, all of them in the flat part (4.1.2).",
+        question="Does the number of histories per generation, N, affect direct learning over 2000 histories?",
+        claim="There is no difference within 2000 histories, during which returns stay flat (4.1.2).",
         curves={
             "N 15": "direct-contacts-N15-short",
             "N 25": "direct-contacts-N25-short",
@@ -248,9 +251,9 @@ _CLAIMS: Final = [
     ),
     Experiment(
         name="text-4.3",
-        title="Direct against projected",
-        question="How do the two ways compare on the same state and N?",
-        claim="A similar rise; then both drop, and only projected learning recovers (4.3).",
+        title="Direct and projected learning compared",
+        question="How do direct and projected learning compare, with the same state and N?",
+        claim="Both rise alike; then both drop, and only projected learning recovers (4.3).",
         curves={"direct, D 100": "direct-contacts-N50", "projected, D 1500": "contacts-D1500-N50"},
         figure=Curves(scale="symlog"),
         find=claims.only_projected_recovers,
@@ -258,7 +261,7 @@ _CLAIMS: Final = [
     Experiment(
         name="text-3.5.2",
         title="Scaled returns",
-        question="Does the size of the returns matter?",
+        question="Does the scale of the returns matter?",
         claim="Learning does not change when returns are scaled (3.5.2).",
         curves={
             "returns x1": "joints-D8000",
@@ -270,8 +273,8 @@ _CLAIMS: Final = [
     ),
     Experiment(
         name="table-3.2",
-        title="Features for an accuracy",
-        question="How many features does a kernel accuracy need?",
+        title="Number of features for an accuracy",
+        question="How many features are needed for a given accuracy of the kernel?",
         claim="D = d eps^-2 log(1/eps^2): for eps 0.1, 1600 features for 8 numbers to 12600 for 63 (table 3.2).",
         figure=KernelError(features=(30, 90, 280, 560, 1600, 3400, 5400, 12600)),
         find=claims.kernel_error,
@@ -281,23 +284,24 @@ _CLAIMS: Final = [
 _QUESTIONS: Final = [
     Experiment(
         name="why-features",
-        title="Is it the kernel's noise?",
-        question="Few features approximate the kernel badly. Does that noise hinder, or explore? The kernel itself "
-        "has none.",
+        title="Does the noise of the approximation matter?",
+        question="Few features approximate the kernel badly. Does this noise hinder learning, or does it help "
+        "exploration? The exact kernel has none.",
         curves={"D 300": "joints-D300", "D 1500": "joints-D1500", "D 8000": "joints-D8000", "kernel": "joints-kernel"},
         figure=Curves(panels=("mean policy", "success")),
         find=claims.learning,
     ),
     Experiment(
         name="why-start",
-        title="Is it where the search begins?",
-        question="mu = 1 squeezes the bar at once, and sigma = 2 makes most samples do nothing. What do a start "
-        "near the held grip (mu 1.75, sigma 0.8), capped steps of sigma, both, and the derived normaliser change?",
+        title="Does the start of the search matter?",
+        question="With mu = 1 the policy squeezes the bar at once, and with sigma = 2 most samples do nothing. What "
+        "changes with a start near the held grip (mu 1.75, sigma 0.8), with capped steps of sigma, with both, and with "
+        "the derived normaliser?",
         curves={
-            "as printed": "joints-D8000",
-            "start near": "joints-D8000-near",
+            "as in the thesis": "joints-D8000",
+            "near start": "joints-D8000-near",
             "sigma capped": "joints-D8000-capped",
-            "near, capped": "joints-D8000-near-capped",
+            "near and capped": "joints-D8000-near-capped",
             "derived normaliser": "joints-D8000-sehnke",
         },
         figure=Curves(panels=("mean policy", "success")),
@@ -305,11 +309,11 @@ _QUESTIONS: Final = [
     ),
     Experiment(
         name="why-race",
-        title="What makes the race to the bottom?",
-        question="Does direct learning run away with another normaliser, or without symmetric sampling "
-        "and normalisation (thesis 3.1)?",
+        title="What causes the race to the bottom?",
+        question="Does direct learning also diverge with a different normaliser, or without symmetric sampling and "
+        "normalisation (thesis 3.1)?",
         curves={
-            "as printed": "direct-contacts-N50",
+            "as in the thesis": "direct-contacts-N50",
             "derived normaliser": "direct-contacts-N50-derived",
             "plain, not normalised": "direct-contacts-N50-plain",
         },
@@ -318,10 +322,10 @@ _QUESTIONS: Final = [
     ),
     Experiment(
         name="why-contacts",
-        title="Is it the contact points, or where the search begins?",
-        question="A contact point of one fingertip radius moves the kernel as far as a joint by 57 degrees: does touch "
-        "hinder less when it counts less? Or is it that nine more numbers take the first mean so far away that the "
-        "kernel is zero, which a width of 2 makes up for?",
+        title="Contact points, or the start of the search?",
+        question="In the kernel, moving a contact point by one fingertip radius counts as much as turning a joint by "
+        "57 degrees. Do contact points hinder less if they are scaled down? Or is the cause that nine more numbers put "
+        "the initial mean so far from every state that the kernel is zero, and does a width of 2 compensate for this?",
         curves={
             "joints alone": "default-bar",
             "contacts x1": "default-contacts",
@@ -335,7 +339,7 @@ _QUESTIONS: Final = [
     Experiment(
         name="cosine",
         title="Direct learning with bounded parameters",
-        question="Thesis 5.2: would the cosine of the parameters make direct learning work?",
+        question="Thesis 5.2: does direct learning work if actions depend on the cosine of the parameters?",
         curves={
             "direct, D 100": "direct-joints-N15-projected-weights",
             "cosine, D 100": "cosine-joints-D100",
@@ -360,8 +364,8 @@ _QUESTIONS: Final = [
     ),
     Experiment(
         name="equal-accuracy",
-        title="State bases at one kernel accuracy",
-        question="Thesis 5: how do the state bases compare when each has the features for an accuracy of 10 %?",
+        title="State bases at equal kernel accuracy",
+        question="Thesis 5: how do the state bases compare if each has as many features as an accuracy of 10 % needs?",
         curves={
             "joints, D 1600": "joints-D1600",
             "joints+contacts, D 3400": "contacts-D3400",
@@ -374,9 +378,9 @@ _QUESTIONS: Final = [
     Experiment(
         name="start-fitted",
         title="A start that fits the size of the state",
-        question="A Gaussian kernel of 17, 54 or 62 numbers is zero at the printed start. Which state bases are learnt "
-        "after 1500 rollouts when the kernel's width and the first sigma are chosen so that the first mean acts a "
-        "little, and a sample's spread moves it by about one (`--start fitted`)?",
+        question="At the thesis' start a Gaussian kernel of 17, 54 or 62 numbers is zero. Which state bases are learnt "
+        "after 1500 rollouts if the kernel's width and the initial sigma are chosen so that the kernel's exponent is "
+        "about two at the initial mean, and sampling changes it by about one (`--start fitted`)?",
         curves={
             f"{state}, {start}": f"{name}{suffix}"
             for start, suffix in (("fitted", "-fitted"), ("printed", ""))
@@ -388,8 +392,8 @@ _QUESTIONS: Final = [
     Experiment(
         name="fig-4.2-fitted",
         title="Convergence of mu and sigma, from the fitted start",
-        question="Does the search distribution converge when the start fits the size of the state?",
-        claim="Sigma goes to 0 and mu converges, to another value in each trial (4.2.1).",
+        question="Does the search distribution converge if the start fits the size of the state?",
+        claim="Sigma goes to 0 and mu converges, to a different value in each trial (4.2.1).",
         curves={"projected, joints+contacts, D 1500": "contacts-D1500-fitted"},
         figure=Curves(panels=("mu_2", "sigma_2")),
         find=claims.converges,
@@ -397,8 +401,9 @@ _QUESTIONS: Final = [
     Experiment(
         name="fig-4.4-fitted",
         title="State bases, from the fitted start",
-        question="Which of the hand's senses should the controller see, when each has a start that fits its size?",
-        claim="Joint positions learn fastest and highest, joint positions with the tactile image slowest (4.2.3).",
+        question="Which state should the controller observe, if each state has a start that fits its size?",
+        claim="With joint positions learning is fastest and returns are highest; with joint positions and the tactile "
+        "image learning is slowest (4.2.3).",
         curves={
             "joints, D 1500": "joints-D1500-fitted",
             "joints+contacts, D 1500": "contacts-D1500-fitted",
@@ -409,28 +414,27 @@ _QUESTIONS: Final = [
     Experiment(
         name="fig-4.5-fitted",
         title="Pairs per generation, from the fitted start",
-        question="Few pairs and many updates, or many pairs and few updates, when the start fits the "
-        "size of the state?",
-        claim="N 50 rises at generation 30 to 40, drops and recovers; N 15 rises at 90, smoother and nearly as high "
-        "(4.2.4).",
+        question="Few pairs and many updates, or many pairs and few updates, if the start fits the size of the state?",
+        claim="With N 50 returns rise at generation 30 to 40, drop, and recover. With N 15 they rise at generation 90, "
+        "more smoothly and nearly as high (4.2.4).",
         curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
-        find=claims.pairs_a_generation,
+        find=claims.pairs_per_generation,
     ),
     Experiment(
         name="fig-4.6-fitted",
-        title="The same over rollouts, from the fitted start",
-        question="Which N makes more of the same number of rollouts, when the start fits the size of the state?",
-        claim="What counts is the number of rollouts; a small N learns sooner (4.2.4). The thesis counts histories, "
-        "of two rollouts each.",
+        title="Pairs per generation, over rollouts, from the fitted start",
+        question="Which N learns more from the same number of rollouts, if the start fits the size of the state?",
+        claim="What matters is the number of rollouts; with a small N learning is faster (4.2.4). The thesis counts "
+        "histories, which are two rollouts each.",
         curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
         figure=Curves(over="rollouts"),
         find=claims.rollouts_count,
     ),
     Experiment(
         name="equal-accuracy-fitted",
-        title="State bases at one kernel accuracy, from the fitted start",
-        question="Thesis 5: how do the state bases compare when each has the features for an accuracy of 10 %, and a "
-        "start that fits its size?",
+        title="State bases at equal kernel accuracy, from the fitted start",
+        question="Thesis 5: how do the state bases compare if each has as many features as an accuracy of 10 % needs, "
+        "and a start that fits its size?",
         curves={
             "joints, D 1600": "joints-D1600-fitted",
             "joints+contacts, D 3400": "contacts-D3400-fitted",
@@ -442,13 +446,13 @@ _QUESTIONS: Final = [
     ),
     Experiment(
         name="why-fitted",
-        title="Width or first sigma?",
-        question="The fitted start changes two settings, the kernel's width (E = 2) and the first sigma (Q = 1). "
-        "Which of them does it?",
+        title="Width or initial sigma?",
+        question="The fitted start changes two settings, the kernel's width (E = 2) and the initial sigma (Q = 1). "
+        "Which of them makes the difference?",
         curves={
             f"{state}, {start}": f"{name}{suffix}"
             for state, name in zip(("joints+contacts", "joints+tactile"), _WIDE, strict=True)
-            for start, suffix in (("width alone", "-width"), ("sigma alone", "-sigma"), ("both", "-fitted"))
+            for start, suffix in (("only width", "-width"), ("only sigma", "-sigma"), ("both", "-fitted"))
         },
         figure=Curves(panels=("mean policy", "success")),
         find=claims.learning,
@@ -456,8 +460,8 @@ _QUESTIONS: Final = [
     Experiment(
         name="objects",
         title="Other objects",
-        question="Thesis 5.2: can the gait be learnt on other objects, and does a policy work on objects it has "
-        "never held?",
+        question="Thesis 5.2: can the gait be learnt with other objects, and does a policy work with objects that it "
+        "was not trained on?",
         curves={name: f"default-{name}" for name in OBJECTS},
         figure=Transfer(objects=OBJECTS),
         find=claims.transfer,
@@ -465,18 +469,19 @@ _QUESTIONS: Final = [
     Experiment(
         name="objects-between",
         title="Other objects, with the thumb between the fingers",
-        question="Can the gait be learnt on other objects within 1500 rollouts when the thumb is between the "
-        "fingers (`--pose between`) and the start fits the size of the state, and does a policy work on objects it has "
-        "never held?",
+        question="Can the gait be learnt with other objects within 1500 rollouts, if the thumb is between the fingers "
+        "(`--pose between`) and the start fits the size of the state? Does a policy work with objects that it was not "
+        "trained on?",
         curves={name: f"between-{name}-fitted" for name in OBJECTS},
         figure=Transfer(objects=OBJECTS),
         find=claims.transfer,
     ),
     Experiment(
         name="release",
-        title="The way back",
-        question="Thesis 5.2: chains need other gaits. Can the middle finger be taken off again (index+middle+thumb to "
-        "index+thumb)? The kernel's actions are never negative, so it can only close; direct ones have a sign.",
+        title="Taking the middle finger off",
+        question="Thesis 5.2: a chain needs more gaits. Can a policy learn to take the middle finger off again "
+        "(index+middle+thumb to index+thumb)? The kernel policy's actions are never negative, so it can only close the "
+        "fingers; actions of direct learning have a sign.",
         curves={"kernel": "release-kernel", "direct, D 100": "release-direct"},
         figure=Curves(panels=("mean policy", "success")),
         find=claims.learning,
@@ -484,24 +489,24 @@ _QUESTIONS: Final = [
     Experiment(
         name="chain",
         title="A chain of gaits",
-        question="Thesis 5.2: can an upper level chain learnt gaits? It switches by touch: when the goal grip has "
-        "been felt for three steps, the other policy takes over.",
-        curves={"add the middle finger": "default-bar", "take it off": "release-direct"},
+        question="Thesis 5.2: can an upper-level policy chain learnt gaits? It switches by touch: when the sensors "
+        "have shown the goal grip for three steps, the other policy takes over.",
+        curves={"add the middle finger": "default-bar", "take the middle finger off": "release-direct"},
         figure=Chain(),
         find=claims.chain,
     ),
     Experiment(
         name="friction",
         title="Friction",
-        question="Thesis 5.2: real fingertips hold better than simulated ones. How does success depend on friction?",
+        question="Thesis 5.2: real fingertips grip better than simulated ones. How does success depend on friction?",
         curves={"default": "default-bar", "thesis, D 8000": "joints-D8000"},
         figure=Friction(factors=(0.01, 0.02, 0.04, 0.07, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)),
         find=claims.friction,
     ),
     Experiment(
         name="baselines",
-        title="Baselines, and plain PGPE",
-        question="What are symmetric sampling and the optimal baseline worth, on the same number of rollouts?",
+        title="Baselines and plain PGPE",
+        question="How much do symmetric sampling and the optimal baseline help, with the same number of rollouts?",
         curves={
             "symmetric": "default-bar",
             "symmetric, optimal b": "default-optimal-baseline",
@@ -518,16 +523,16 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for exp
 """By name; those of the thesis come first."""
 
 RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}
-"""Rollouts per second of two cores, of the projected policy times its features; used only for estimates."""
+"""Rollouts per second on two cores (for `projected`, multiplied by the number of features), for estimates of time."""
 
 
 def _cheap(name: str) -> RunConfig:
-    """A configuration that takes as long as the set-up's; used only for estimates."""
+    """A configuration that takes as long as the set-up's, for estimates of time."""
     return SETUPS[FITTED[name][0] if name in FITTED else name]
 
 
 def rollouts(name: str) -> int:
-    """Exploring rollouts of a trial of a set-up."""
+    """Number of exploring rollouts in one trial of a set-up."""
     config = _cheap(name)
     assert isinstance(config.algorithm_config, PGPE)
     return 2 * config.algorithm_config.pairs * config.generations

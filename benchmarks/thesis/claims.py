@@ -1,4 +1,4 @@
-"""Tests of the claims of Plage 2016, and of our additional questions, on data: one function per experiment. Pure."""
+"""Tests the claims of Plage 2016, and answers our own questions, from data: one function per experiment. Pure."""
 
 import numpy as np
 
@@ -25,11 +25,11 @@ def race(data: Data) -> list[Finding]:
             f"from {spread(first)} to {spread(peak)} at generation {', '.join(map(str, at.tolist()))}",
         ),
         Finding(
-            "and falls without end",
+            "and then falls without bound",
             bool((end < 10 * first).sum() > half),
             f"return of the last 10 generations {spread(end)}; {', '.join(series.failures()) or 'no run diverged'}",
         ),
-        Finding("actions become 100 times the joint range", bool((factor >= 100).sum() > half), spread(factor, 0)),
+        Finding("actions grow to 100 times the joint range", bool((factor >= 100).sum() > half), spread(factor, 0)),
         Finding("the gait is not learnt", not series.learnt.any(), counted(series)),
     ]
 
@@ -45,31 +45,31 @@ def converges(data: Data) -> list[Finding]:
     ]
     if series.trials > 1:
         said = ", ".join(f"{m:.2f}" for m in mu)
-        found.append(Finding("to another value in each trial", bool(mu.std() > 0.3), said))
+        found.append(Finding("to a different value in each trial", bool(mu.std() > 0.3), said))
     return found
 
 
 def features(data: Data) -> list[Finding]:
-    """Figure 4.3: more features learn faster, higher, more evenly; 300 not at all."""
+    """Figure 4.3: with more features learning is faster, higher and more even; with 300 nothing is learnt."""
     few, some, many = data.series.values()
     ends = [series.end("mean_policy_return") for series in (few, some, many)]
     areas = [np.nanmean(series.columns["return_mean"], axis=1) for series in (few, some, many)]
     nothing = bool(np.isnan(shapes.rise(few)).all()) and not few.learnt.any()
     found = [
-        Finding("D 300 learns nothing in 150 generations", nothing, counted(few)),
+        Finding("with D 300 nothing is learnt in 150 generations", nothing, counted(few)),
         Finding(
-            "D 8000 learns faster than D 1500, D 1500 than D 300",
+            "D 8000 learns faster than D 1500, and D 1500 faster than D 300",
             bool(areas[2].mean() > areas[1].mean() > areas[0].mean()),
             "return over all generations, D 300 first: " + "; ".join(spread(a) for a in areas),
         ),
         Finding(
-            "and ends higher",
+            "and ends with higher returns",
             bool(ends[2].mean() > ends[1].mean() > ends[0].mean()),
             "mean policy at the end " + "; ".join(spread(e) for e in ends),
         ),
     ]
     if few.trials > 1:
-        said = f"standard deviation of that {ends[1].std():.2f} at D 1500, {ends[2].std():.2f} at D 8000"
+        said = f"standard deviation of these {ends[1].std():.2f} with D 1500, {ends[2].std():.2f} with D 8000"
         found.append(Finding("with less spread between trials", bool(ends[2].std() < ends[1].std()), said))
     return found
 
@@ -96,39 +96,49 @@ def learnt_within_90(data: Data) -> list[Finding]:
 
 
 def states(data: Data) -> list[Finding]:
-    """Figure 4.4: joints fastest and highest, tactile slowest."""
+    """Figure 4.4: with joints learning is fastest and returns are highest; with the tactile image it is slow."""
     joints, contacts, touch = data.series.values()
     areas = [np.nanmean(s.columns["return_mean"][:, :80], axis=1).mean() for s in (joints, contacts, touch)]
     ends = [s.end("mean_policy_return").mean() for s in (joints, contacts, touch)]
     said = ", ".join(f"{area:.2f}" for area in areas)
     return [
-        Finding("joints learn fastest", bool(areas[0] == max(areas)), f"return over 80 generations {said}"),
+        Finding("with joints learning is fastest", bool(areas[0] == max(areas)), f"return over 80 generations {said}"),
         Finding(
-            "and highest", bool(ends[0] == max(ends)), "mean policy at the end " + ", ".join(f"{e:.2f}" for e in ends)
+            "and returns are highest",
+            bool(ends[0] == max(ends)),
+            "mean policy at the end " + ", ".join(f"{e:.2f}" for e in ends),
         ),
         Finding(
-            "joints and tactile image are slowest", bool(areas[2] == min(areas)), f"return over 80 generations {said}"
+            "with joints and tactile image learning is slowest",
+            bool(areas[2] == min(areas)),
+            f"return over 80 generations {said}",
         ),
     ]
 
 
-def pairs_a_generation(data: Data) -> list[Finding]:
+def pairs_per_generation(data: Data) -> list[Finding]:
     """Figure 4.5: N 50 rises sooner, drops, recovers; N 15 later, smoother."""
     many, few = data.series.values()
     rises, drops = (shapes.rise(many), shapes.rise(few)), (shapes.largest_drop(many), shapes.largest_drop(few))
     ends = many.end("return_mean"), few.end("return_mean")
     return [
         Finding(
-            "N 50 rises at generation 30 to 40", shapes.about(rises[0], 25, 50), f"half way up at {spread(rises[0], 0)}"
+            "N 50 rises at generation 30 to 40",
+            shapes.about(rises[0], 25, 50),
+            f"half of the rise at generation {spread(rises[0], 0)}",
         ),
-        Finding("N 15 rises at about 90", shapes.about(rises[1], 60, 120), f"half way up at {spread(rises[1], 0)}"),
+        Finding(
+            "N 15 rises at about 90",
+            shapes.about(rises[1], 60, 120),
+            f"half of the rise at generation {spread(rises[1], 0)}",
+        ),
         Finding(
             "N 15 is smoother",
             bool(drops[1].mean() < drops[0].mean()),
             f"largest drop within 10 generations {spread(drops[1])}; with N 50 {spread(drops[0])}",
         ),
         Finding(
-            "and nearly as high",
+            "and ends nearly as high",
             bool(ends[1].mean() > ends[0].mean() - 0.5),
             f"return at the end {spread(ends[1])}; with N 50 {spread(ends[0])}",
         ),
@@ -136,7 +146,7 @@ def pairs_a_generation(data: Data) -> list[Finding]:
 
 
 def rollouts_count(data: Data) -> list[Finding]:
-    """Figure 4.6: what counts is the number of rollouts; small N learns sooner."""
+    """Figure 4.6: what matters is the number of rollouts; with a small N learning is faster."""
     many, few = data.series.values()
     budget = few.rollouts * few.columns["return_mean"].shape[1]
     until = budget // many.rollouts
@@ -145,15 +155,17 @@ def rollouts_count(data: Data) -> list[Finding]:
         np.nanmean(few.columns["return_mean"], axis=1),
     )
     said = f"return over the first {budget} rollouts {spread(area[1])}; with N 50 {spread(area[0])}"
-    found = [Finding("at equal rollouts, N 15 learns sooner", bool(area[1].mean() > area[0].mean()), said)]
+    found = [
+        Finding("with the same number of rollouts, N 15 learns faster", bool(area[1].mean() > area[0].mean()), said)
+    ]
     if many.trials > 1:
         near = abs(area[1].mean() - area[0].mean()) < max(np.ptp(area[0]), np.ptp(area[1]))
-        found.append(Finding("N matters less than chance does: rollouts count", bool(near), said))
+        found.append(Finding("N matters less than chance: what matters is the number of rollouts", bool(near), said))
     return found
 
 
 def remedies(data: Data) -> list[Finding]:
-    """4.1.1: clipped actions, limited punishment, lower first values: none helps; limited actions saturate."""
+    """4.1.1: clipped actions, limited punishment and lower initial values do not help; limited actions saturate."""
     saturated = data.measured["saturated"]
     out = []
     for row, (label, series) in zip(saturated, data.series.items(), strict=True):
@@ -161,7 +173,7 @@ def remedies(data: Data) -> list[Finding]:
         config = data.configs[label]
         if config.task_config.clip or config.task_config.reward == "limited":  # type: ignore[attr-defined]
             early, last = row[:, min(9, row.shape[1] - 1)], np.array([r[~np.isnan(r)][-1] for r in row])
-            said = f"part of the targets at a limit {spread(early)} at generation 10; {spread(last)} at the end"
+            said = f"share of targets at a limit {spread(early)} at generation 10; {spread(last)} at the end"
             stuck = bool((early > 0.9).all() and (last > 0.9).all())
             out.append(Finding(f"{label}: all actions at a limit from generation 10 on", stuck, said))
     return out
@@ -178,7 +190,7 @@ def no_difference(data: Data) -> list[Finding]:
     means = np.array([e.mean() for e in ends.values()])
     said = "; ".join(f"{label}: {spread(e)}" for label, e in ends.items())
     within = max(float(np.ptp(e)) for e in ends.values())
-    what = "after 2000 histories, the N differ less than trials of one N do (last 500 rollouts)"
+    what = "after 2000 histories, values of N differ less than trials with one N (last 500 rollouts)"
     return [Finding(what, bool(np.ptp(means) < within), said)]
 
 
@@ -204,7 +216,7 @@ def only_projected_recovers(data: Data) -> list[Finding]:
 
 
 def scale_free(data: Data) -> list[Finding]:
-    """3.5.2: scaled returns do not change learning; with a power of two, which causes no rounding, not by one bit."""
+    """3.5.2: scaled returns do not change learning; a power of two, which causes no rounding, changes no bit."""
     plain, exact, scaled = data.series.values()
     difference = np.abs(scaled.columns["return_mean"] / 100.0 - plain.columns["return_mean"])
     early = float(np.nanmax(difference[:, :20]))
@@ -216,7 +228,7 @@ def scale_free(data: Data) -> list[Finding]:
         ),
         Finding("x100: the same returns for 20 generations", early < 1e-3, f"largest difference {early:.2g}"),
         Finding(
-            "x100: as many trials learn",
+            "x100: the same number of trials learn",
             int(plain.learnt.sum()) == int(scaled.learnt.sum()),
             f"{counted(plain)}; x100: {counted(scaled)}",
         ),
@@ -224,20 +236,20 @@ def scale_free(data: Data) -> list[Finding]:
 
 
 def learning(data: Data) -> list[Finding]:
-    """Which of the set-ups learn: for additional questions, where there is nothing to reproduce."""
+    """Which set-ups learn; for our own questions, which have no claim to reproduce."""
     out = []
     for label, series in data.series.items():
         said = f"{counted(series)}; mean policy at the end {spread(series.final)}"
         if series.failures():
             said += f"; {', '.join(series.failures())}"
-        out.append(Finding(f"{label} learns", bool(series.learnt.mean() > 0.5), said))
+        out.append(Finding(f"{label}: learns", bool(series.learnt.mean() > 0.5), said))
     return out
 
 
 def mostly_learnt(data: Data) -> list[Finding]:
-    """Which of the set-ups are learnt at the end of most trials."""
+    """Which set-ups are learnt in at least _MOST of their trials."""
     return [
-        Finding(f"{label} is learnt in 4 of 5 trials", bool(series.learnt.mean() >= _MOST), counted(series))
+        Finding(f"{label}: learnt in at least 4 of 5 trials", bool(series.learnt.mean() >= _MOST), counted(series))
         for label, series in data.series.items()
     ]
 
@@ -249,9 +261,9 @@ def transfer(data: Data) -> list[Finding]:
     off = rate[~np.eye(len(rate), dtype=bool)]
     own = "; ".join(f"{label} {rate[i, i]:.0%}" for i, label in enumerate(labels))
     return [
-        Finding("each is learnt", bool((np.diag(rate) >= LEARNT_ON).all()), own),
+        Finding("every object is learnt", bool((np.diag(rate) >= LEARNT_ON).all()), own),
         Finding(
-            "a policy works on the others",
+            "a policy works with the other objects",
             bool(off.mean() >= LEARNT_ON),
             f"{off.mean():.0%} on average, {off.min():.0%} to {off.max():.0%}",
         ),
@@ -259,18 +271,22 @@ def transfer(data: Data) -> list[Finding]:
 
 
 LEARNT_ON = 0.5
+"""Robust success, over the trials, from which a policy counts as working with an object."""
 _MOST = 0.8  # of the trials
-"""Robust success, over the trials, from which an object counts as mastered."""
 
 
 def chain(data: Data) -> list[Finding]:
     """Number of successive changes of grip."""
-    reached = known_mean(data.measured["reached"], axis=0)  # part of the rollouts that made at least 0, 1, ... changes
+    reached = known_mean(data.measured["reached"], axis=0)  # share of the rollouts that made at least 0, 1, ... changes
     said = ", ".join(
         f"{part:.0%} make {k}" for k, part in enumerate(reached) if k in (1, 2, 4, 8) or k == len(reached) - 1
     )
     return [
-        Finding("most rollouts change the grip there and back twice", bool(reached[4] > 0.5), f"of all, {said} or more")
+        Finding(
+            "most rollouts change the grip four times",
+            bool(reached[4] > 0.5),
+            f"of all rollouts, {said} changes or more",
+        )
     ]
 
 
@@ -281,7 +297,7 @@ def friction(data: Data) -> list[Finding]:
     for label, row in zip(data.series, rate, strict=True):
         good = factors[row >= LEARNT_ON]
         said = "; ".join(f"x{f:g} {r:.0%}" for f, r in zip(factors, row, strict=True))
-        bounds = f"from x{good.min():g} to x{good.max():g}" if len(good) else "nowhere"
+        bounds = f"from x{good.min():g} to x{good.max():g}" if len(good) else "with no factor"
         out.append(Finding(f"{label}: succeeds {bounds}", bool(len(good)), said))
     return out
 
@@ -304,7 +320,7 @@ SIZES = (8, 17, 54, 62)
 
 
 def features_for(size: int, accuracy: float) -> int:
-    """Features for a kernel accuracy by D = d eps^-2 log(1/eps^2) (Rahimi & Recht 2007; thesis, table 3.2).
+    """Number of features for a kernel accuracy by D = d eps^-2 log(1/eps^2) (Rahimi & Recht 2007; thesis, table 3.2).
 
     The theorem leaves constant and base open; c = 1 and base 10 give the thesis' table up to its rounding (but 594
     for its 560).

@@ -50,7 +50,7 @@ class KernelError:
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Number of grip changes if an upper level alternates the policies learnt for the first and the second curve."""
+    """Number of grip changes if the policies learnt for the first and the second curve act in turn."""
 
     steps: int = 100
     """Control steps of a rollout."""
@@ -82,14 +82,14 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """A named set of runs (configurations x trials) with a question, and the figure that answers it."""
+    """A named set of runs (configurations x trials), the question that they answer, and its figure."""
 
     name: str
-    """The name in `python -m benchmarks.thesis NAME`: the thesis' figure or section, or the question in a word."""
+    """The name in `python -m benchmarks.thesis NAME`: a figure or section of the thesis, or a word for the question."""
     title: str
     question: str
     claim: str = ""
-    """What Plage 2016 reports, with the section; empty for additional questions."""
+    """What Plage 2016 reports, with the section; empty for our own questions."""
     curves: Mapping[str, str] = field(default_factory=dict)
     """Label in the legend -> name of the set-up (catalogue.SETUPS)."""
     figure: Figure = field(default_factory=Curves)
@@ -98,7 +98,7 @@ class Experiment:
 
 
 def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunConfig:
-    """A set-up's run number 0, 1, ...: its seed; `generations` shortens it."""
+    """Run number 0, 1, ... of a set-up; the number is its seed, and `generations` shortens it."""
     if generations is not None:
         setup = replace(setup, generations=min(generations, setup.generations))
     return replace(setup, seed=number)
@@ -137,7 +137,7 @@ def spread(values: FloatArray, digits: int = 2) -> str:
 
 
 def counted(series: Series) -> str:
-    """Number of trials that learnt, and from which generation on, as text."""
+    """Number of trials that learnt, and the generations from which every mean policy succeeds, as text."""
     since = series.since[series.learnt]
-    when = f", each mean policy succeeding from generation {', '.join(f'{g:.0f}' for g in sorted(since))} on"
+    when = f" (every mean policy succeeds from generation {', '.join(f'{g:.0f}' for g in sorted(since))} on)"
     return f"{int(series.learnt.sum())} of {series.trials} learnt{when if len(since) else ''}"

@@ -30,9 +30,9 @@ _DASHES: Final = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 _PANELS: Final[dict[Panel, tuple[str, str]]] = {
-    "return": ("return_mean", "mean return of a generation"),
+    "return": ("return_mean", "mean return per generation"),
     "mean policy": ("mean_policy_return", "return of the mean policy"),
-    "success": ("success_rate", "rollouts that succeed [%]"),
+    "success": ("success_rate", "successful rollouts [%]"),
     "sigma": ("sigma_mean", "mean sigma"),
     "mu_2": ("mu_2", "mu of the second parameter"),
     "sigma_2": ("sigma_2", "sigma of the second parameter"),
@@ -42,7 +42,7 @@ _PANELS: Final[dict[Panel, tuple[str, str]]] = {
 
 _RETURNS: Final = ("return", "mean policy")
 
-_FALLEN: Final = -1000.0  # below this mean return the other values are too small to see on a linear axis
+_FALLEN: Final = -1000.0  # a mean return below which other values are invisible on a linear axis
 
 
 def draw(experiment: Experiment, data: Data, folder: Path) -> tuple[Path, Path]:
@@ -75,9 +75,9 @@ def _caption(experiment: Experiment, data: Data) -> str:
     said = ", ".join(common(list(data.configs.values()))) + f"; {trials} {'trials' if trials > 1 else 'trial'}"
     if isinstance(experiment.figure, Curves):
         said += (
-            ", line: median of those that run, shaded: from the least to the greatest"
+            "; line: median of the trials still running, shaded: minimum to maximum"
             if _run_away(experiment.figure, data)
-            else ", line: mean of those that run, shaded: standard deviation"
+            else "; line: mean of the trials still running, shaded: standard deviation"
         )
     said += "."
     broken = [f"{label}: {', '.join(s.failures())}" for label, s in data.series.items() if s.failures()]
@@ -130,7 +130,7 @@ def _curves(experiment: Experiment, data: Data) -> Canvas:
 
 
 def _run_away(figure: Curves, data: Data) -> bool:
-    """Whether a trial's returns fell so far that it alone would determine the mean."""
+    """Whether the returns of a trial fell so far that this trial alone would determine the mean."""
     drawn = (series for series in data.series.values() if not series.empty)
     return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in drawn)
 
@@ -153,7 +153,8 @@ def _scale(axis: Axes, panel: Panel, low: float, high: float, *, run_away: bool)
 def _line(axis: Axes, i: int, name: str, values: FloatArray, step: int = 1, *, run_away: bool = False) -> FloatArray:
     """Draw the i-th line of a panel, its spread shaded, and return it: values (trials, generations), `step` apart.
 
-    Generations that no trial reached are left out. The mean and the standard deviation, where nothing has run away.
+    Generations that no trial reached are left out. The line is the mean with its standard deviation; if a trial ran
+    away, it is the median with minimum and maximum.
     """
     there = ~np.isnan(values)
     values = values[:, : int(there.any(axis=0).sum())]
@@ -180,15 +181,15 @@ def _spread(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _transfer(experiment: Experiment, data: Data) -> Canvas:
     assert isinstance(experiment.figure, Transfer)
     caption = _caption(experiment, data) + (
-        " Left: learning. Right: robust success [%] of the policies learnt on the row's object when they hold the "
-        "column's: mean over the trials."
+        " Left: learning. Right: robust success [%] with the column's object of policies learnt with the row's object: "
+        "mean over the trials."
     )
     canvas, (left, right) = _canvas(2, caption)
     for i, (name, series) in enumerate(data.series.items()):
         if series.empty:
             continue
         _line(left, i, name, 100 * series.columns["success_rate"])
-    left.set(xlabel="generation", ylabel="rollouts that succeed [%]", ylim=(-3, 103))
+    left.set(xlabel="generation", ylabel="successful rollouts [%]", ylim=(-3, 103))
     if left.lines:
         left.legend(loc="lower right", fontsize=8)
     rate = 100 * known_mean(data.measured["transfer"], axis=1)
@@ -197,7 +198,7 @@ def _transfer(experiment: Experiment, data: Data) -> Canvas:
         right.text(column, row, f"{value:.0f}", ha="center", va="center", color="white" if value > 60 else "black")
     right.set_xticks(range(len(experiment.figure.objects)), experiment.figure.objects)
     right.set_yticks(range(len(data.series)), list(data.series))
-    right.set(xlabel="holds", ylabel="learnt on")
+    right.set(xlabel="tried with", ylabel="learnt with")
     for side in ("left", "bottom"):
         right.spines[side].set_visible(False)
     right.tick_params(length=0)
@@ -206,8 +207,8 @@ def _transfer(experiment: Experiment, data: Data) -> Canvas:
 
 def _friction(experiment: Experiment, data: Data) -> Canvas:
     caption = _caption(experiment, data) + (
-        " Robust success of the final mean policies with every friction coefficient times the factor, mass, "
-        "position and joint readings perturbed: mean over the trials, shaded: standard deviation."
+        " Robust success of the final mean policies if every friction coefficient is multiplied by the factor, and "
+        "mass, position and joint readings are perturbed: mean over the trials, shaded: standard deviation."
     )
     canvas, (axis,) = _canvas(1, caption)
     factors = data.measured["factors"]
@@ -219,16 +220,16 @@ def _friction(experiment: Experiment, data: Data) -> Canvas:
     axis.set_xscale("log")
     axis.set_xticks(factors, [f"{f:g}" for f in factors], minor=False)
     axis.minorticks_off()
-    axis.set(xlabel="friction, times the usual", ylabel="robust success [%]", ylim=(-3, 103))
+    axis.set(xlabel="factor of friction", ylabel="robust success [%]", ylim=(-3, 103))
     axis.legend(fontsize=8)
     return canvas
 
 
 def _chain(experiment: Experiment, data: Data) -> Canvas:
     caption = _caption(experiment, data) + (
-        " Left: how hard each fingertip presses in one perturbed rollout; grey: the second policy acts. Right: "
-        "rollouts that make at least so many changes of grip with the object in place, over 100 perturbed starts a "
-        "trial: mean and standard deviation."
+        " Left: force on each fingertip in one perturbed rollout; grey: the second policy acts. Right: rollouts with "
+        "at least this number of grip changes while the object stays in place, from 100 perturbed starts per trial: "
+        "mean and standard deviation."
     )
     canvas, (left, right) = _canvas(2, caption)
     acting, force = data.measured["acting"], data.measured["force"]
@@ -241,14 +242,15 @@ def _chain(experiment: Experiment, data: Data) -> Canvas:
     reached = 100 * data.measured["reached"]
     mean, spread = _spread(reached)
     right.errorbar(np.arange(len(mean)), mean, spread, color=_COLOURS[0], marker="o", ms=4, lw=1.3, capsize=2)
-    right.set(xlabel="changes of grip", ylabel="rollouts that make so many [%]", ylim=(-3, 103))
+    right.set(xlabel="grip changes", ylabel="rollouts with at least this number [%]", ylim=(-3, 103))
     return canvas
 
 
 def _kernel(experiment: Experiment, data: Data) -> Canvas:  # noqa: ARG001  one signature for all figures
     caption = (
-        "Largest error of z(x)'z(y) against the Gaussian kernel over all pairs of 40 states of d numbers, each from "
-        "U(0, 1); mean over draws of the features. Grey: the accuracy for which the thesis' table 3.2 takes so many."
+        "Largest difference between z(x)'z(y) and the Gaussian kernel, over all pairs of 40 states of d numbers drawn "
+        "from U(0, 1): mean over draws of the features. Grey: the accuracy for which table 3.2 of the thesis gives "
+        "this number."
     )
     canvas, (axis,) = _canvas(1, caption)
     counts = data.measured["features"]

@@ -41,7 +41,7 @@ class ExperimentFolder:
         """An existing one.
 
         Raises:
-          ConfigError: there is none, or it is of an experiment that this release does not know.
+          ConfigError: there is none, or this release does not know its experiment.
         """
         try:
             told = json.loads((path / "experiment.json").read_text("utf-8"))
@@ -61,7 +61,7 @@ class ExperimentFolder:
 
     @classmethod
     def prepare(cls, path: Path, names: Sequence[str], trials: int, generations: int | None) -> "ExperimentFolder":
-        """A new folder, or an existing one to continue; trials may be added.
+        """A new folder, or an existing one to continue, perhaps with more trials.
 
         Raises:
           ConfigError: the folder is another experiment's, or something else's.
@@ -96,7 +96,7 @@ class ExperimentFolder:
         return tuple(dict.fromkeys(name for e in self.experiments for name in EXPERIMENTS[e].curves.values()))
 
     def config(self, setup: str, number: int) -> RunConfig:
-        """The configuration of a trial."""
+        """Configuration of a trial."""
         return trial(catalogue.config(setup), number, self.generations)
 
     def run(self, setup: str, number: int) -> RunFolder:
@@ -105,14 +105,14 @@ class ExperimentFolder:
 
     @property
     def runs(self) -> dict[Path, RunConfig]:
-        """Configurations by run folder, trial by trial, so that all set-ups have an early result."""
+        """Configurations by run folder, trial by trial, so that each set-up has an early result."""
         pairs = [(setup, number) for number in range(self.trials) for setup in self.setups]
         return {self.run(*pair).path: self.config(*pair) for pair in pairs}
 
     def check_runs(self, *, go_on: bool = False) -> None:
         """Check that the runs in the folder have the set-ups' configurations, and that no recorded run is missing.
 
-        To continue with the runs, each recorded one must exist; otherwise all runs of a set-up may be missing.
+        To continue, every recorded run must exist; to draw figures, all runs of a set-up may be missing.
 
         Raises:
           ConfigError: a run has a different configuration, or is missing.
@@ -122,7 +122,9 @@ class ExperimentFolder:
             there = [folder.path.exists() for folder in folders]
             for number, folder in enumerate(folders):
                 if there[number] and folder.read_config() != self.config(setup, number):
-                    raise ConfigError(f"{folder.path} is not of the set-up {setup} any more: give a different --out")
+                    raise ConfigError(
+                        f"{folder.path} no longer has the settings of set-up {setup}: give a different --out"
+                    )
             file = self.path / "data" / f"{setup}.npz"
             known = series.load(file).states if file.exists() and (go_on or any(there)) else ()
             for folder, exists, state in zip(folders, there, known, strict=False):
@@ -163,10 +165,10 @@ class ExperimentFolder:
 
 
 def find(name: str) -> Experiment:
-    """The experiment of a name.
+    """The experiment with a name.
 
     Raises:
-      ConfigError: there is none; names those there are.
+      ConfigError: there is none; the message lists the names.
     """
     if name not in EXPERIMENTS:
         raise ConfigError(

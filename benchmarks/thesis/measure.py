@@ -30,7 +30,7 @@ from learner.replay import load as load_policy
 from learner.run_folder import RunFolder
 
 _POINTS: Final = 40
-"""Number of states; the kernel values of all pairs of them are compared."""
+"""Number of states; the kernel is compared for all pairs of them."""
 
 _AT_LIMIT: Final = 1e-9  # [rad]
 
@@ -77,11 +77,11 @@ def _trials(folder: ExperimentFolder, setup: str) -> list[RunFolder | None]:
 
 
 def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """Size of the mean policy's actions, generation by generation.
+    """Size of the mean policy's actions in each generation.
 
     Returns:
-      action: (set-ups, trials, generations) the largest of a rollout, in units of its joint's range;
-      saturated: (set-ups, trials, generations) part of a rollout's joint targets at or beyond a joint's limits.
+      action: (set-ups, trials, generations) largest action of the rollout, in units of its joint's range;
+      saturated: (set-ups, trials, generations) share of the rollout's joint targets at or beyond a joint's limits.
     """
     names = list(experiment.curves.values())
     longest = max(folder.config(name, 0).generations for name in names)
@@ -121,7 +121,7 @@ def _transfer(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
 
 
 def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """Robust success of learnt policies at each friction, otherwise perturbed as in an evaluation.
+    """Robust success of learnt policies at each friction; everything else is perturbed as in an evaluation.
 
     Returns:
       success: (set-ups, trials, factors); factors.
@@ -139,7 +139,7 @@ def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
 
 
 class _OneFriction(FingerGait):
-    """The task with the same friction in every rollout; mass, place and joint readings are perturbed as always."""
+    """The task with the same friction in every rollout; mass, position and joint readings are perturbed as usual."""
 
     factor = 1.0
     """Factor of all friction coefficients."""
@@ -171,7 +171,7 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
     """How often the grip changes when two learnt policies act in turn, on the evaluation's perturbed starts.
 
     Returns:
-      reached: (trials, changes) part of the rollouts that made at least so many;
+      reached: (trials, changes) share of the rollouts with at least this number of changes;
       acting: (steps,) and force: (steps, 3) [N] of the first trial's first rollout.
     """
     assert isinstance(experiment.figure, Chain)
@@ -190,7 +190,7 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
 
 
 def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """The largest error of the kernel over all pairs of states drawn from U(0, 1) in each number.
+    """Largest error of the kernel over all pairs of states whose numbers are drawn from U(0, 1).
 
     Returns:
       error: (sizes, counts), the mean over the trials' draws of features; sizes; features.

@@ -1,6 +1,6 @@
 """The records of a set-up's runs, as arrays and as one compact file.
 
-Figures and findings need only these files, so they can be made again without the runs.
+Figures and findings need only these files, so they can be remade without the runs.
 """
 
 import zipfile
@@ -26,7 +26,7 @@ LEARNT: Final = 0.8
 """Robust success from which a run counts as learnt, if its last mean policy succeeds as well."""
 
 END: Final = 10
-"""Generations that count as the end of a run."""
+"""Number of generations that count as the end of a run."""
 
 _SECOND: Final = 1
 _MOST: Final = 3e38
@@ -95,7 +95,7 @@ class Series:
 
 
 def known_mean(values: FloatArray, axis: int) -> FloatArray:
-    """Mean over an axis without nan values; nan if there are only these."""
+    """Mean over an axis, ignoring nan; nan if there is nothing else."""
     count = (~np.isnan(values)).sum(axis=axis)
     return np.where(count > 0, np.nansum(values, axis=axis) / np.maximum(count, 1), np.nan)
 

@@ -1,4 +1,4 @@
-"""Shapes of learning curves: where a return rises, how far it drops, whether it stays down. Pure."""
+"""Shapes of learning curves: when a return rises, how far it drops, and whether it recovers. Pure."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from benchmarks.thesis.series import Series
 from farm.arrays import BoolArray, FloatArray
 
 END_OF_START = 5
-"""Generations that count as the beginning of a run."""
+"""Number of generations that count as the start of a run."""
 
 
 def about(values: FloatArray, low: float, high: float) -> bool:
@@ -36,7 +36,7 @@ def first_and_best(series: Series) -> tuple[FloatArray, FloatArray, FloatArray]:
 def rise(series: Series) -> FloatArray:
     """(trials,) generation at which the return is half way from its start to its best.
 
-    nan where the best is not above the start by a quarter of it.
+    nan if the best return does not exceed the start by a quarter of |start|.
     """
     smooth, first, best = first_and_best(series)
     at = [1 + np.argmax(row >= f + 0.5 * (b - f)) for row, f, b in zip(smooth, first, best, strict=True)]
