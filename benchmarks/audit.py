@@ -1,4 +1,4 @@
-"""Cost of spot checks: rollouts/s of two hosts, alternately with and without them; one table.
+"""Measures the cost of spot checks: rollouts/s of two hosts, in turn without and with checks; one table.
 
     python benchmarks/audit.py [--generations 60] [--repeats 5]
 
@@ -54,4 +54,6 @@ def _rate(config: RunConfig, audit: float) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

@@ -1,9 +1,10 @@
-"""Number of rollouts after which a preset's mean policy succeeds (results are in docs/seeds.md). Uses one process.
+"""Finds the number of rollouts after which a preset's mean policy succeeds (results: docs/seeds.md). One process.
 
     python benchmarks/early.py [--preset default] [--first 20] [--seeds 10] [--policy constant]
 
-The mean policy is tried on 100 perturbed starts after every generation of the first 500 rollouts, then after every 15th
-and the last; on the nominal start after every 5th. `--policy constant` learns 8 joint commands without feedback.
+The mean policy is tested on 100 perturbed starts after every generation of the first 500 rollouts, then after every
+15th generation and the last; on the nominal start after every 5th. `--policy constant` learns 8 joint commands
+without feedback.
 """
 
 import argparse
@@ -39,7 +40,7 @@ class Constant(Policy):
 
 @dataclass
 class Curve:
-    """Results of the mean policy, by number of exploring rollouts."""
+    """Results of the mean policy, each with the number of exploring rollouts."""
 
     robust: list[tuple[int, int]]
     nominal: list[tuple[int, float]]
@@ -65,7 +66,7 @@ def main() -> None:
     constant: dict[str, Any] = {"policy": f"{__file__}:Constant", "initial_mu": 0.0, "initial_sigma": 0.1}
     changed = constant if arguments.policy == "constant" else {}
     print(f"| seed | robust success >= {ENOUGH} % from rollout on | return >= {GOOD} from rollout on ", end="")
-    print("| return, last | robust success, least of the last half, last |\n|---|---|---|---|---|")
+    print("| return, last | robust success, lowest in the last half, last |\n|---|---|---|---|---|")
     runner: Runner | None = None
     for seed in range(arguments.first, arguments.first + arguments.seeds):
         curve, runner = _learnt(configure("finger-gait", arguments.preset, seed=seed, **changed), runner)
@@ -78,7 +79,7 @@ def main() -> None:
 
 
 def _learnt(config: Any, runner: Runner | None) -> tuple[Curve, Runner]:  # noqa: ANN401  a RunConfig
-    """The whole run."""
+    """Learn one run."""
     problem, algorithm, curve = setup.problem(config), config.algorithm_config, Curve([], [])
     runner = runner or problem.runner()
     runner.policy = problem.policy
@@ -105,4 +106,6 @@ def _since(values: list[tuple[int, Any]], least: float) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

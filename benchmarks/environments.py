@@ -1,4 +1,4 @@
-"""Rollouts per second of Gymnasium environments: in its own loop, in the farm's one by one, and in the farm's batches.
+"""Rollouts per second of Gymnasium environments: in its own loop, and in the farm's, one by one and in batches.
 
     python benchmarks/environments.py [--rollouts 64] [--steps 200] [--repeats 3]
 
@@ -23,7 +23,7 @@ NAMES = (
 
 
 class OneByOne(Environment):
-    """The same task, whose environments step themselves."""
+    """The same task, with each environment stepped by itself."""
 
     def __init__(self, config: EnvironmentConfig, name: str) -> None:
         super().__init__(config, name)
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     count = arguments.rollouts
-    print("| environment | steps | Gymnasium's own loop [rollouts/s] | the farm, one by one | in a batch | times |")
+    print("| environment | steps | Gymnasium's own loop [rollouts/s] | the farm, one by one | in a batch | ratio |")
     print("|---|---|---|---|---|---|")
     for name in NAMES:
         steps = min(arguments.steps, 100 if name == "Pusher-v5" else 50 if name == "Reacher-v5" else 10_000)
@@ -84,4 +84,6 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

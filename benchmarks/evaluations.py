@@ -1,4 +1,4 @@
-"""The evaluations that peers.py times; a separate module, so that the workers of each backend can import it."""
+"""The evaluations that peers.py times, in a separate module, so that the workers of each backend can import it."""
 
 import functools
 import os
@@ -12,7 +12,7 @@ from learner.config import configure
 from learner.setup import problem
 
 STILL = 50.0
-"""Value of every parameter: so far from any joint position that the kernel is zero and no rollout ends early."""
+"""Value of every parameter: so far from every joint position that the kernel is zero and no rollout ends early."""
 
 
 @functools.cache

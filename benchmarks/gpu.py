@@ -1,10 +1,10 @@
-"""Physics steps per second of the backend `warp`, compared with MuJoCo on this machine's processor; one table.
+"""Physics steps per second of the backend `warp` and of MuJoCo on this machine's processor; one table.
 
     python benchmarks/gpu.py [--worlds 1024,4096,16384] [--tasks finger-gait,gym:Ant-v5,gym:HalfCheetah-v5]
         [--steps 20] [--threads 2,16]
 
-Rollouts of a random linear policy, from perturbed starts, with all parts of a control step: observation, action,
-reward. Physics steps before the start (closing a grip) take time but are not counted; compilation is not timed.
+Each row times rollouts of a random linear policy from perturbed starts, with all parts of a control step: observation,
+action, reward. Physics steps before the start (closing a grip) take time but are not counted. Compilation is not timed.
 Without a GPU, MuJoCo Warp simulates slowly on the processor: use few worlds.
 """
 
@@ -26,8 +26,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", default="1024,4096,16384")
     parser.add_argument("--tasks", default="finger-gait,gym:Ant-v5,gym:HalfCheetah-v5")
-    parser.add_argument("--steps", type=int, default=20, help="control steps of a rollout")
-    parser.add_argument("--threads", default="2,16", help="numbers of threads of MuJoCo on the processor")
+    parser.add_argument("--steps", type=int, default=20, help="control steps per rollout")
+    parser.add_argument("--threads", default="2,16", help="numbers of MuJoCo's threads on the processor")
     chosen = parser.parse_args()
     print("| task | simulated by | together | physics steps/s |\n|---|---|---|---|")
     for name in chosen.tasks.split(","):
@@ -59,4 +59,6 @@ def row(name: str, by: str, worlds: int, steps: int, make: MakeEngine, *, exact:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

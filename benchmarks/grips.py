@@ -1,4 +1,4 @@
-"""How well each grip holds the object without a policy: it is closed, released and held for 3 s; one table.
+"""Tests how well each grip holds the object for 3 s without a policy; one table.
 
 python benchmarks/grips.py [--object bar] [--pose opposed]
 """
@@ -26,7 +26,9 @@ def main() -> None:
     parser.add_argument("--object", default="bar")
     parser.add_argument("--pose", choices=tuple(POSES), default="opposed")
     parser.add_argument(
-        "--option", default="", help="MJCF option to use instead of the pose's: impratio=3 | noslip_iterations=5"
+        "--option",
+        default="",
+        help="MJCF option to use instead of the options of the pose: impratio=3 | noslip_iterations=5",
     )
     arguments = parser.parse_args()
     name, _, value = arguments.option.partition("=")
@@ -73,4 +75,6 @@ def show(grip: str, rollouts: Rollouts) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

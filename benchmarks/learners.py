@@ -1,10 +1,10 @@
-"""Every algorithm with every policy, each with the same budget: the gait and three environments.
+"""Every algorithm with every policy, each with the same budget, on the gait and three environments; one table each.
 
     python benchmarks/learners.py [--tasks gait,Reacher-v5] [--seeds 5] [--out FILE.jsonl]
 
-Nothing is tuned here: a policy has the same start and initial sigma with all algorithms, population and learning rates
+Nothing is tuned: each policy has the same start and initial sigma with all algorithms. Population and learning rates
 are the algorithms' defaults, and PGPE is that of Toklu 2020 (ranks, ClipUp with a speed derived from sigma). The seeds
-of a row are simulated together in this process; the results are the same as those of `farm run`.
+of a cell are simulated together in this process; the results are the same as those of `farm run`.
 """
 
 import argparse
@@ -46,18 +46,18 @@ GAIT: Final[Mapping[str, dict[str, Any]]] = {
     "kernel": {"initial_mu": 1.5, "initial_sigma": 0.3},
     "weighted-kernel": {"initial_mu": 0.0, "initial_sigma": 1.0},
 }
-OTHERS: Final[Mapping[str, dict[str, Any]]] = {
+ENVIRONMENTS: Final[Mapping[str, dict[str, Any]]] = {
     "linear": {"normalise": True, "initial_mu": 0.0, "initial_sigma": 0.05},
     "mlp": {"normalise": True, "layers": (16,), "initial_mu": 0.0, "initial_sigma": 0.05},
     "rbf": {"normalise": True, "bandwidth": 3.0, "initial_mu": 0.0, "initial_sigma": 0.2},
 }
-"""Policies, and the start of their search."""
+"""Policies of the environments, and the start of their search."""
 
 TASKS: Final[Mapping[str, tuple[str, int, Mapping[str, dict[str, Any]]]]] = {
     "gait": ("finger-gait", 900, GAIT),
-    "Reacher-v5": ("gym:Reacher-v5", 1000, OTHERS),
-    "InvertedDoublePendulum-v5": ("gym:InvertedDoublePendulum-v5", 1000, OTHERS),
-    "Hopper-v5": ("gym:Hopper-v5", 1000, OTHERS),
+    "Reacher-v5": ("gym:Reacher-v5", 1000, ENVIRONMENTS),
+    "InvertedDoublePendulum-v5": ("gym:InvertedDoublePendulum-v5", 1000, ENVIRONMENTS),
+    "Hopper-v5": ("gym:Hopper-v5", 1000, ENVIRONMENTS),
 }
 """Task, exploring rollouts, policies."""
 
@@ -77,7 +77,7 @@ class Search:
     rollouts: int = 0
 
     def seen(self) -> FloatArray:
-        """Mean and standard deviation of its observations, (2, d)."""
+        """Mean and standard deviation of the observations so far, (2, d)."""
         return normaliser(self.moments)
 
 
@@ -202,4 +202,6 @@ def _since(looks: Sequence[tuple[int, float]]) -> int | None:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

@@ -2,7 +2,7 @@
 
     python benchmarks/load.py [--seconds 10] [--learners 40]
 
-Workers are emulated on this machine as in scaling.py; their rollouts take no time.
+The workers are emulated on this machine, as in scaling.py; their rollouts take no time.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def _learners(count: int, seconds: float) -> None:
-    """This number of learners behind one router, and four workers that serve all of them."""
+    """Measure this number of learners behind one router, with four workers that serve all of them."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         endpoint, generations = free_endpoint(), 20
         router = stack.enter_context(process(["-m", "farm", "router", "--listen", endpoint], folder))
@@ -66,4 +66,6 @@ def _learners(count: int, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

@@ -1,13 +1,13 @@
-"""Compares the farm with a pool of processes, Ray, EvoTorch on Ray, and Dask; one table.
+"""Compares the farm with a process pool, Ray, EvoTorch on Ray, and Dask; one table.
 
     python benchmarks/peers.py [--turns 3] [--only NAME]
 
-Each backend runs several times, in turn with the others, in a separate process. All evaluate the same: generations of
-15 and of 100 mirrored pairs of the finger gait with perturbed starts, held still so that no rollout ends early, and
+The backends run in turn, several times, each time in a separate process. All evaluate the same: generations of 15 and
+of 100 mirrored pairs of the finger gait with perturbed starts, held still so that no rollout ends early, and
 generations of empty evaluations. Their rate of physics steps is divided by that of MuJoCo alone with two threads,
-measured in the same process just before and after. The other backends get each worker's half of a generation in one
-call, which is their fastest way, and without updates and checkpoints. The time of `farm run` includes these, but not
-recording. Packages that are not installed are reported and left out: `pip install ray distributed evotorch` adds all.
+measured in the same process just before and after. The other tools get each worker's half of a generation in one call,
+which is fastest for them, and do not update or save anything. The time of `farm run` includes updates and checkpoints,
+but not recording. Tools that are not installed are left out: `pip install ray distributed evotorch` installs all.
 """
 
 import argparse
@@ -77,10 +77,10 @@ def main() -> None:
             there[name] = what
     turns = [{name: _turn(name, kill=turn == 0) for name in there} for turn in range(arguments.turns)]
     print(
-        "\n| | 30 rollouts, against physics | 200 | no time, 30 [ms] | 200 [ms] | first result [s] | memory [MB] ",
+        "\n| | 30 rollouts | 200 rollouts | 30 empty jobs [ms] | 200 [ms] | first result [s] | memory [MB] ",
         end="",
     )
-    print("| a worker is killed |\n|---|---|---|---|---|---|---|---|")
+    print("| if a worker is killed |\n|---|---|---|---|---|---|---|---|")
     for name, what in there.items():
         rows = [turn[name] for turn in turns]
         cells = [
@@ -103,9 +103,13 @@ def _turn(name: str, *, kill: bool) -> dict[str, Any]:
         command, stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ, "PYTHONPATH": path}
     ) as process:
         assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("{"):
-                said |= json.loads(line)
+        try:
+            for line in process.stdout:
+                if line.startswith("{"):
+                    said |= json.loads(line)
+        except KeyboardInterrupt:
+            os.killpg(process.pid, signal.SIGKILL)  # Ctrl-C does not reach a session of its own
+            raise
     print(name, json.dumps(said), file=sys.stderr, flush=True)
     return said
 
@@ -190,7 +194,7 @@ def _memory() -> float:
 
 
 def _killed(evaluate: Callable[[], FloatArray], victim: Callable[[], int]) -> None:
-    """An evaluation during which a worker is killed."""
+    """Kill a worker during an evaluation, and print what happens."""
     before = time.perf_counter()
     alone = evaluate()
     undisturbed = time.perf_counter() - before
@@ -206,7 +210,7 @@ def _killed(evaluate: Callable[[], FloatArray], victim: Callable[[], int]) -> No
     seconds = time.perf_counter() - before
     killer.wait()
     signal.setitimer(signal.ITIMER_REAL, 0.0)
-    same = "the same returns" if np.array_equal(found, alone) else "other returns"
+    same = "the same returns" if np.array_equal(found, alone) else "different returns"
     _say(killed=f"{same}, {seconds - undisturbed:+.1f} s")
 
 
@@ -236,7 +240,7 @@ def _halves(theta: FloatArray) -> list[FloatArray]:
 
 @contextmanager
 def of_loop() -> Opened:
-    """No farm: the closed loop in this process, on two threads."""
+    """The closed loop in this process without a farm, on two threads."""
     found = problem(configure())
     own = Runner(found.task, found.policy, lambda model: BatchEngine(model, 200, 2))
 
@@ -330,7 +334,7 @@ def of_pool() -> Opened:
         pools: dict[Any, farm.Farm] = {}
 
         def evaluate(what: Any, theta: FloatArray) -> FloatArray:  # noqa: ANN401
-            if what not in pools:  # one at a time: two workers, as the others have
+            if what not in pools:  # one pool at a time, so that there are only two workers
                 stack.close()
                 pools.clear()
                 own = ("finger-gait", {"preset": "default"}) if what is gait else (f"{ZERO}:ZeroCost", _LINEAR)
@@ -391,4 +395,6 @@ BACKENDS = {
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

@@ -1,11 +1,11 @@
-"""The learner's cost of recording, and the size of recordings.
+"""Measures what recording costs the learner, and the size of recordings.
 
     python benchmarks/recording.py [--blocks 10] [--repeats 3] [--long 500]
 
-In a run with 15 pairs per generation, the middle two of every four blocks of ten generations are recorded. So a noisy
-machine and learning (rollouts take longer as fewer end early) affect both kinds of blocks alike. The run is recorded
-into a file, and live: without a viewer, with one that is connected, and with one that has disconnected. The table
-compares the median time per generation, and the processor time of the learner's thread and of the recorder's.
+In a run with 15 pairs per generation, the middle two of every four blocks of ten generations are recorded. So other
+load and learning (rollouts take longer as fewer end early) affect blocks with and without recording alike. The run is
+recorded into a file, and live: without a viewer, with a connected viewer, and with a viewer that no longer reads. The
+table compares the median time per generation, and the processor time of the learner's thread and of the recorder's.
 """
 
 import argparse
@@ -65,7 +65,7 @@ def main() -> None:
             _run(configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *found[name])
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}")
     print("\n| recorded | time per generation [ms] | recorded | longest | learner's thread | recorded | difference "
-          "| recorder |")  # fmt: skip
+          "| recorder and Rerun |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
     for name, (without, with_) in found.items():
         wall, thread, process = (
@@ -130,7 +130,7 @@ def _now() -> tuple[float, float, float]:
 
 @contextmanager
 def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
-    """A viewer without a window that is connected, or has disconnected."""
+    """A viewer without a window that is connected; stopped: it no longer reads."""
     program, port = Path(rerun_cli.__file__).with_name("rerun"), free_endpoint().rpartition(":")[2]
     command = [str(program), uri, "--headless", "--bind", "127.0.0.1", "--port", port]
     with tempfile.TemporaryDirectory() as home:
@@ -139,7 +139,7 @@ def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
         )
         try:
             if stopped:
-                time.sleep(2.0)  # it has connected by then
+                time.sleep(2.0)  # by then it is connected
                 os.kill(process.pid, signal.SIGSTOP)
             yield
         finally:
@@ -148,4 +148,6 @@ def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

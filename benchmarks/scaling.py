@@ -1,11 +1,11 @@
-"""How many workers one learner can serve. The workers are emulated: real, but without physics. Prints two tables.
+"""Measures how many workers one learner can serve, with emulated workers, which do not simulate. Prints two tables.
 
     python benchmarks/scaling.py [--workers 1,4,16,64,256,1000] [--pair 0.02] [--seconds 12]
 
-An emulated worker is the farm's `Worker` class with its own session. Instead of simulating, it makes up returns and
-sends them after the time that a simulation would take. A learner process learns from them. All share this machine, so
-the emulation takes processor time that a real farm's learner would not have to share; the table shows both. With more
-than 64 workers a pair takes longer, so that there are as many pairs per second as with 64: the table then shows the
+An emulated worker is the farm's `Worker` class with its own session. Instead of simulating, it invents returns and
+sends them after the time that a simulation would take. A learner process learns from them. Learner and emulation share
+this machine, which a real farm's learner would have for itself; the table shows the processor time of both. With more
+than 64 workers a pair takes longer, so that there are as many pairs per second as with 64. The table then shows the
 cost of more workers, not of more rollouts.
 """
 
@@ -34,6 +34,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.commands.status import ask
+from farm.errors import Interrupted
 from farm.net import codec, keys, session
 from farm.net.events import Event, Events
 from farm.net.messages import Spec
@@ -48,11 +49,11 @@ from workers.worker import IDLE, Worker, WorkerConfig
 TOGETHER = 32  # emulated workers per process
 MOST = 3200  # largest number of pairs per second
 PAIRS = 1000  # per generation; with more than 64 workers in proportion to their number
-LOOK = 1.0  # [s] timeout of queries, and between two idle checks
+LOOK = 1.0  # [s] timeout of queries, and time between two idle checks
 
 
 class MadeUp:
-    """Runs a run's jobs as `Runner` does, but makes the numbers up, at once."""
+    """Does a run's jobs as `Runner` does, but invents the numbers, which takes no time."""
 
     known: ClassVar[dict[str, "MadeUp"]] = {}
     """By the specification's digest; shared by all workers of a process."""
@@ -65,7 +66,7 @@ class MadeUp:
         self._channels = {name[9:]: shape for name, shape in shapes.items() if name.startswith("channels/")}
 
     def run(self, mu: FloatArray, jobs: Jobs, traces: str = "none", _: FloatArray | None = None) -> Simulated:
-        """Make results up."""
+        """Invent results."""
         returns = jobs.theta(mu).sum(axis=1)
         exploring = ~np.repeat(jobs.seen, jobs.rollouts)
         rows = traced(traces if self.spec.traced else "none", returns, exploring)
@@ -83,16 +84,16 @@ class MadeUp:
 
 
 class Emulated(Worker):
-    """A worker that answers at the time at which a real one on its own core would.
+    """A worker that answers when a real worker on its own core would.
 
-    A pair takes it so long, and reading jobs and writing results as long as they take the processor. That dozens of
-    workers wait for each other on one core is not theirs; sending and Zenoh's threads are not counted either.
+    Its time is that of its pairs, and the processor time for reading jobs and writing results. The time that dozens of
+    workers on one core wait for each other does not count, nor do sending and Zenoh's threads.
     """
 
     pair: ClassVar[float] = 0.02
 
     def __init__(self, config: WorkerConfig, link: session.Session, agenda: "Agenda") -> None:
-        """Work as the agenda says."""
+        """Send results by this agenda."""
         super().__init__(config, link)
         link.events = Noted(lambda: agenda.came.put((time.monotonic(), self)))
         self._agenda, self._until = agenda, 0.0
@@ -107,10 +108,10 @@ class Emulated(Worker):
         return sorted(self._session.events.waiting(0.0), key=lambda event: event.topic == "inbox")
 
     def _tell_idle(self) -> None:
-        if time.monotonic() >= self._until + IDLE:  # until then it pretends to simulate
+        if time.monotonic() >= self._until + IDLE:  # until then it "simulates"
             super()._tell_idle()
 
-    def _runner(self, header: RoundHeader) -> Any:  # noqa: ANN401  in the place of a Runner
+    def _runner(self, header: RoundHeader) -> Any:  # noqa: ANN401  instead of a Runner
         if header.spec not in MadeUp.known:
             payload = self._session.ask(keys.spec(self._config.farm, header.run), LOOK)
             if payload is None:
@@ -141,7 +142,7 @@ class Noted(Events):
 
 
 class Agenda:
-    """The work of all emulated workers in a process: on one thread, as many would compete for the interpreter."""
+    """The work of all emulated workers in a process, on one thread: several would compete for the interpreter."""
 
     def __init__(self) -> None:
         self.came: queue.SimpleQueue[tuple[float, Emulated]] = queue.SimpleQueue()
@@ -210,7 +211,7 @@ def main() -> None:
             f"{m.megabytes:.0f} | {m.emulation:.2f} |",
             flush=True,
         )
-    print("\nA generation's time [ms], where simulating takes none (16 workers):\n")
+    print("\nTime per generation [ms] if simulation takes no time (16 workers):\n")
     print("| N | median | learner: us per pair |\n|---|---|---|")
     for pairs in (15, 100, 1000):
         m = measure(16, pairs, 0.0, arguments.seconds)
@@ -249,7 +250,8 @@ def _emulate(endpoint: str, workers: int, pair: float) -> None:
     """Run a process of emulated workers until its standard input closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the parent process stops this one
     Emulated.pair, over, agenda = pair, threading.Event(), Agenda()
-    with ExitStack() as stack:
+    threading.Thread(target=_until_closed, args=(over,), daemon=True).start()
+    with suppress(Interrupted), ExitStack() as stack:
         emulated: list[Emulated] = []
         for i in range(workers):
             config = WorkerConfig(connect=(endpoint,), name=f"e{i}")
@@ -257,7 +259,6 @@ def _emulate(endpoint: str, workers: int, pair: float) -> None:
             emulated.append(Emulated(config, link, agenda))
             emulated[-1].join()
         gc.freeze()  # otherwise garbage collection would search the many objects of all workers
-        threading.Thread(target=_until_closed, args=(over,), daemon=True).start()
         agenda.follow(emulated, over)
 
 
@@ -308,7 +309,7 @@ def pause(*processes: "subprocess.Popen[bytes]") -> None:
     """Wait a moment; exit if one of the processes has ended."""
     time.sleep(0.05)
     if any(process.poll() is not None for process in processes):
-        sys.exit("a learner or a process full of workers ended before its time")
+        sys.exit("a learner or a process with emulated workers ended too early")
 
 
 def cpu(pid: int) -> float:
@@ -318,9 +319,11 @@ def cpu(pid: int) -> float:
 
 
 def megabytes(pid: int) -> float:
-    """Memory that a process has in use."""
+    """Resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

@@ -1,4 +1,4 @@
-"""How reliably a preset learns: runs with several seeds, one table (results are in docs/seeds.md).
+"""Tests how reliably a preset learns: runs with several seeds, one table (results: docs/seeds.md).
 
     python benchmarks/seeds.py [--preset default] [--seeds 10] [--out runs/seeds-default]
 
@@ -7,6 +7,7 @@ An existing run is not repeated; an interrupted one is resumed.
 
 import argparse
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -43,11 +44,21 @@ def _run(out: Path, preset: str, seed: int) -> dict[str, Any]:
         begin = ["--resume", str(folder)] if folder.exists() else ["--preset", preset, "--seed", str(seed)]
         name = [] if folder.exists() else ["--out", str(out), "--name", f"s{seed}"]
         command = [sys.executable, "-m", "farm", "run", *begin, *name, "--no-record"]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+            try:
+                process.wait()
+            except KeyboardInterrupt:
+                process.terminate()
+                process.wait()  # it saves the run, which the same command then resumes
+                raise
+        if process.returncode:
+            sys.exit(f"{shlex.join(command)} ended with status {process.returncode}")
     progress = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
     since = next((line["generation"] for line in progress if line["mean_policy_success"]), None)
     return {**json.loads(summary.read_text()), "first": progress[0]["mean_policy_return"], "since": since}
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

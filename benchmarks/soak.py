@@ -1,8 +1,8 @@
-"""Soak test: workers of a farm are killed and join at random, for as long as you like; checks results and memory.
+"""Soak test: a farm's workers are killed and started at random for a given time; checks the results and the memory.
 
     python benchmarks/soak.py [--minutes 60] [--every 3]
 
-While a learner runs, every few seconds a worker is killed or a new one joins (there are always one to four). Then the
+While a learner runs, a worker is killed or a new one joins every few seconds (there are always one to four). Then the
 same number of generations is learnt again without disturbance. The hashes must agree, and memory must not have grown,
 except for the rollouts that a learner keeps for recorders that join late. Otherwise the exit status is 1.
 """
@@ -28,7 +28,7 @@ MOST = 4  # workers at a time
 
 
 class Crowd:
-    """Workers that come and go."""
+    """The workers, and a thread that kills and starts them."""
 
     def __init__(self, endpoint: str, every: float) -> None:
         self.killed = self.joined = 0
@@ -58,7 +58,8 @@ class Crowd:
                 self._join()
 
     def _join(self) -> None:
-        self._workers.append(subprocess.Popen(self._command))
+        # In a process group of its own, so that only `close` ends it after Ctrl-C.
+        self._workers.append(subprocess.Popen(self._command, process_group=0))
         self.joined += 1
 
     def _kill(self) -> None:
@@ -69,10 +70,10 @@ class Crowd:
 
 
 def main() -> None:
-    """Soak, learn again, print."""
+    """Run the test, learn again, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--every", type=float, default=3.0, help="seconds between two changes among the workers")
+    parser.add_argument("--every", type=float, default=3.0, help="seconds until the next worker is killed or started")
     arguments = parser.parse_args()
     config = RunConfig(generations=1_000_000)
     with tempfile.TemporaryDirectory() as folder:
@@ -121,7 +122,7 @@ def _megabytes(pid: int) -> float:
 
 
 def _flat(megabytes: list[float], filling: float = 0.0) -> bool:
-    """Whether memory in the last quarter is hardly above that in the first, apart from buffers of bounded size."""
+    """Whether memory in the last quarter is about that in the first, apart from buffers of this size [MB]."""
     quarter = max(1, len(megabytes) // 4)
     return max(megabytes[-quarter:]) < 1.1 * max(megabytes[:quarter]) + 10 + filling
 
@@ -133,4 +134,6 @@ def _from_to(megabytes: list[float]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

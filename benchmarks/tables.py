@@ -1,11 +1,11 @@
-"""Published scores of linear policies compared with ours: settings, published score, our score; a line per seed.
+"""Compares published scores of linear policies with ours: settings, published score, our score; one row per seed.
 
     python benchmarks/tables.py TABLE ENVIRONMENT [--seed S ...] [--out FILE]
 
     python benchmarks/tables.py ars Hopper-v5 --seed 0 1 2
     python benchmarks/tables.py --list
 
-Runs with several seeds are simulated together in one batch, in this process. For each a `farm run` command is printed
+Runs with several seeds are simulated together in one batch, in this process. The last lines have a `farm run` command
 that gives the same results to the last bit. The score is the mean return of the last mean policy from 100 new starts.
 
 `--state FILE` saves the runs to FILE every minute and on Ctrl-C; the same command continues them, to the same bits.
@@ -29,6 +29,7 @@ import numpy as np
 
 from farm import seeds
 from farm.arrays import FloatArray, IntArray
+from farm.commands.signals import INTERRUPTED
 from farm.moments import merged, normaliser, usable
 from farm.rollouts import Runner
 from farm.tasks import loop
@@ -95,7 +96,7 @@ TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
         ),  # fmt: skip
     },
 }
-# An ARS spread of one direction (Swimmer's pairs 1) is that of its two returns.
+# With one direction (Swimmer, pairs 1) the spread of returns that ARS divides by is that of its two returns.
 
 
 @dataclass
@@ -140,7 +141,7 @@ class Search:
         self.curve.append((self.steps, float(rollouts.returns.mean())))
 
     def saved(self) -> dict[str, Any]:
-        """Everything from which `restore` continues, by name."""
+        """Everything that `restore` needs to continue, by name."""
         values = {"steps": self.steps, "pairs": self.pairs, "moments": self.moments, "curve": np.array(self.curve)}
         return values | {f"state.{name}": value for name, value in self.state.to_dict().items() if value is not None}
 
@@ -176,7 +177,7 @@ class SideBySide:
 
 
 def main() -> None:
-    """Learn, and print the lines."""
+    """Learn, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", nargs="?", choices=tuple(TABLES))
     parser.add_argument("environment", nargs="?")
@@ -228,7 +229,7 @@ def main() -> None:
     print(f"{total / (time.monotonic() - begun):.0f} steps/s in this process")
 
 
-_MOST: Final = 1_000_000  # generations: the steps end a run
+_MOST: Final = 1_000_000  # generations: runs end by their number of steps
 
 
 def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[list[Search], Runner]:
@@ -281,7 +282,8 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
         if saved and (stopped.is_set() or time.monotonic() - shown > 60):
             _save(saved, searches)
         if stopped.is_set():
-            sys.exit(f"stopped; the same command continues from {saved}")
+            sys.stderr.write(f"stopped; the same command continues from {saved}\n")
+            sys.exit(INTERRUPTED)
         if time.monotonic() - shown > 60:
             shown = time.monotonic()
             now = ", ".join(f"{s.steps / 1e6:.2f}M {s.curve[-1][1]:.0f}" for s in going)
@@ -296,7 +298,7 @@ def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntA
 
 
 def _thinned(curve: list[tuple[int, float]]) -> list[tuple[int, float]]:
-    """Some of its points, and the last."""
+    """Evenly chosen points of the curve, with the last."""
     picked = np.unique(np.linspace(0, len(curve) - 1, LOOKS).astype(int))
     return [curve[at] for at in picked.tolist()]
 
@@ -310,4 +312,6 @@ def _flags(values: Mapping[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

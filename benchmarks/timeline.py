@@ -1,14 +1,15 @@
-"""Who waits for what in a generation: a picture of two of them, and a table of where the two cores' time goes.
+"""Shows what learner and workers do, and when they wait: a picture of two generations, and a table of times.
 
     python benchmarks/timeline.py [--pairs 15] [--generations 60] [--picture FILE.svg]
 
-A learner with two workers of its own learns the gait. Learner and workers note when they begin and end their parts, by
-the same clock. Of the middle generations, the picture shows two whose time is the median.
+A learner with two local workers learns the gait. Learner and workers record the begin and end of each of their tasks,
+by the same clock. The picture shows two generations of median duration.
 """
 
 import argparse
 import json
 import select
+import signal
 import statistics
 import subprocess
 import sys
@@ -31,11 +32,11 @@ PARTS: Final = {
 }  # fmt: skip
 
 Noted = list[tuple[str, float, float]]
-"""Part, begin and end [s]."""
+"""Name, begin and end [s] of each task."""
 
 
 def noting(noted: Noted, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, noting when it runs."""
+    """The function, which then also records its begin and end."""
 
     def run(*words: Any, **more: Any) -> Any:  # noqa: ANN401
         begun = time.monotonic()
@@ -48,7 +49,8 @@ def noting(noted: Noted, part: str, function: Callable[..., Any]) -> Callable[..
 
 
 def work(endpoint: str) -> None:
-    """Be a worker until standard input closes, and print what was noted."""
+    """Work until standard input closes; then print the noted times."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the learner's process closes standard input
     noted: Noted = []
     with session.connect((endpoint,), 30.0, lambda: False) as link:
         worker = Worker(WorkerConfig(connect=(endpoint,)), link)
@@ -81,14 +83,14 @@ def main() -> None:
     middle = rounds[len(rounds) // 3 :]
     lengths = [b - a for a, b in zip(middle, middle[1:], strict=False)]
     length = statistics.median(lengths)
-    print(f"a generation of {chosen.pairs} pairs: {1e3 * length:.1f} ms (median of {len(lengths)})\n")
-    print("| part | ms of a generation, learner and both workers |\n|---|---|")
+    print(f"{1e3 * length:.1f} ms per generation of {chosen.pairs} pairs (median of {len(lengths)})\n")
+    print("| task | ms per generation, learner and both workers |\n|---|---|")
     took = {
         part: 1e3 * sum(e - b for noted in rows for name, b, e in noted if name == part and middle[0] <= b < middle[-1])
         for part in PARTS
     }
-    took["update, save, report"] -= took["hand out jobs"]  # the next jobs go out in the middle of it
-    took["simulate"] -= took["send results"]  # at its end
+    took["update, save, report"] -= took["hand out jobs"]  # the next jobs are handed out in the middle of it
+    took["simulate"] -= took["send results"]  # results are sent at its end
     for part, total in took.items():
         print(f"| {part} | {total / len(lengths):.1f} |")
     print(f"| both workers wait | {2e3 * length - (took['simulate'] + took['send results']) / len(lengths):.1f} |")
@@ -98,7 +100,7 @@ def main() -> None:
 
 
 def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
-    """When each round began, and what learner and workers noted."""
+    """When each round began, and what learner and workers recorded."""
     config = configure(pairs=pairs, generations=generations)
     endpoint, rounds = free_endpoint(), list[float]()
     learner: Noted = []
@@ -143,13 +145,15 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
 
 
 def draw(rows: list[Noted], begin: float, end: float, path: Path) -> None:
-    """Bars over time: learner, workers."""
+    """Draw bars over time, for learner and workers."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.6), layout="constrained")
     axes = figure.subplots()
     for height, noted in enumerate(rows):
-        order = sorted(noted, key=lambda one: one[0] == "hand out jobs")  # inside the learner's own part: on top
+        order = sorted(
+            noted, key=lambda one: one[0] == "hand out jobs"
+        )  # part of the learner's update: drawn on top of it
         for part, first, last in order:
             if last > begin and first < end:
                 axes.barh(-height, 1e3 * (last - first), left=1e3 * (first - begin), height=0.7, color=PARTS[part])
@@ -163,4 +167,6 @@ def draw(rows: list[Noted], begin: float, end: float, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

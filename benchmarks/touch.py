@@ -1,12 +1,13 @@
-"""Is touch needed? Learns the fragile bar with and without it; writes a table, a figure, and the numbers.
+"""Learns the fragile bar with and without touch; writes a table, a figure, and the numbers.
 
     python benchmarks/touch.py [--seeds 20,21,22,23,24] [--bias 0.05] [--out docs/results/touch] [--rows forces,joints]
 
 Each row is learnt by the farm for 1280 rollouts, in runs under runs/touch, and tested on 200 starts that were not used
-for training: the average of its last ten means, and its last mean alone. Settings were chosen on seeds 0 to 14.
-Without touch there are: the best constant targets, a function of time, the joints, the joints with their targets (a
-servo's deflection measures force), the joints with a memory, and a hand-made expert: it closes the middle finger at a
-constant rate until its joints lag by a given angle; rate and lag are the best of a grid on separate starts.
+for training: the average of its last ten means, and its last mean alone. Settings were chosen with seeds 0 to 14.
+The policies without touch are the best constant targets, and functions of time, of the joints, of the joints and their
+targets (a servo's deflection measures force), and of the joints with a memory. The last row is a hand-made expert: it
+closes the middle finger at a constant rate until its joints lag by a given angle; rate and lag are the best of a grid
+on separate starts. Interrupted runs continue.
 """
 
 import argparse
@@ -68,7 +69,7 @@ class Blind(FragileBar):
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """One part for each kind of number."""
+        """Sizes of the parts: one for each kind of number."""
         size = BLIND[self.config.sight]
         return (size,) if size == 1 else (len(JOINTS), len(JOINTS))
 
@@ -86,7 +87,7 @@ class Blind(FragileBar):
 
 
 class Constant(Policy):
-    """The same action always: a = b."""
+    """The same action at every step: a = theta."""
 
     @property
     def size(self) -> int:
@@ -99,7 +100,7 @@ class Constant(Policy):
 
 
 WIDE: dict[str, Any] = {"width": 1.77, "weight_scale": 0.25, "initial_sigma": 1.0, "action": "offset"}
-"""The weighted kernel as it is for the finger gait."""
+"""Settings of the weighted kernel as for the finger gait."""
 ROWS: dict[str, dict[str, Any]] = {
     "forces": {},
     "cop": {"state": "cop"},
@@ -136,7 +137,9 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"bias-{arguments.bias:g}.json"
     found: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
-    print("| policy sees | success on 200 new starts by seed [%] | of the last mean [%] | shuffled touch [%] |")
+    print(
+        "| policy observes | success on 200 new starts, by seed [%] | last mean alone [%] | with shuffled touch [%] |"
+    )
     print("|---|---|---|---|")
     if "expert" not in found:
         found["expert"] = [_expert(arguments.bias)]
@@ -157,13 +160,13 @@ def _percent(parts: Sequence[float]) -> str:
 
 
 def _learnt(name: str, seed: int, bias: float, *, average: int | None, shuffle: bool) -> float:
-    """Learn a row of the table, unless it exists; return its success, optionally with touch from a wrong rollout."""
+    """Learn a run of a row, or continue it; return its success, optionally with the touch of a different rollout."""
+    from running import learn  # workers load this file by its path alone
+
     options = {"task": "fragile-bar", **ROWS[name], "bias": bias, "seed": seed}
     config = farm.configure(options.pop("task"), **options)
     folder = Path("runs/touch", f"{re.sub('[^a-z]+', '-', name)}-b{bias:g}-s{seed}")
-    if not (folder / "summary.json").exists():
-        for _ in farm.learn(config, folder, workers=2):
-            pass
+    learn(config, folder, workers=2)
     runner = problem(config).runner()
     try:
         return _success(runner, loaded(RunFolder.open(folder), average=average).mu, shuffle=shuffle)
@@ -190,7 +193,7 @@ def _success(runner: Runner, mean: FloatArray, *, shuffle: bool) -> float:
 
 
 def _expert(bias: float) -> float:
-    """The best hand-made policy without touch: close at a rate until the middle finger's last joint lags enough."""
+    """Success of the best hand-made policy without touch: close until the middle finger's joints lag enough."""
     runner = problem(farm.configure("fragile-bar", bias=bias)).runner()
     middle = FINGER_JOINTS["middle"]
 
@@ -238,11 +241,15 @@ def draw(found: dict[str, list[float]], path: Path, bias: float) -> None:
             axes.plot(parts, [row] * len(parts), "o", markeredgecolor=colour, markerfacecolor=fill, markersize=4)
     axes.set_yticks(range(len(names)), names)
     axes.set_xlim(0, 101)
-    axes.set_xlabel("success on 200 new starts [%]\ndots: seeds, rings: their last means alone; bar: the better median")
-    axes.set_title(f"fragile bar, joint readings wrong by up to {bias:g} rad; blue: by touch")
+    axes.set_xlabel(
+        "success on 200 new starts [%]\ndots: seeds; rings: their last means alone; bars: the better median"
+    )
+    axes.set_title(f"fragile bar, joint readings wrong by up to {bias:g} rad; blue: with touch")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

@@ -1,11 +1,11 @@
-"""A script, not a learnt policy, turns a plate by regrasping from perturbed starts; one table.
+"""A script (not a learnt policy) turns a plate by regrasping, from perturbed starts; one table.
 
     python benchmarks/turning.py [--reach 4,6,8,10] [--cycles 8] [--starts 200] [--video FILE.gif] [--torsion 2]
 
 The plate lies on the thumb. Index and middle finger push it in opposite directions; then each of them is lifted,
-brought back and set down, while the other one holds. The script uses the model's kinematics but no feedback. Reach and
-torsional friction are in mm; the film shows the first reach. A row has the worst values of all starts: the least turn
-and speed, the latest time, the largest tilt and drift.
+brought back and set down, while the other holds the plate. The script uses the model's kinematics but no feedback.
+Reach and torsional friction are in mm; the video shows the first reach. Each row has the worst values of all its
+starts: the least turn and speed, the latest time, the largest tilt and drift.
 """
 
 import argparse
@@ -36,7 +36,7 @@ MOST_TILT: Final = 30.0
 TURN: Final = 360.0
 """Turn to be reached [deg]."""
 SIDE: Final = (264, 216)
-"""Width and height of the film [pixels]."""
+"""Width and height of the video [pixels]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class Script:
     """Parameters of a cycle of the fingers."""
 
     reach: float = 0.006
-    """How far from the plate's middle a stroke begins and ends [m]."""
+    """Distance from the plate's middle at which a stroke begins and ends [m]."""
     press: float = 2.0
     """Commanded force of index and middle finger [N]."""
     thumb: float = 3.0
@@ -52,11 +52,11 @@ class Script:
     pinch: float = 2.5
     """Commanded force of the thumb while one finger is lifted [N]."""
     lift: float = 0.01
-    """How high a finger is lifted [m]."""
+    """Height by which a finger is lifted [m]."""
     stroke: float = 0.5
     """Time of a stroke [s]."""
     move: float = 0.1
-    """Time to lift a finger, to bring it back, to set it down: each [s]."""
+    """Time of each of: lifting a finger, bringing it back, setting it down [s]."""
 
 
 class Keys:
@@ -79,7 +79,7 @@ class Keys:
         return np.clip(out, LOWER, UPPER)
 
     def _at(self, finger: str, along: float, up: float, force: float) -> FloatArray:
-        """A finger's targets at a place, pressing upwards with a force: J' F / k beyond the place."""
+        """A finger's targets at a position, beyond it by J' F / k to press upwards with this force."""
         joints, own = FINGER_JOINTS[finger], self._hand.model
         goal = np.array([self._centre[0] + along, self._height[finger] + up])
         values, jacobian = self._touch.copy(), np.empty((3, own.nv))
@@ -145,7 +145,7 @@ class Turned:
 
     @classmethod
     def of(cls, qpos: FloatArray, felt: BoolArray) -> "Turned":
-        """What follows from the states (B, T, nq) and from which fingertips touch the plate (B, T, 3)."""
+        """The motion computed from the states (B, T, nq) and from which fingertips touch the plate (B, T, 3)."""
         pose = qpos[..., -7:]
         degrees = np.cumsum(np.degrees(2.0 * np.arctan(0.5 * turned(pose))), axis=1)
         tilt = np.degrees(np.arccos(np.clip(upright(pose), -1.0, 1.0)))
@@ -203,7 +203,9 @@ def main() -> None:
     parser.add_argument("--torsion", type=float, help="torsional friction of the object [mm]; the plate has 2")
     parser.add_argument("--cycles", type=int, default=8)
     parser.add_argument("--starts", type=int, default=200, help="number of perturbed starts")
-    parser.add_argument("--video", type=Path, metavar="FILE", help="a film of the nominal start: .gif or .mp4")
+    parser.add_argument(
+        "--video", type=Path, metavar="FILE", help="video of the rollout from the nominal start: .gif or .mp4"
+    )
     chosen = parser.parse_args()
     if chosen.video is not None:
         video.check(chosen.video)
@@ -223,7 +225,7 @@ def main() -> None:
 
 
 def row(found: Turned, rows: slice) -> str:
-    """Cells of the table: of several rollouts the least turn, the latest time, the largest tilt and drift."""
+    """Cells of the table: least turn and speed, latest time, largest tilt and drift of these rollouts."""
     each = [found.first(i) for i in range(len(found.lost))[rows]]
     whole = [i for i in each if i.degrees[0].max(initial=0.0) >= TURN]
     degrees = min(i.degrees[0, -1] for i in each)
@@ -237,14 +239,16 @@ def row(found: Turned, rows: slice) -> str:
 
 
 def film(gait: FingerGait, found: Turned) -> Iterator[rendering.Picture]:
-    """The first rollout in real time, until the plate has made a full turn."""
+    """Pictures of the first rollout in real time, until the plate has made a full turn."""
     first = found.first(0)
     round_at = np.flatnonzero(first.degrees[0] >= TURN)
     poses = first.qpos[0, : round_at[0] + 1] if len(round_at) else first.qpos[0]
     shown = video.moments((np.arange(len(poses)) * TIMESTEP).tolist(), speed=1.0, rest=0.0)[::2]
     for picture in rendering.pictures(gait.model, poses[shown], SIDE, camera=Turning.camera):
-        yield from (picture, picture)  # a gif keeps it once
+        yield from (picture, picture)  # a gif stores it once
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

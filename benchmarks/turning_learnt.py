@@ -1,11 +1,11 @@
-"""A plate turned by regrasping, learnt with touch and without, beside holding still and the script; one table.
+"""Learns to turn a plate by regrasping, with touch and without; compares with the script and holding still; one table.
 
     python benchmarks/turning_learnt.py [--seeds 20,21] [--rows phase,phase+forces] [--video FILE] [--json FILE]
 
-Each row is learnt by the farm in runs of its own under runs/turning, one per seed, with the preset of the task
-`turning`; rows differ in what the policy sees. Policies are judged for 16 s from 200 perturbed starts that no run
-trained on, and for 24 s with cycles of 3 s instead of 2. With shuffled touch every policy is given the forces that
-another rollout's fingers feel. The film shows the last row's policy of the first seed from the nominal start.
+Each row has one run per seed, under runs/turning, with the preset of the task `turning`; rows differ in what the policy
+observes. Policies are tested for 16 s from 200 perturbed starts that were not used for training, and for 24 s with
+cycles of 3 s instead of 2 (slowed). In rows with shuffled forces each rollout gets the forces of a different rollout.
+The video shows the last row's policy with the first seed, from the nominal start. Interrupted runs continue.
 """
 
 import argparse
@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from running import learn
+from turning import TURN, Keys, Script, Turned, film, script_of, task, turn
 
 import farm
-from benchmarks.turning import TURN, Keys, Script, Turned, film, script_of, task, turn
 from farm import seeds
 from farm.arrays import FloatArray
 from farm.policies.base import Policy
@@ -29,24 +30,24 @@ from learner.replay import LoadedPolicy
 
 ROWS: Final = "phase,phase+forces,phase+joints,phase+joints+forces"
 LONG: Final[Mapping[str, Any]] = {"steps": 160}
-"""How policies are judged."""
+"""Settings of the test."""
 SLOW: Final[Mapping[str, Any]] = {"steps": 240, "cycle": 3.0}
-"""And once more: as many cycles, each of them longer than in training."""
+"""Settings of the slowed test: the same number of cycles, each longer than in training."""
 STARTS: Final[list[loop.Seed]] = [seeds.trial(9, i) for i in range(200)]
-"""Starts that are judged."""
+"""Starts of the tests."""
 
 Figures = dict[str, float | None]
-"""Of one policy from all starts, by column; None where there is none."""
+"""Results of one policy from all starts, by column; None: there is no value."""
 
 
 class Shuffled:
-    """A policy that is given the forces of another rollout."""
+    """A policy that gets the forces of a different rollout."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """As the policy does."""
+        """Prepare as the policy does."""
         return self._policy.prepare(theta)
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
@@ -56,13 +57,13 @@ class Shuffled:
 
 
 def main() -> None:
-    """Learn, judge, and print."""
+    """Learn, test, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="20,21,22,23")
-    parser.add_argument("--rows", default=ROWS, help="what policies see, with commas")
-    parser.add_argument("--generations", type=int, help="other than the preset's")
-    parser.add_argument("--video", type=Path, metavar="FILE", help=".gif or .mp4")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="the table's numbers, seed by seed")
+    parser.add_argument("--rows", default=ROWS, help="what the policies observe, separated by commas")
+    parser.add_argument("--generations", type=int, help="number of generations instead of the preset's")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="video file: .gif or .mp4")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="file for the table's numbers of each seed")
     chosen = parser.parse_args()
     if chosen.video is not None:
         video.check(chosen.video)
@@ -71,7 +72,7 @@ def main() -> None:
     table: dict[str, list[Figures]] = {}
     for name, found in _rows(names, numbers, options):
         if not table:
-            print(f"| what the policy sees | {' | '.join(found[0])} |\n|---|{'---|' * len(found[0])}")
+            print(f"| what the policy observes | {' | '.join(found[0])} |\n|---|{'---|' * len(found[0])}")
         table[name] = found
         cells = (", ".join(_cell(figures[column]) for figures in found) for column in found[0])
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
@@ -81,7 +82,7 @@ def main() -> None:
         policy = farm.load(_learnt(names[-1], numbers[0], options), **LONG)
         shown = _turned(policy.runner.rollouts(policy.mu[None], [None], physics=True))
         lifts = (shown.felt[0, :-1] & ~shown.felt[0, 1:]).sum(axis=0).tolist()
-        print(f"lifted in the film's 16 s: {dict(zip(FINGERS, lifts, strict=True))}")
+        print(f"fingers lifted in the 16 s of the video: {dict(zip(FINGERS, lifts, strict=True))}")
         video.write(chosen.video, film(policy.runner.task, shown))
 
 
@@ -90,17 +91,15 @@ def _cell(figure: float | None) -> str:
 
 
 def _learnt(name: str, number: int, options: Mapping[str, Any]) -> Path:
-    """A run's folder; it is learnt if that has not been done."""
+    """The folder of a run, which is learnt or continued unless it has finished."""
     config = farm.configure("turning", state=name, seed=number, **options)
     folder = Path("runs/turning", f"{name.replace('+', '-')}-g{config.generations}-s{number}")
-    if not (folder / "summary.json").exists():
-        for _ in farm.learn(config, folder, workers=1):
-            pass
+    learn(config, folder, workers=1)
     return folder
 
 
 def _rows(names: list[str], numbers: list[int], options: Mapping[str, Any]) -> Iterator[tuple[str, list[Figures]]]:
-    """Rows of the table: their names, and what each seed's policy did."""
+    """Rows of the table: name, and the results of each seed's policy."""
     gait = task()
     played = turn(gait, script_of(Keys(gait.hand, Script()), 15)[: LONG["steps"] * SUBSTEPS], STARTS)
     yield "the script", [_figures(Turned.of(played.qpos[:, ::SUBSTEPS], played.felt[:, ::SUBSTEPS]))]
@@ -108,23 +107,23 @@ def _rows(names: list[str], numbers: list[int], options: Mapping[str, Any]) -> I
         folders = [_learnt(name, number, options) for number in numbers]
         policies = [farm.load(folder, **LONG) for folder in folders]
         if name == names[0]:
-            yield "holding still", [_judged(policies[0], 0.0 * policies[0].mu)]
-        yield name, [_judged(policy, policy.mu) for policy in policies]
+            yield "holding still", [_tested(policies[0], 0.0 * policies[0].mu)]
+        yield name, [_tested(policy, policy.mu) for policy in policies]
         if "forces" in name:
-            yield f"{name}, shuffled", [_judged(policy, policy.mu, shuffle=True) for policy in policies]
+            yield f"{name}, shuffled", [_tested(policy, policy.mu, shuffle=True) for policy in policies]
         policies = [farm.load(folder, **SLOW) for folder in folders]
-        yield f"{name}, slowed", [_judged(policy, policy.mu) for policy in policies]
+        yield f"{name}, slowed", [_tested(policy, policy.mu) for policy in policies]
 
 
-def _judged(policy: LoadedPolicy, mean: FloatArray, *, shuffle: bool = False) -> Figures:
-    """What a mean (P,) does from the starts."""
+def _tested(policy: LoadedPolicy, mean: FloatArray, *, shuffle: bool = False) -> Figures:
+    """Results of a mean (P,) from the starts."""
     runner, theta = policy.runner, np.tile(mean, (len(STARTS), 1))
     acts = Shuffled(runner.policy) if shuffle else runner.policy
     return _figures(_turned(loop.run(runner.task, acts, runner.sim, theta, STARTS)))
 
 
 def _turned(found: loop.Rollouts) -> Turned:
-    """What the plate did in rollouts."""
+    """Motion of the plate in these rollouts."""
     qpos, force = (
         np.concatenate([found.start[name][:, None], found.frames[name]], axis=1) for name in ("qpos", "force")
     )
@@ -132,7 +131,7 @@ def _turned(found: loop.Rollouts) -> Turned:
 
 
 def _figures(found: Turned) -> Figures:
-    """Of several rollouts, looked at once per control step; each counts until the plate is lost."""
+    """Results of several rollouts, from one value per control step; each rollout counts until the plate is lost."""
     each = [found.first(row) for row in range(len(found.lost))]
     speed = [np.abs(np.diff(one.degrees[0])) / CONTROL_PERIOD for one in each]
     degrees = [one.degrees[0, -1] for one in each]
@@ -151,4 +150,6 @@ def _figures(found: Turned) -> Figures:
 
 
 if __name__ == "__main__":
-    main()
+    from running import script
+
+    script(main)

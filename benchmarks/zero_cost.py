@@ -13,6 +13,6 @@ class ZeroCost(Task):
       <actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
     steps = 1
 
-    def reward(self, sim, action):  # noqa: ANN001, ANN201, ARG002  as an author would write it
-        """(B,)."""
+    def reward(self, sim, action):  # noqa: ANN001, ANN201, ARG002  as users write it
+        """Rewards (B,)."""
         return np.array(action[:, 0])

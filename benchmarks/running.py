@@ -1,0 +1,43 @@
+"""What the scripts of this folder share: how they end, and runs that an interrupted script continues."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from farm.commands.signals import INTERRUPTED
+from farm.errors import ConfigError, FarmError
+from farm.net.session import free_endpoint
+from learner.config import RunConfig
+from learner.run import Placement, open_run
+from learner.run_folder import RunFolder
+from learner.setup import fitted
+
+
+def script(main: Callable[[], None]) -> None:
+    """Run a script; Ctrl-C and the farm's errors end it with one line instead of a traceback."""
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped before the end\n")
+        sys.exit(INTERRUPTED)
+    except FarmError as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(2 if isinstance(error, ConfigError) else 1)
+
+
+def learn(config: RunConfig, path: Path, workers: int) -> None:
+    """Learn a run in this folder, unless it has finished; an interrupted run continues.
+
+    Raises:
+      ConfigError: the folder has a run with different settings.
+      RunError: the run failed.
+    """
+    folder = RunFolder(path)
+    if (folder.read_summary() or {}).get("state") == "finished":
+        return
+    if path.exists() and folder.read_config() != fitted(config):
+        raise ConfigError(f"{path} is a run with different settings: remove it, or work in a different folder")
+    place = Placement(workers=workers, listen=free_endpoint(), record=False)
+    with open_run(config, path, place, resume=path.exists()) as run:
+        for _ in run.learn():
+            pass
