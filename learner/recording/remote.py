@@ -98,7 +98,7 @@ def _recorded(path: Path) -> int:
         chunks = (chunk for part in parts(path) for chunk in RrdReader(part).stream())
         batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == _STATISTICS]
     except Exception as error:  # Rerun's reader raises many types
-        raise ConfigError(f"cannot read {path}: {error}; move it away, or choose another --out") from None
+        raise ConfigError(f"cannot read {path}: {error}; move it away, or choose a different --out") from None
     numbers = [
         batch.column("generation").cast("int64").to_pylist() for batch in batches if "generation" in batch.schema.names
     ]
@@ -108,16 +108,16 @@ def _recorded(path: Path) -> int:
 def _folder(path: Path, config: RunConfig) -> RunFolder:
     folder = RunFolder(path)
     if folder.checkpoint.exists():
-        raise ConfigError(f"{path} is the learner's own folder, which it records itself: choose another --out")
+        raise ConfigError(f"{path} is the learner's own folder, which it records itself: choose a different --out")
     with writing(f"to {path}", ConfigError):
         path.mkdir(parents=True, exist_ok=True)
         if (path / "config.json").exists():
             for setting, old, new in configs.other(folder.read_config(), config):
                 raise ConfigError(
                     f"{path} holds another run of that name, with --{setting} {old} instead of {new}: "
-                    "choose another --out"
+                    "choose a different --out"
                 )
         elif any(path.iterdir()):
-            raise ConfigError(f"{path} is no recording's folder, and not empty: choose another --out")
+            raise ConfigError(f"{path} is no recording's folder, and not empty: choose a different --out")
         folder.write_config(config)
     return folder

@@ -1,4 +1,4 @@
-"""`farm record`: a recorder elsewhere has what the learner's own has, whoever comes late or goes away."""
+"""`farm record`: a recording over the network equals the learner's own, even if programs start late or stop."""
 
 import itertools
 import re
@@ -48,7 +48,7 @@ def recorder(farm: Farm, endpoint: str, *flags: str) -> Process:
 
 
 def until(process: Process, text: str) -> str:
-    """The line with this text, once it is said."""
+    """Wait for the line with this text."""
     assert process.stdout
     said = []
     for line in iter(process.stdout.readline, ""):
@@ -74,7 +74,7 @@ def numbers(count: int) -> list[int]:
 
 
 def test_the_same_recording_as_the_learners(farm: Farm) -> None:
-    """Begun before there is a learner, with all there is to record."""
+    """A recorder that starts before the learner records the whole run."""
     endpoint = free_endpoint()
     process = farm.start("record", "--connect", endpoint)
     until(process, "no answer from")
@@ -224,9 +224,13 @@ def test_folders_and_runs_that_make_no_sense(farm: Farm) -> None:
     strange.mkdir(parents=True)
     (strange / "letter.txt").touch()
     for run, out, expected in (
-        ("a", "runs", "runs/a is the learner's own folder, which it records itself: choose another --out"),
-        ("b", "recordings", "recordings/b holds another run of that name, with --seed 7 instead of 0: choose another"),
-        ("b", "strange", "strange/b is no recording's folder, and not empty: choose another --out"),
+        ("a", "runs", "runs/a is the learner's own folder, which it records itself: choose a different --out"),
+        (
+            "b",
+            "recordings",
+            "recordings/b holds another run of that name, with --seed 7 instead of 0: choose a different",
+        ),
+        ("b", "strange", "strange/b is no recording's folder, and not empty: choose a different --out"),
         ("b", "runs/b/config.json", "cannot write to .*: Not a directory"),
     ):
         command = RecordCommand(connect=(endpoint,), run=run, out=farm.folder / out)
