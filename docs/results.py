@@ -94,7 +94,7 @@ for these explanations is in the experiments whose names begin with `why-`.
 
 
 def main() -> None:
-    """Copy, and write the page."""
+    """Copy the data, and write the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--machine", default="", help="what the experiments ran on, and their commit: a sentence")
@@ -125,7 +125,7 @@ def main() -> None:
 
 
 def _take(folder: ExperimentFolder, out: Path) -> None:
-    """Measure what is missing, and put a folder's data and experiments beside those that are here."""
+    """Make missing measurements, and add a folder's data and experiments to docs/results."""
     (out / "data").mkdir(parents=True, exist_ok=True)
     known = ExperimentFolder.open(out).experiments if (out / "experiment.json").exists() else ()
     for name in folder.experiments:
@@ -160,7 +160,7 @@ def question(page: str, known: Mapping[str, Data], notes: Mapping[str, str]) -> 
 
 
 def filled(text: str, known: Mapping[str, Data]) -> str:
-    """A note with links and verdicts in the places of {NAME}."""
+    """A note in which links and verdicts replace {NAME}."""
     return re.sub(r"\{([a-z0-9.-]+)\}", lambda m: f"{link(m[1])}: {said(EXPERIMENTS[m[1]], known[m[1]])}", text)
 
 

@@ -1,10 +1,10 @@
-"""Films a task that travels: edited on one machine, learnt at once by workers that stand on two others.
+"""Films a task that the learner sends: edited on one machine, learnt at once by workers on two other machines.
 
     sudo python docs/travel.py [--out docs/pictures/travel.gif]
 
-Three hosts are network namespaces; what follows a command is what the program printed there, at its time. Commands have
-shorter paths and the host's name than those that were run. Needs
-root, iproute2, and the extras `certificates`, `figures` and `video`.
+The three hosts are network namespaces. The text after a command is what the program printed, at the time when it did.
+The commands are shown with shorter paths and with the host's name. Needs root, iproute2, and the extras `certificates`,
+`figures` and `video`.
 """
 
 import argparse

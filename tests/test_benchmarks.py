@@ -1,10 +1,16 @@
-"""Benchmarks' scripts run, and print the rows that they promise; how fast anything is, no test says."""
+"""The benchmarks' scripts run and print the expected rows; no test measures speed."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from farm.net.session import free_endpoint
+from learner.config import RunConfig, configure
+from learner.run import Placement, open_run
+from learner.run_folder import RunFolder
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
@@ -29,3 +35,43 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
     heads = sum(line.startswith("|--") for line in lines)
     assert len(lines) - 2 * heads == rows, done.stdout
     assert all(line.count("|") >= 3 for line in lines)
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_script_with_one_line() -> None:
+    command = [sys.executable, "-u", FOLDER / "early.py"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        process.stdout.readline()  # the table's head, before the first run
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "stopped before the end\n")
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    from running import learn
+
+    config = configure(generations=6, pairs=2)
+    learn(config, tmp_path / "whole", workers=1)
+    interrupt(config, tmp_path / "parts", after=3)
+    assert hash_of(tmp_path / "parts") != hash_of(tmp_path / "whole")
+    learn(config, tmp_path / "parts", workers=1)
+    assert hash_of(tmp_path / "parts") == hash_of(tmp_path / "whole")
+    written = (tmp_path / "parts/summary.json").stat().st_mtime_ns
+    learn(config, tmp_path / "parts", workers=1)
+    assert (tmp_path / "parts/summary.json").stat().st_mtime_ns == written, "a finished run is not repeated"
+
+
+def interrupt(config: RunConfig, path: Path, after: int) -> None:
+    place = Placement(workers=1, listen=free_endpoint(), record=False)
+    with open_run(config, path, place) as run:
+        reports = run.learn()
+        for _ in range(after):
+            next(reports)
+        reports.close()
+
+
+def hash_of(path: Path) -> str:
+    return (RunFolder(path).read_summary() or {})["parameters_sha256"]
