@@ -1,4 +1,4 @@
-"""Which package may import which, and through which door: docs/architecture.md as a test."""
+"""Which package may import which, and through which modules: docs/architecture.md as a test."""
 
 import ast
 import re

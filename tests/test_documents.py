@@ -1,4 +1,4 @@
-"""Documents that quote the program quote what it says."""
+"""Documents quote the program correctly."""
 
 import ast
 import os
@@ -80,7 +80,7 @@ def test_the_results_anchors_exist() -> None:
 
 @pytest.mark.slow
 def test_the_pages_of_results_are_what_the_recorded_data_says(tmp_path: Path) -> None:
-    """Made again from a copy of docs/results, pages and figures are those of the project."""
+    """Pages and figures made from a copy of docs/results are those of the project."""
     pytest.importorskip("matplotlib")
     docs = ROOT / "docs"
     shutil.copytree(docs / "results", tmp_path / "results")

@@ -1,4 +1,4 @@
-"""Hosts with addresses of their own on one machine: network namespaces, and wires that can be cut or are bad."""
+"""Hosts with separate addresses on one machine: network namespaces, with links that can be cut or made unreliable."""
 
 import fcntl
 import heapq

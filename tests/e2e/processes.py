@@ -1,4 +1,4 @@
-"""Real processes on loopback: the command `farm` as a person runs it."""
+"""Real processes on loopback: the command `farm` as users run it."""
 
 import json
 import os
@@ -70,13 +70,13 @@ class Farm:
         return json.loads((self.folder / path).read_text())
 
     def progress(self, run: str) -> list[dict[str, Any]]:
-        """A run's generations so far; a line that is being written while this looks does not count yet."""
+        """A run's generations so far; a line that is still being written does not count."""
         path = self.folder / "runs" / run / "progress.jsonl"
         whole = path.read_text().rpartition("\n")[0] if path.exists() else ""
         return [json.loads(line) for line in whole.splitlines()]
 
     def wait_for(self, event: Callable[[], object], seconds: float = 60) -> None:
-        """Look for an event until it is there."""
+        """Wait until a condition holds."""
         until = time.monotonic() + seconds
         while not event():
             assert time.monotonic() < until, "what was waited for did not happen"

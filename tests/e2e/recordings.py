@@ -1,4 +1,4 @@
-"""Recordings read back with Rerun's own reader."""
+"""Reads recordings with Rerun's own reader."""
 
 from collections import defaultdict
 from pathlib import Path
@@ -33,7 +33,7 @@ def rows(batches: list[Any], name: str) -> dict[int, Any]:
 
 
 def generations(path: Path) -> list[int]:
-    """Generations in a recording, each of which is there once."""
+    """The generations in a recording, each once."""
     return sorted(rows(read(path)["/learning/return"], "scalars"))
 
 

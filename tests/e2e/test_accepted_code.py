@@ -1,4 +1,4 @@
-"""A task that travels: edited here, learnt by workers that stay; and nobody else can send one."""
+"""Tasks sent by the learner: edited here, learnt by running workers; other machines cannot send one."""
 
 import contextlib
 import hashlib
@@ -182,7 +182,7 @@ EVIL = b"raise SystemExit('evil')"
 
 
 def pose(opened: Session, worker: str, run: str) -> None:
-    """Do all that a learner of a task that travels does."""
+    """Do everything that the learner of such a task does."""
     digest = hashlib.sha256(EVIL).hexdigest()
     spec = codec.encode(
         Spec(run=run, task="evil.py:Evil", task_config={}, policy="linear", policy_config={}, code={"task": digest})
@@ -234,7 +234,7 @@ def test_a_workers_or_a_viewers_certificate_sends_no_code(farm: Farm, certs: Pat
 
 
 class Posing(Bundle):
-    """A worker's bundle with which somebody listens as if it were a learner's."""
+    """A worker's bundle, used to listen as a learner does."""
 
     def roster(self) -> Roster:
         return Roster(("w2",), ("w1",), ())

@@ -1,4 +1,4 @@
-"""A user's mistake gets one line, the right exit status, and costs nothing."""
+"""A user's mistake gets one line and the right exit status, and nothing is lost."""
 
 import json
 import logging
@@ -103,7 +103,7 @@ def test_mistakes(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """In this process: a program for each would take as long as all others together."""
+    """In this process: separate programs would take as long as all other tests together."""
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
     said = "".join(capfd.readouterr())
@@ -163,7 +163,7 @@ sys.exit(main())
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("module", ["farm.plugins", "numpy", "rich.console", "mujoco"])
 def test_ended_among_imports(module: str, number: int, farm: Farm) -> None:
-    """When it begins to import that; the last one is imported by the command itself."""
+    """Send the signal when this module is being imported; the command itself imports the last one."""
     code = INTERRUPTED.replace("MODULE", repr(module)).replace("NUMBER", str(int(number)))
     process = farm.start_python("-P", "-c", code, "tasks")
     said, _ = process.communicate(timeout=60)

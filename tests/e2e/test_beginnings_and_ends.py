@@ -1,4 +1,4 @@
-"""Where a run may begin, and when it may end before its last generation."""
+"""Where a run may start from, and when it may end before its last generation."""
 
 import numpy as np
 import pytest

@@ -24,7 +24,7 @@ USER = os.geteuid() or 1000
 
 
 def call(*command: str, **settings: str) -> str:
-    """What a command says; it has to succeed."""
+    """A command's output; the command must succeed."""
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=600
     )
@@ -38,7 +38,7 @@ def succeeds(*command: str) -> bool:
 
 @pytest.fixture(scope="module")
 def base() -> str:
-    """The Dockerfile's own base image where it is to be had, else one of Debian's packages."""
+    """The Dockerfile's base image if it is available, otherwise one made from Debian's packages."""
     if not succeeds("docker", "version"):
         pytest.skip("Docker does not run here")
     if succeeds("docker", "image", "inspect", BASE) or succeeds("docker", "pull", "--quiet", BASE):
@@ -74,11 +74,11 @@ class Stack:
         return found
 
     def read(self, name: str, folder: Path) -> str:
-        """A file of the run; empty as long as it is not there."""
+        """A file of the run; empty if it does not exist yet."""
         return self.fetch("learner", f"runs/{self.settings['RUN']}/{name}", folder).decode()
 
     def fetch(self, service: str, path: str, folder: Path) -> bytes:
-        """A file out of a service's container; empty as long as it is not there."""
+        """A file from a service's container; empty if it does not exist yet."""
         command = ["docker", "cp", f"{self.container(service)}:/farm/{path}", "-"]
         with (folder / "copied.tar").open("w+b") as file:
             if subprocess.run(command, stdout=file, stderr=subprocess.PIPE, check=False).returncode:

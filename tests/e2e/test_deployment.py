@@ -1,4 +1,4 @@
-"""The files of docs/deployment: each is checked by its own program's rules, and its commands really learn."""
+"""The files of docs/deployment: each is checked by the program that it is for, and its commands learn."""
 
 import os
 import shlex
@@ -30,7 +30,7 @@ Place = tuple[str, Callable[[str], str]]
 
 @pytest.fixture
 def place(farm: Farm) -> Place:
-    """A free endpoint, and how the files' addresses and folders read on this machine."""
+    """A free endpoint, and a function that replaces the files' addresses and folders by those of this test."""
     endpoint, certs = free_endpoint().replace("tcp", "tls"), farm.folder / "certs"
     certificates.main(["new", str(certs), "--learner", "127.0.0.1", "--worker", "w", "--viewer", "v"])
     there = {

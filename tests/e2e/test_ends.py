@@ -1,4 +1,4 @@
-"""However a run or a worker ends, it ends soon, says so in a line, and leaves no process behind."""
+"""A run or a worker ends quickly in every case, prints one line, and leaves no process behind."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ def _state(pid: int) -> str:
 
 
 def end(process: "subprocess.Popen[str]", number: signal.Signals, record: Callable[[str, object], None]) -> str:
-    """Send a signal, wait for the end, and see that it came soon and nobody is left."""
+    """Send a signal, and check that the program ends quickly and leaves no process behind."""
     workers = children(process.pid)
     assert workers
     begun = time.monotonic()

@@ -1,4 +1,4 @@
-"""Whatever dies, hangs, slows down or is cut off: every pair counts once, and the numbers stay the same.
+"""If anything dies, hangs, slows down or is cut off, every pair counts once, and the numbers stay the same.
 
 Each test ends with the hash of the undisturbed run, and says how long the run stood still at most;
 `pytest --measurements FILE` writes that down (docs/reliability.md holds ours).
@@ -35,7 +35,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check:
-    """Every pair once, the same hash, no longer a standstill than allowed [s]; and signs that there was a fault.
+    """Check that every pair counts once, the hash is the same, no pause is too long [s], and the fault occurred.
 
     Those are a least standstill [s], jobs given out again, or a word in the run's log.
     """

@@ -1,4 +1,4 @@
-"""What a user does with finished runs: see them again, film, compare and play them, take the policy elsewhere."""
+"""Uses of finished runs: replay, video, comparison, interactive play, export of the policy."""
 
 import contextlib
 import ctypes.util
@@ -322,7 +322,7 @@ def test_several_recordings_are_a_table_in_the_viewer(done: Farm, tmp_path: Path
 
 
 def bare(farm: Farm, path: Path) -> str:
-    """What the example says in an interpreter where importing any of this project raises."""
+    """The example's output, in an interpreter in which importing this project raises."""
     code = (
         "import runpy, sys\n"
         "for package in ('farm', 'learner', 'workers'): sys.modules[package] = None\n"

@@ -1,4 +1,4 @@
-"""Nonsense from the network, over a live session: nothing falls over, honest work goes on, and all of it is counted."""
+"""Invalid messages over a live session: nothing crashes, honest work continues, and all of them are counted."""
 
 import json
 import os
@@ -57,7 +57,7 @@ def _array(dtype: str, shape: tuple[int, ...], raw: bytes) -> msgpack.ExtType:
 
 
 def spoilt(honest: bytes, data: st.DataObject) -> bytes:
-    """An honest message with something wrong; never one that could pass for the real one."""
+    """An honest message with an error, which makes it different from every valid one."""
     body: dict[str, Any] = msgpack.unpackb(honest, ext_hook=msgpack.ExtType)
     how = data.draw(st.sampled_from(["cut", "noise", "nested", "field", "missing", "foreign", "version", "stale"]))
     if how == "cut":
@@ -124,7 +124,7 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
 
 
 def overheard(stranger: session.Session) -> dict[str, tuple[str, bytes]]:
-    """A message of each kind, as honest ones speak."""
+    """A valid message of each kind."""
     stranger.subscribe("all", "farm/**")
     heard: dict[str, tuple[str, bytes]] = {}
     while set(heard) < set(TOPICS):

@@ -1,4 +1,4 @@
-"""The live stream: real viewers that look on, stop, are killed and come late, and a run that does not care."""
+"""The live stream: viewers that watch, stop reading, are killed or come late do not affect the run."""
 
 import signal
 import subprocess

@@ -1,4 +1,4 @@
-"""What a run leaves behind to look at: recordings, figures, tables; read back and computed again."""
+"""A run's recordings, figures and tables, read back and compared with computed values."""
 
 import contextlib
 import json
@@ -113,7 +113,7 @@ def test_a_window_needs_a_display(recorded: Farm, monkeypatch: pytest.MonkeyPatc
 
 
 def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
-    """One recording in the end, and every generation in it once."""
+    """There is one recording in the end, with every generation once."""
     process = farm.start("run", *SMALL[:-1], "30")
     farm.wait_for(lambda: len(farm.progress("r")) >= 3)
     process.terminate()
@@ -142,7 +142,7 @@ def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
 
 
 def listeners(port: int) -> set[str]:
-    """Addresses on this machine where somebody listens on a port."""
+    """Addresses of this machine on which a program listens at this port."""
     found = set()
     for name in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:

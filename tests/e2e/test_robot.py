@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(60)]
 
 
 def wait_for(process: "subprocess.Popen[str]", words: str) -> str:
-    """What it says until it says that."""
+    """Its output up to this text."""
     said = ""
     for line in process.stdout or ():
         said += line
@@ -63,7 +63,7 @@ def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> 
     assert lines[0]["mean_policy_return"] < 0, "50 is upright throughout"
     assert lines[-1]["mean_policy_return"] > 40
     assert "failed at a job: the rig" in said, "what it cannot do"
-    assert lines[-1]["reissued"] > 0, "goes to others"
+    assert lines[-1]["reissued"] > 0, "other workers do its jobs"
     assert "is expelled" not in said
     robot.terminate()
     did, _ = robot.communicate(timeout=20)

@@ -1,4 +1,4 @@
-"""Routers between learner and workers: zenohd instead of ours, and sites that each have one."""
+"""Routers between learner and workers: zenohd instead of ours, and one router per site."""
 
 from collections.abc import Callable
 from pathlib import Path

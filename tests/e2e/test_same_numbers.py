@@ -1,4 +1,4 @@
-"""The numbers learnt are the same to the last bit, whatever happens to the farm."""
+"""The learnt numbers are the same to the last bit, even if workers die or join late."""
 
 import os
 import platform

@@ -1,4 +1,4 @@
-"""With certificates only those who should get in do, and only to what is theirs."""
+"""With certificates only permitted programs connect, and each can do only what its certificate permits."""
 
 import contextlib
 import json
@@ -38,7 +38,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(params=["learner", "router", "zenohd"])
 def place(farm: Farm, certs: Path, request: pytest.FixtureRequest) -> tuple[str, list[str]]:
-    """Where to connect, and what the learner is told: all topologies are attacked alike."""
+    """Where to connect, and the learner's flags: each topology gets the same attacks."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     tls = ["--tls", str(certs / "own")]
     if request.param == "learner":
@@ -58,7 +58,7 @@ def intruder(endpoint: str, bundle: Bundle) -> Iterator[Session]:
 
 
 def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Results:
-    """Splendid returns for every pair."""
+    """Very high returns for every pair."""
     eps = np.zeros((count, 1))
     flags = np.tile([True, False, False, False], (2 * count, 1))
     given = Simulated(np.full(2 * count, 1000.0), flags, np.full(2 * count, 15), np.zeros((2, 15, 54), dtype="<f4"), ())
@@ -185,14 +185,14 @@ def test_who_has_no_good_certificate_is_told_what_to_check(
 
 
 class Naked(Bundle):
-    """Trusts the farm's authority, but has nothing to show."""
+    """Settings that trust the farm's authority, but have no certificate."""
 
     def connecting(self) -> dict[str, object]:
         return {"transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem")}
 
 
 def refused(opened: Session) -> None:
-    """A session that opened all the same must be of no use."""
+    """A session that was opened nevertheless must be useless."""
     until = time.monotonic() + 3
     while time.monotonic() < until:
         assert opened.ask(keys.generation("farm", "r"), 0.5) is None

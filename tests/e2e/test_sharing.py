@@ -1,4 +1,4 @@
-"""Runs that share their workers, and a run that has none for a while."""
+"""Runs that share their workers, and a run without workers for some time."""
 
 import os
 import time
@@ -18,7 +18,7 @@ RUNS = {"first": ("--seed", "1"), "second": ("--seed", "2", "--policy", "project
 
 
 def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:
-    """While both are on each makes more than half of the other's generations, and both end with their own numbers."""
+    """While both run, each makes more than half of the other's generations, and both have the usual numbers."""
     endpoint, length = free_endpoint(), ("--generations", str(GENERATIONS), *SMALL)
     farm.start_router(endpoint)
     learners = {

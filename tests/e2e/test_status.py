@@ -1,4 +1,4 @@
-"""`farm status`, and who is refused."""
+"""`farm status`, and refused workers."""
 
 import json
 

@@ -93,7 +93,7 @@ def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator
 def learnt(
     config: RunConfig, path: Path, count: int, *files: Path, resume: bool = False, liars: int = 0, audit: float = 0.02
 ) -> dict[str, Any]:
-    """A run by so many workers; what its summary says."""
+    """The summary of a run by this number of workers."""
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
     with (
         open_run(config, path, place, resume=resume) as run,

@@ -1,4 +1,4 @@
-"""A pool of workers for search methods of one's own: real processes over loopback."""
+"""A pool of workers for the user's own search method: real processes over loopback."""
 
 import os
 import queue

@@ -1,4 +1,4 @@
-"""The benchmark of published tables: its runs side by side give the numbers of `farm run`, one by one."""
+"""The benchmark of published tables: runs simulated together give the same numbers as separate `farm run`s."""
 
 import json
 import subprocess

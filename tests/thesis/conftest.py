@@ -1,4 +1,4 @@
-"""The scripts of the checkout are no installed package: this is where `benchmarks` is found."""
+"""Makes `benchmarks` importable: the scripts of the checkout are not installed."""
 
 import sys
 from pathlib import Path

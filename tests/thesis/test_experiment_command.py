@@ -29,7 +29,7 @@ SHORT = ("fig-4.3", "--trials", "2", "--generations", "3", "--workers", "2")
 
 @pytest.fixture(autouse=True, scope="module")
 def from_a_checkout():
-    """Commands run in folders of their own: benchmarks/ is found by the path."""
+    """Commands run in separate folders, and find benchmarks/ by the path."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
         yield

@@ -125,7 +125,7 @@ def test_the_features_that_the_thesis_recommends():
 
 
 def folder_with(path: Path, generations: int, state: str = "finished") -> RunFolder:
-    """A run's folder as a run would leave it."""
+    """A run's folder with the files of a finished run."""
     run = RunFolder.create(path, replace(RunConfig(), generations=9))
     numbers = dict.fromkeys(GenerationStats.__dataclass_fields__, 0.0)
     counts = ("generation", "rollouts", "ended", "failed", "clamped", "reissued", "workers")
@@ -269,7 +269,7 @@ def test_a_folder_is_one_experiments(tmp_path):
 
 
 def test_data_whose_runs_are_gone_is_not_overwritten(tmp_path):
-    """A set-up's data stays while all its runs are gone; with some of them gone nothing is done."""
+    """If all runs of a set-up are gone, its data stays; if some are gone, nothing is done."""
     folder = ExperimentFolder.prepare(tmp_path / "out", ["text-8000"], 2, 9)
     configs = [folder.config("joints-D8000", number) for number in range(2)]
     for number in range(2):

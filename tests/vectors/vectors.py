@@ -1,4 +1,4 @@
-"""Messages of the worker's side, byte by byte: `python tests/vectors/vectors.py` writes them anew beside this file.
+"""Messages of the worker's side, byte by byte: `python tests/vectors/vectors.py` writes them again beside this file.
 
 NAME.bin is a message as it travels; messages.json says what each holds. An array is {"dtype", "shape", "values"} there.
 """

@@ -1,4 +1,4 @@
-"""`farm certificates`: what it refuses it says in a line and leaves nothing of; who may take part is not forgotten."""
+"""`farm certificates`: errors are one line and leave no files; admitted machines stay admitted."""
 
 import json
 import shutil
@@ -93,7 +93,7 @@ def test_names_that_a_certificate_does_not_take(
 
 
 def test_none_or_all(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error in the middle leaves nothing half made."""
+    """An error leaves no incomplete files."""
     before, issue = files(tmp_path), certificates._Authority.issue
 
     def full(self: Any, to: Path, role: Any, name: str, days: int, hosts: tuple[str, ...]) -> None:

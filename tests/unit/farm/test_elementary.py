@@ -1,4 +1,4 @@
-"""Elementary functions: near the true values, and the same bits however they are asked for."""
+"""Elementary functions: near the true values, and the same bits for every shape of the argument."""
 
 import math
 from decimal import Decimal, localcontext

@@ -1,4 +1,4 @@
-"""Running moments against numpy's own mean and standard deviation of everything at once."""
+"""Running moments compared with numpy's mean and standard deviation of all data."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where tasks, policies and commands come from: built in, installed packages, files; and what goes wrong there."""
+"""Sources of tasks, policies and commands: built in, installed packages, files; and their errors."""
 
 import hashlib
 import subprocess
@@ -206,7 +206,7 @@ def test_a_class_of_an_installed_package() -> None:
         **dict.fromkeys(("finger-gait", "fragile-bar", "turning", "gym"), "built in"),
         **dict.fromkeys(("walk", "broken", "lost"), "theirs 1.2"),
     }
-    assert find("tasks", "finger-gait").target is FingerGait, "nobody takes a built-in's name"
+    assert find("tasks", "finger-gait").target is FingerGait, "a built-in's name cannot be taken"
     assert find("commands", "hike").target.steps == 5
     with pytest.raises(
         ConfigError,

@@ -1,4 +1,4 @@
-"""Random features and controllers against their formulas; and rows that do not know of their batch."""
+"""Random features and controllers compared with their formulas; rows do not depend on their batch."""
 
 import math
 from itertools import pairwise

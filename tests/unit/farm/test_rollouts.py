@@ -1,4 +1,4 @@
-"""Jobs to results on a made-up task: signs, origins, rates, traces; and which specifications are served."""
+"""From jobs to results with a small test task: signs, origins, rates, traces; which specifications are served."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

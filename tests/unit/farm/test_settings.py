@@ -1,4 +1,4 @@
-"""Settings: what is checked of them, and command lines: one line for a mistake, a help that says what everything is."""
+"""Settings and their checks; command lines: one line for a mistake, and help for every flag."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

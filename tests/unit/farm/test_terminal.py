@@ -1,4 +1,4 @@
-"""What others wrote moves no cursor, rings no bell and turns no text around on a terminal of ours."""
+"""Text from other machines moves no cursor, rings no bell and reverses no text on our terminal."""
 
 import io
 import logging

@@ -1,4 +1,4 @@
-"""An upper level over gaits: which may follow each other, and when the next one acts."""
+"""A chain of gaits: which may follow each other, and when the next one acts."""
 
 from collections.abc import Callable
 from functools import cache

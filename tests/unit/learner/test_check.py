@@ -1,4 +1,4 @@
-"""`farm check`: which word is the task, and names of settings that a flag of a command has."""
+"""`farm check`: which word is the task, and settings with the same name as a flag of the command."""
 
 from pathlib import Path
 

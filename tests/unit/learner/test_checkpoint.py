@@ -1,4 +1,4 @@
-"""Checkpoints: read back bit for bit, and never half: neither when damaged nor when writing fails."""
+"""Checkpoints: read back bit for bit; a damaged or incomplete one is never used."""
 
 import errno
 import hashlib

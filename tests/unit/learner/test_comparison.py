@@ -1,4 +1,4 @@
-"""Runs beside each other: names, differences, results."""
+"""Comparison of runs: names, differences, results."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A run's configuration: parts chosen by name, to JSON and back, what is refused and with which words, what changed."""
+"""A run's configuration: parts chosen by name, JSON, error messages, differences."""
 
 import json
 import time

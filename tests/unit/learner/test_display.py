@@ -1,4 +1,4 @@
-"""The live screen: what workers and their network say moves none of it."""
+"""The live screen: texts from workers and network do not disturb it."""
 
 import io
 import logging
@@ -18,7 +18,7 @@ ATTACK = "\x1b[2J\x1b]0;owned\a\u202e\x9b3J [bold]"
 
 
 def screen(workers: list[WorkerStatus], width: int, show: Callable[[], None] = lambda: None) -> str:
-    """What a terminal of that width is sent for one generation."""
+    """The output for one generation on a terminal of this width."""
     learner = SimpleNamespace(config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0))
     farm = SimpleNamespace(census=lambda: workers)
     run = cast("Any", SimpleNamespace(learner=learner, farm=farm, recording=None, live=None))

@@ -1,4 +1,4 @@
-"""A run without a network: how it begins, goes on, is resumed, and what is loaded of it afterwards."""
+"""A run without a network: start, progress, resume, and loading its results."""
 
 import errno
 import itertools

@@ -1,4 +1,4 @@
-"""Loggers: what reaches TensorBoard's files and wandb, and that nothing of theirs reaches the learning."""
+"""Loggers: the values in TensorBoard's files and wandb; their errors do not affect learning."""
 
 import json
 import struct

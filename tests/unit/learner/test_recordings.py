@@ -1,4 +1,4 @@
-"""Where a recording may be written: what cannot be is said before the work is done."""
+"""Where a recording may be written: errors come before the work is done."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A run's policy again, when the file of its task is another by now."""
+"""Loading a run's policy after the file of its task has changed."""
 
 import logging
 from pathlib import Path

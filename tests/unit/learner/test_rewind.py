@@ -1,4 +1,4 @@
-"""Exploring rollouts of a run again, from their seeds: every return, to the last bit."""
+"""Exploring rollouts of a run repeated from their seeds: every return, to the last bit."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def learnt(task: str, path: Path, **settings: object) -> list[FloatArray]:
 
 
 class _Kept:
-    """In the dispatcher's place, too: keeps what every round gave, but for replays of the best."""
+    """Instead of the dispatcher: keeps the results of every round, except replays of the best."""
 
     def __init__(self, alone: Alone, returns: list[FloatArray]) -> None:
         self._alone, self._returns = alone, returns

@@ -1,4 +1,4 @@
-"""A run's folder: what is appended is read back exactly, torn ends are cut off, nothing is overwritten."""
+"""A run's folder: appended entries are read back exactly, incomplete ends are cut off, nothing is overwritten."""
 
 import json
 from dataclasses import replace
@@ -287,7 +287,7 @@ def test_a_checkpoint_without_generation(folder: RunFolder) -> None:
 
 
 def test_parameters_are_begun_whole_or_not_at_all(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A head that was torn would keep the run from going on."""
+    """With an incomplete head the run could not continue."""
 
     def full(path: Path, *_: object) -> None:
         path.touch()

@@ -1,4 +1,4 @@
-"""A sweep: what is varied, which folders that makes, what is refused, and what the table says."""
+"""A sweep: varied settings, folders, error messages, and the table."""
 
 import csv
 import json
@@ -24,7 +24,7 @@ def made(path, *sigmas, seeds=(0, 1), **common):
 
 
 def ran(path, config, returns, state="finished", final=None, rollouts=30):
-    """A run's folder as a run would leave it."""
+    """A run's folder with the files of a finished run."""
     folder = RunFolder.create(path, config)
     told = dict.fromkeys(GenerationStats.__dataclass_fields__, 0.0)
     told |= dict.fromkeys(("ended", "failed", "clamped", "reissued", "workers"), 0)

@@ -1,4 +1,4 @@
-"""A stage with a real session on loopback."""
+"""A test stage with a real session on loopback."""
 
 import threading
 from collections.abc import Iterator

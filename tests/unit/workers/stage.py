@@ -1,4 +1,4 @@
-"""A stage for one worker: learners that follow a script, and a task that simulates nothing."""
+"""A test stage for one worker: learners that follow a script, and a task that simulates nothing."""
 
 import hashlib
 import threading

@@ -1,4 +1,4 @@
-"""Code that a learner sends: when it is fetched, what is refused, and what the process that runs it is left with."""
+"""Code sent by a learner: when it is fetched, what is refused, and what its process can still access."""
 
 import hashlib
 import logging

@@ -1,4 +1,4 @@
-"""`farm worker`: what it is told, each of its processes is told."""
+"""`farm worker`: its flags are passed on to each of its processes."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_processes_are_told_everything(changed: dict[str, object], tmp_path: Pat
 
 
 def test_no_setting_is_left_out(tmp_path: Path) -> None:
-    """Whoever adds a setting to a worker adds its flag."""
+    """Every setting of a worker has a flag."""
     path = tmp_path / "mine.py"
     path.touch()
     certificates.main(["new", str(tmp_path / "certs"), "--learner", "localhost", "--worker", "w"])

@@ -1,4 +1,4 @@
-"""The fingerprint changes with anything that changes a number, and with nothing else."""
+"""The fingerprint changes if and only if the numbers change."""
 
 import subprocess
 import sys

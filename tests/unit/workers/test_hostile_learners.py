@@ -1,4 +1,4 @@
-"""A worker, and learners and sessions that are confused or hostile."""
+"""A worker with learners and sessions that are faulty or hostile."""
 
 import threading
 import time

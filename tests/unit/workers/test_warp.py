@@ -22,7 +22,7 @@ ROWS = 6
 
 
 class Kicked(Task):
-    """A paddle pushes a ball, of a mass of its own in each rollout, over the ground."""
+    """A paddle pushes a ball over the ground; the ball's mass differs between rollouts."""
 
     xml = """
 <mujoco>
@@ -39,13 +39,13 @@ class Kicked(Task):
     steps, substeps = 5, 10
 
     def reset(self, sim: Sim, row: int, rng: np.random.Generator | None) -> None:
-        """Another mass, another place."""
+        """Draw mass and position."""
         if rng is not None:
             sim.expand("body_mass")[row, 1] *= rng.uniform(0.5, 2.0)
             sim.qpos[row, :2] += rng.uniform(0.0, 0.01, 2)
 
     def reward(self, sim: Sim, action: FloatArray) -> FloatArray:
-        """How far the ball is, and how the paddle stands."""
+        """The ball's distance and the paddle's angle."""
         reward: FloatArray = sim.qpos[:, 0] + 0.1 * sim.xquat[:, 2, 2] - 0.01 * (action * action).sum(axis=1)
         return reward
 

@@ -1,4 +1,4 @@
-"""A worker and a learner that follows a script: who says what when, what is served, and what is ignored."""
+"""A worker and a learner that follows a script: the order of messages, which runs are served, what is ignored."""
 
 import logging
 from dataclasses import replace
@@ -193,7 +193,7 @@ class Pole(farm.Task):
 
 
 def pole(file: Path) -> Spec:
-    """What a learner says of the task in that file."""
+    """A learner's specification of the task in that file."""
     found, policy = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", "kernel")
     code = {"task": found.digest(), "policy": policy.digest(), "simulation": plugins.code_digest(SIMULATION)}
     files = {"model.xml": found.target.xml}

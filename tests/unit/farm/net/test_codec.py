@@ -1,4 +1,4 @@
-"""Bytes that come in: round trips, every kind of nonsense, and nothing but MessageError whatever they are."""
+"""Received bytes: round trips, and MessageError for every kind of invalid input."""
 
 import contextlib
 import tracemalloc
@@ -371,7 +371,7 @@ def peak_of(payload, kind=Sample):
 
 
 def bound(payload):
-    """Return what decoding may take: small objects cost Python some 100 bytes a byte, never more."""
+    """Return what decoding may take: small objects cost Python some 100 bytes per byte, never more."""
     return 200_000 + 150 * len(payload)
 
 
@@ -462,7 +462,7 @@ def test_mutated_bytes_are_a_message_or_a_message_error(start, length, instead, 
 
 
 def test_a_timestamp_is_a_number() -> None:
-    """No object of msgpack's own reaches whoever takes a table of anything for JSON."""
+    """No object of msgpack's own is accepted in a table that is to become JSON."""
     body = msgpack.unpackb(codec.encode(sample()), ext_hook=msgpack.ExtType)
     body["settings"] = {"when": msgpack.Timestamp(7, 500_000_000)}
     settings = codec.decode(msgpack.packb(body), Sample).settings

@@ -1,4 +1,4 @@
-"""What subscriptions brought: in order, bounded, and never waited for longer than was asked."""
+"""Received events: in order, in bounded memory, and with timeouts that are kept."""
 
 import queue
 import signal

@@ -1,4 +1,4 @@
-"""Whose key it is: what is remembered of strangers is short."""
+"""Names in keys: the worker or the run that a key names; keys without a valid name are refused."""
 
 import pytest
 
@@ -15,18 +15,18 @@ def test_the_names_behind_a_prefix() -> None:
     "behind",
     ["", "a", "a/", "/1", "a/b/c", "a/*", "**", "a/$*", "ä/1", f"{'x' * 101}/1", "/".join("ab" * 15_000), "./1"],
 )
-def test_what_is_no_worker_is_nobodys(behind: str) -> None:
+def test_a_key_without_a_worker_is_refused(behind: str) -> None:
     with pytest.raises(MessageError, match="a key without a name"):
         keys.worker_in(f"farm/want/{behind}", keys.want("farm", ""))
 
 
 @pytest.mark.parametrize("behind", ["", "a/b", "*", "x" * 101, "a/" * 10_000])
-def test_what_is_no_run_is_nobodys(behind: str) -> None:
+def test_a_key_without_a_run_is_refused(behind: str) -> None:
     with pytest.raises(MessageError, match="a key without a name"):
         keys.run_in(f"farm/live/learner/{behind}", keys.learner_token("farm", ""))
 
 
-def test_a_key_of_another_farm_is_nobodys() -> None:
+def test_a_key_of_another_farm_is_refused() -> None:
     with pytest.raises(MessageError, match="a key without a name"):
         keys.worker_in("other/want/a/1", keys.want("farm", ""))
 

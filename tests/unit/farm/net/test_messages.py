@@ -1,4 +1,4 @@
-"""Every message there and back bit for bit, what each refuses, and jobs as one table."""
+"""Every message encoded and decoded bit for bit, invalid messages, and jobs as one table."""
 
 import contextlib
 import dataclasses

@@ -1,4 +1,4 @@
-"""Sessions on loopback, for real."""
+"""Real sessions on loopback."""
 
 import threading
 from collections.abc import Callable

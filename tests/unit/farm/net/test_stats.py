@@ -1,4 +1,4 @@
-"""Lines of progress.jsonl: the names stay, so that what was written can always be read."""
+"""Lines of progress.jsonl: the names do not change, so that old files can be read."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What learners tell observers: tables in it are as JSON has them, whoever sent them."""
+"""Messages from learners to observers: tables in them are valid JSON, even from a hostile sender."""
 
 from typing import Any
 

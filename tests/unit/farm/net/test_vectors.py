@@ -1,4 +1,4 @@
-"""The test vectors are what we send, by our own codec and by plain msgpack, and what we read."""
+"""The test vectors equal our messages, encoded by our codec and by plain msgpack, and can be decoded."""
 
 import importlib.util
 import json
@@ -30,7 +30,7 @@ def test_our_codec_writes_and_reads_them(name: str) -> None:
 
 
 def packed(value: Any) -> Any:
-    """What plain msgpack packs, of what JSON says."""
+    """The JSON values, packed by plain msgpack."""
     if isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}:
         head = msgpack.packb([value["dtype"], value["shape"]])
         numbers = struct.pack(f"<{len(value['values'])}{LETTERS[value['dtype']]}", *value["values"])

@@ -1,4 +1,4 @@
-"""What a channel may be."""
+"""Valid and invalid channels."""
 
 import pytest
 

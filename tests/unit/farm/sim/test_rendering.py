@@ -1,4 +1,4 @@
-"""Pictures of any model, drawn by a process of its own: MuJoCo chooses how it draws when it is imported."""
+"""Pictures of any model, drawn in a separate process, because MuJoCo chooses its renderer when it is imported."""
 
 import os
 import subprocess

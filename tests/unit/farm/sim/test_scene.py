@@ -1,4 +1,4 @@
-"""What of a compiled model is drawn, and where."""
+"""Which parts of a compiled model are drawn, and where."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""Gymnasium's environments as tasks: against a plain loop, bit for bit; which names are taken; clear errors."""
+"""Gymnasium's environments as tasks: equal to a plain loop, bit for bit; accepted names; clear errors."""
 
 import subprocess
 import sys

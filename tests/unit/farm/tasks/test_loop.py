@@ -1,4 +1,4 @@
-"""The closed loop on made-up tasks: rows that do not know of each other, ends, failures, and clear errors."""
+"""The closed loop on small test tasks: independent rows, ends, failures, and clear errors."""
 
 from dataclasses import dataclass, fields
 

@@ -1,4 +1,4 @@
-"""What a task's observations are like: origin and spread."""
+"""Origin and spread of a task's observations."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""SNES, ARS, CMA-ES and sep-CMA: against slow readings of their equations, and as states that are resumed."""
+"""SNES, ARS, CMA-ES and sep-CMA: compared with plain versions of their equations, and resumed."""
 
 import builtins
 import math

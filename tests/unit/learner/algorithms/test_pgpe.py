@@ -1,4 +1,4 @@
-"""PGPE against a slow reading of its equations in Python floats, one number at a time."""
+"""PGPE compared with its equations in plain Python floats, one number at a time."""
 
 import itertools
 import math

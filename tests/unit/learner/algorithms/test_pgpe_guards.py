@@ -1,4 +1,4 @@
-"""PGPE where the equations have no answer: nothing to divide by, nothing finite, no room."""
+"""PGPE where its equations are undefined: division by zero, values that are not finite, bounds of sigma and speed."""
 
 import dataclasses
 import itertools

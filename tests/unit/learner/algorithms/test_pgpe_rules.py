@@ -1,4 +1,4 @@
-"""PGPE: numbers by hand, invariances of the update, and that it learns."""
+"""PGPE: examples computed by hand, invariances of the update, and a test that it learns."""
 
 import dataclasses
 import itertools

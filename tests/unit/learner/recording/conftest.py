@@ -1,4 +1,4 @@
-"""A made-up task with a channel of each kind, one without channels, and recordings read back by Rerun's own reader."""
+"""A test task with a channel of each kind, one without channels, and Rerun's own reader for recordings."""
 
 from collections import defaultdict
 from collections.abc import Callable

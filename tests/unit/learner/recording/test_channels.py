@@ -1,4 +1,4 @@
-"""What a task's channels become in a recording, and how primitives are drawn."""
+"""How a recording shows a task's channels and primitives."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Compacting a recording: a process that is killed while at it leaves no other behind, and what it leaves goes."""
+"""Compacting a recording: if the process is killed, its child ends as well, and its files are removed later."""
 
 import os
 import select

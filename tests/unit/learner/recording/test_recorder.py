@@ -1,4 +1,4 @@
-"""Recordings are written for real and read back with Rerun's own reader."""
+"""Recordings are written and read back with Rerun's own reader."""
 
 import pickle
 import re

@@ -1,4 +1,4 @@
-"""The recorder's thread: learning never waits for it, nor fails with it."""
+"""The recorder's thread: learning neither waits for it nor fails with it."""
 
 import logging
 import threading

@@ -47,7 +47,7 @@ class Pole(farm.Task):
 
 
 class Alone:
-    """In the dispatcher's place: does a round's jobs here and now, some of them at a time, in any order."""
+    """Instead of the dispatcher: does a round's jobs at once, several together, in any order."""
 
     def __init__(self, found: setup.Problem, seed: int = 0) -> None:
         self.admission, self.workers, self.reissued = SimpleNamespace(canary="c"), ("w/1",), 0

@@ -1,4 +1,4 @@
-"""A learner without physics, and workers to hire."""
+"""A learner and workers without physics."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack

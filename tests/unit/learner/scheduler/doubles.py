@@ -1,4 +1,4 @@
-"""A dispatcher, and workers that do what a test says; no physics."""
+"""A dispatcher, and workers that follow the test's instructions; no physics."""
 
 import threading
 from collections.abc import Callable
@@ -83,7 +83,7 @@ class Worker:
         self.say(keys.result(FARM, RUN, self.name), message)
 
     def work(self, count: int) -> list[int]:
-        """Answer chunks until so many jobs are done."""
+        """Answer chunks until this number of jobs is done."""
         done: list[int] = []
         while len(done) < count:
             chunk = self.chunk()

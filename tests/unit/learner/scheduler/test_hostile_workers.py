@@ -34,7 +34,7 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     ]  # fmt: skip
     for message in bad:
         worker.answer(message)
-    assert farm.workers == ("a/1",), "somebody joined by a message of another"
+    assert farm.workers == ("a/1",), "a worker joined by the message of another worker"
     worker.answer(honest)
     worker.answer(worker.results(first, 0, value=7.0))
     worker.work(3)

@@ -1,4 +1,4 @@
-"""Which workers may join, which of those that announce themselves are connected, and what is known of each."""
+"""Which workers may join, which announced workers are connected, and what the learner knows about each."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A round's results: whichever messages bring them, in whatever order, doubled or not, the same comes out."""
+"""A round's results do not depend on how messages group, order or repeat them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ def begun(traces: str, trace: tuple[int, int] = TRACE) -> RoundResults:
 
 
 def message(indices: Sequence[int], traces: str) -> Results:
-    """What a worker sends of these jobs."""
+    """A worker's message with the results of these jobs."""
     jobs = sorted(indices)
     rows = [row for job in jobs for row in ((2 * job, 2 * job + 1) if job < PAIRS else (-1,))]
     returns = np.array([9.0 if row < 0 else RETURNS[row] for row in rows])
@@ -137,7 +137,7 @@ def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
     assert round_.moments[round_.rows(PAIRS), 0].tolist() == [PAIRS + 1.0]
     plain, sent = RoundResults(JOBS, "none", TRACE, SHAPES), message([0], "none")
     assert plain.place(sent) is not None
-    assert plain.place(replace(sent, moments=np.zeros((2, 5)))) is None, "nobody asked"
+    assert plain.place(replace(sent, moments=np.zeros((2, 5)))) is None, "moments were not requested"
 
 
 @pytest.mark.parametrize("changed", ["returns", "flags", "steps", "moments"])

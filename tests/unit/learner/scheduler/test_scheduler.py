@@ -1,4 +1,4 @@
-"""The scheduler's rules, one at a time; `test_scheduler_simulation` has them all at once."""
+"""The scheduler's rules, one at a time; `test_scheduler_simulation` tests them together."""
 
 import math
 from collections import Counter
@@ -11,7 +11,7 @@ from learner.scheduler.scheduler import Assignment, Scheduler, SchedulerConfig
 
 
 def started(jobs, workers=(), *, credits=4, seconds=None, **config):
-    """Return a scheduler in a round of `jobs`; `seconds` a job are known from a round before."""
+    """Return a scheduler in a round of `jobs`; `seconds` per job are known from an earlier round."""
     scheduler = Scheduler(SchedulerConfig(**{"chunk_seconds": 0.08, "short_seconds": 0.0, **config}))
     if seconds is not None:
         scheduler.begin(1)
@@ -326,7 +326,7 @@ def test_processes_of_one_host_are_one_opinion():
         assert name.startswith("h/")
         assert not scheduler.error(name, index, now)
     assert given(scheduler.assign(0.5)) == {"i/1": [4]}
-    assert scheduler.error("i/1", 4, 0.6), "nobody is left to try"
+    assert scheduler.error("i/1", 4, 0.6), "no worker is left to try"
 
 
 def test_three_hosts_that_brought_results_are_enough():

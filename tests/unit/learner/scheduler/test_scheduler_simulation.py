@@ -1,4 +1,4 @@
-"""The scheduler on a simulated farm: workers come, die, hang; messages get lost, doubled, late."""
+"""The scheduler on a simulated farm: workers join, die, hang; messages are lost, repeated, late."""
 
 import heapq
 import itertools
@@ -29,7 +29,7 @@ class SimWorker:
 
 
 class Farm:
-    """A learner with its scheduler, workers, and a network that is none of the best.
+    """A learner with its scheduler, workers, and an unreliable network.
 
     The books here are kept apart from the scheduler's and checked against what it hands out.
     """

@@ -1,4 +1,4 @@
-"""Hosts whose numbers are wrong are found out, and their jobs are repeated."""
+"""Hosts with wrong numbers are detected, and their jobs are repeated."""
 
 import numpy as np
 import pytest
@@ -117,7 +117,7 @@ def filled(returns: FloatArray) -> RoundResults:
 
 
 def checked(audit: Audit, returns: FloatArray) -> set[int]:
-    """Play a round of two hosts by turns; the jobs that were asked for again, all of them answered."""
+    """Play a round of two hosts in turn; return the repeated jobs, all of them answered."""
     audit.begin(len(returns))
     for index in range(len(returns)):
         audit.counted(f"{'ab'[index % 2]}/1", np.array([index]))
@@ -167,7 +167,7 @@ def test_only_machines_whose_numbers_are_of_one_kind_are_compared() -> None:
         for index in indices:
             assert audit.answered(worker, index, results.answer(index), results.answer(index))
     assert audit.settle() == {}
-    assert audit.passed(results, list(KINDS)), "nobody is like c, and a device is like nobody"
+    assert audit.passed(results, list(KINDS)), "no host is like c, and a device is like no host"
 
 
 def test_numbers_of_another_kind_expel_nobody() -> None:

@@ -62,7 +62,7 @@ def link() -> Iterator[tuple[Session, Session]]:
 
 @pytest.fixture
 def publisher(link: tuple[Session, Session]) -> Iterator[Publisher]:
-    """Of a run with two generations behind it, in a folder that was renamed since."""
+    """The publisher of a run that has done two generations, in a folder that was then renamed."""
     learner = SimpleNamespace(
         folder=SimpleNamespace(name="r", progress=lambda: [stats(1), stats(2)]), run="first", config=RunConfig(),
         state=SimpleNamespace(generation=2),

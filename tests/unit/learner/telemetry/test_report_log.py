@@ -1,4 +1,4 @@
-"""What a run reported: in order, page by page, in bounded memory."""
+"""A run's reports: in order, in pages, in bounded memory."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Following a run: real sessions on loopback, a learner's side that loses, repeats and comes back."""
+"""Following a run: real sessions on loopback, with a learner that loses and repeats messages and restarts."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace

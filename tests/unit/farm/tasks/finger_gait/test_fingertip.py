@@ -1,4 +1,4 @@
-"""A fingertip is pressed in the simulator at places known beforehand: where that shows in image, scene and picture."""
+"""A fingertip is pressed at known points in the simulator; image, scene and picture must show them."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The fragile bar: what is a success, what differs between rollouts, and that feeling is enough to do it."""
+"""The fragile bar: success, differences between rollouts, and a policy that succeeds by touch."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace

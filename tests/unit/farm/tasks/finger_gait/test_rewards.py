@@ -1,4 +1,4 @@
-"""Rewards and return against a slow reading of the thesis' equations 3.3 to 3.5 in plain Python."""
+"""Rewards and return compared with equations 3.3 to 3.5 of the thesis in plain Python."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_weights_are_those_of_table_3_1():
 
 
 def example():
-    """Return q, c, CP, a and the demonstration of an example small enough to reckon by hand."""
+    """Return q, c, CP, a and the demonstration of an example small enough to compute by hand."""
     goal = Felt(joints=np.ones(8), images=np.zeros((3, 18)), points=np.zeros((3, 3)))
     goal.images[0, 4], goal.images[2, 17] = 2.0, 1.0  # c_d'c_d = 5
     goal.points[1] = 0.1, 0.2, 0.3

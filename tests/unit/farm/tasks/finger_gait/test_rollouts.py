@@ -1,4 +1,4 @@
-"""The gait's rollouts against one at a time in a plain mj_step loop, bit for bit; and what they are worth."""
+"""The gait's rollouts equal single ones in a plain mj_step loop, bit for bit; and their returns."""
 
 import copy
 import functools

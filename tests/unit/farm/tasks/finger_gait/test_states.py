@@ -1,4 +1,4 @@
-"""The four state bases: sizes, the order of their parts, and rows that do not know of each other."""
+"""The four state bases: sizes, the order of their parts, and independence of rows."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Touch: where the taxels lie, how a contact spreads over them, and the contact point read back."""
+"""Touch: positions of the taxels, the spread of a contact over them, and the contact point computed back."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The plate is turned by the script of benchmarks/turning.py; and what the task `turning` makes of that."""
+"""The script of benchmarks/turning.py turns the plate; how the task `turning` rewards it."""
 
 import copy
 from dataclasses import replace
