@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     own = arguments is None  # a process of its own
     try:
         if own:
-            _signals(signal.SIG_DFL)  # among imports there is nothing to be ended in order yet
+            _signals(signal.SIG_DFL)  # during imports there is nothing to save or to stop yet
             _streams()
         status = _run(list(sys.argv[1:] if arguments is None else arguments), own=own)
         sys.stdout.flush()

@@ -41,7 +41,7 @@ class Pool:
 
     def _start(self) -> "subprocess.Popen[bytes]":
         # Its standard input is a pipe that is never written to: it closes when this process ends.
-        # A session of its own keeps the terminal's Ctrl-C away: this process ends its workers.
+        # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its workers.
         return subprocess.Popen(self._command, stdin=subprocess.PIPE, env=self._environment, start_new_session=True)
 
     @property

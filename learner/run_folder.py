@@ -294,7 +294,7 @@ class RunFolder:
             read, lost, torn = [], [], False
         kept = [stats for _, stats in read if stats.generation <= generation]
         if torn and (not read or read[-1][1].generation < generation):
-            lost.append(path.read_bytes().count(b"\n") + 1)  # else: of a later generation
+            lost.append(path.read_bytes().count(b"\n") + 1)  # otherwise it is of a later generation
         if lost:
             copy = _copy(path)
             which = ", ".join(map(str, lost[:10])) + (", ..." if len(lost) > 10 else "")

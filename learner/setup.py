@@ -130,10 +130,10 @@ def _check_size(found: Problem) -> None:
 
 
 def fitted(config: RunConfig) -> RunConfig:
-    """The configuration with the kernel's width h and the first sigma computed, if --start is fitted.
+    """The configuration with the kernel's width h and the initial sigma computed, if --start is fitted.
 
-    A Gaussian kernel of many numbers is zero nearly everywhere. With these values the first mean mu has a small output
-    at the nominal start x0 (d,), and a sample changes the exponent by about one:
+    A Gaussian kernel of many numbers is zero nearly everywhere. With these values the initial mean mu has a small
+    output at the nominal start x0 (d,), and a sample changes the exponent by about one:
 
         |mu - x0|^2 / (2 h^2) = 2,   d sigma^2 / (2 h^2) = 1:    h = |mu - x0| / 2,   sigma = h sqrt(2 / d)
 

@@ -164,7 +164,7 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], sho
         "--name", path.name, "--resume-existing", "--json", "--log-level", "WARNING", *flags,
     ]  # fmt: skip
     # Standard input is a pipe that is never written to: it closes when this process ends, however it ends.
-    # A session of its own keeps the terminal's Ctrl-C away: this process ends its learners.
+    # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its learners.
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONIOENCODING": "utf-8"},

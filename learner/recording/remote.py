@@ -19,7 +19,7 @@ from learner.run_folder import RunFolder
 from learner.telemetry.report import unpacked
 from learner.telemetry.subscriber import Subscriber
 
-_STATISTICS: Final = "/learning/return"  # an entity that has one row a generation
+_STATISTICS: Final = "/learning/return"  # an entity with one row per generation
 
 
 @dataclass

@@ -174,8 +174,8 @@ class JobTable:
         """Whether a job has failed on `most` hosts with proven workers, or as often and no worker is left to try."""
         errors = self.errors[index]
         hosts = {name.partition("/")[0] for name in errors if name in self.workers and self.workers[name].proven}
-        nobody = all(name in errors or known.benched for name, known in self.workers.items())
-        return len(hosts) >= most or (nobody and errors.total() >= most)
+        none_left = all(name in errors or known.benched for name, known in self.workers.items())
+        return len(hosts) >= most or (none_left and errors.total() >= most)
 
     def _leave(self, worker: str, index: int, now: float) -> bool:
         """Remove a holder of a job; return whether it was the last one, in which case the job is in no queue."""
