@@ -21,6 +21,29 @@ from typing import Any, Final
 
 from farm.errors import ConfigError, UnservedError
 
+COMMANDS: Final = {
+    "run": "starts a learner and local workers: learns a task and records it",
+    "learner": "starts only the learner; workers join it from any machine",
+    "worker": "starts only workers; they serve every learner they find",
+    "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
+    "new-task": "writes a task of 31 lines that runs, to start from",
+    "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
+    "evaluate": "tries the learnt mean policy on perturbed starts",
+    "replay": "simulates any policy or rollout of a run again, into a recording or a video",
+    "chain": "runs learnt policies one after another, and counts the cycles",
+    "compare": "puts several runs into one recording: curves together, scenes side by side",
+    "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
+    "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
+    "sweep": "learns settings x seeds on one set of workers; a table and a figure",
+    "record": "records a run on any machine, over the network",
+    "view": "opens the recordings of runs in the Rerun viewer",
+    "runs": "prints a table of the runs in a folder",
+    "status": "shows the runs and workers of a farm, and their state",
+    "router": "starts a permanent router that learners and workers connect to",
+    "certificates": "makes certificates for a farm of several machines",
+}
+"""The built-in commands and their purposes."""
+
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     "tasks": {
         "finger-gait": "farm.tasks.finger_gait.task:FingerGait",
@@ -55,25 +78,9 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
     "commands": {
-        "run": "learner.commands.run:main",
-        "learner": "learner.commands.learner:main",
+        **{name: f"learner.commands.{name.replace('-', '_')}:main" for name in COMMANDS},
+        **{name: f"farm.commands.{name}:main" for name in ("status", "router", "certificates")},
         "worker": "workers.command:main",
-        "tasks": "learner.commands.tasks:main",
-        "check": "learner.commands.check:main",
-        "new-task": "learner.commands.new_task:main",
-        "evaluate": "learner.commands.evaluate:main",
-        "replay": "learner.commands.replay:main",
-        "chain": "learner.commands.chain:main",
-        "compare": "learner.commands.compare:main",
-        "play": "learner.commands.play:main",
-        "export": "learner.commands.export:main",
-        "sweep": "learner.commands.sweep:main",
-        "record": "learner.commands.record:main",
-        "view": "learner.commands.view:main",
-        "runs": "learner.commands.runs:main",
-        "status": "farm.commands.status:main",
-        "router": "farm.commands.router:main",
-        "certificates": "farm.commands.certificates:main",
     },
 }
 """Kinds of plug-ins, and the built-in ones by name. Strings, because farm/ must not import learner/ or workers/."""
