@@ -11,7 +11,7 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -145,7 +145,8 @@ def find(kind: str, name: str) -> Plugin:
     """
     path, _, inside = name.rpartition(":")
     if path.endswith(".py"):
-        return _from_file(kind, Path(path), inside)
+        where = Path(path).resolve()
+        return _of_source(kind, where, _read(where, f"{_one(kind)} {where}"), inside)
     own, _, variant = name.partition(":")
     if own in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][own].partition(":")
@@ -177,17 +178,13 @@ def _from_package(kind: str, own: str, variant: str) -> Plugin:
     raise ConfigError(f"unknown {_one(kind)} {own[:80]!r}; known are {known}{files}")
 
 
-def _from_file(kind: str, path: Path, inside: str) -> Plugin:
-    where = path.resolve()
+def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
     try:
-        source = where.read_bytes()
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise kind(f"{what}: there is no such file") from None
     except OSError as error:
-        raise ConfigError(f"{_one(kind)} {where}: {_missing(error)}") from None
-    return _of_source(kind, where, source, inside)
-
-
-def _missing(error: OSError) -> str:
-    return "there is no such file" if isinstance(error, FileNotFoundError) else f"it cannot be read: {error.strerror}"
+        raise kind(f"{what}: it cannot be read: {error.strerror}") from None
 
 
 def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
@@ -265,10 +262,7 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
     name, _, inside = wire.rpartition(":")
     for path in files:
         if path.name == name:
-            try:
-                source = path.read_bytes()
-            except OSError as error:
-                raise UnservedError(f"{path}: {_missing(error)}") from None
+            source = _read(path, str(path), UnservedError)
             if hashlib.sha256(source).hexdigest() != digest:
                 raise UnservedError(f"{path} differs from the learner's {name}: copy the learner's file there")
             return _of_source(kind, path.resolve(), source, inside)
@@ -305,22 +299,15 @@ def _sources(module: str) -> dict[str, bytes]:
 
 @cache  # task, policy and simulation share most of their modules
 def _imports(source: bytes, parent: str | None, package: str) -> tuple[str, ...]:
-    return tuple(_imported(source, parent, package))
-
-
-def _imported(source: bytes, parent: str | None, package: str) -> Iterator[str]:
     """Modules of the top-level package that a source imports; relative to its parent."""
+    names: list[str] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), parent)
-            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        for name in names:
-            if name.partition(".")[0] == package and _is_module(name):
-                yield name
+            names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return tuple(name for name in names if name.partition(".")[0] == package and _is_module(name))
 
 
 def _is_module(name: str) -> bool:

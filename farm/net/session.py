@@ -43,11 +43,7 @@ _COMMON: Final = {
     "transport/link/rx/max_message_size": 64 * 1024 * 1024,
     "transport/shared_memory/enabled": False,
 }
-_ROUTER: Final = {
-    "mode": "router",
-    "transport/unicast/max_sessions": 4096,
-    "transport/unicast/accept_pending": 1024,
-}
+_ROUTER: Final = {"mode": "router", "transport/unicast/max_sessions": 4096, "transport/unicast/accept_pending": 1024}
 _RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
 _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
@@ -131,8 +127,7 @@ class Session:
 
     def outlet(self, key: str) -> "Outlet":
         """A publisher for a key that is used repeatedly and may have no subscribers."""
-        publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        return Outlet(publisher)
+        return Outlet(self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP))
 
     def answer(self, key: str, reply: Callable[[], bytes]) -> None:
         """Answer every query on the key with the result of `reply` (called on another thread)."""
@@ -231,10 +226,11 @@ def router_settings(
             f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
             "--trust-network if everyone on that network may read everything and pose as a worker"
         )
-    secured = {} if bundle is None else {**bundle.listening(), "access_control": access_control(farm, bundle.roster())}
+    secured = bundle.settings("listen") | {"access_control": access_control(farm, bundle.roster())} if bundle else {}
     settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
     if routers:
-        settings |= {"connect/endpoints": list(routers), **_RETRY, **({} if bundle is None else bundle.connecting())}
+        joined = bundle.settings("connect") if bundle else {}
+        settings |= {"connect/endpoints": list(routers), **_RETRY, **joined}
     return settings
 
 
@@ -292,7 +288,7 @@ def connect(
         check_endpoint(endpoint, encrypted=bundle is not None)
     settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
     if bundle is not None:
-        settings |= bundle.connecting()
+        settings |= bundle.settings("connect")
     with _closing(_try(settings, ", ".join(endpoints), timeout, stopped)) as opened:
         yield opened
 
@@ -301,11 +297,8 @@ def _try(
     settings: Mapping[str, object], where: str, timeout: float | None, stopped: Callable[[], bool]
 ) -> zenoh.Session:
     # A refused handshake looks like no answer: Zenoh gives no reason.
-    hint = (
-        "; the learner may refuse our certificate: same authority, still valid, on its roster?"
-        if "tls/" in where
-        else ""
-    )
+    refused = "; the learner may refuse our certificate: same authority, still valid, on its roster?"
+    hint = refused if "tls/" in where else ""
     begun = told = time.monotonic()
     while True:
         try:
