@@ -5,8 +5,6 @@ single rollouts. Sums run over the rows in index order and never through BLAS, s
 depend on the number of threads.
 """
 
-from __future__ import annotations
-
 from typing import Literal, TypeAlias
 
 import numpy as np

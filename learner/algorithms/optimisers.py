@@ -4,8 +4,6 @@ Shapes: every array is (P,). Pure functions: their memory is an argument and a r
 plain sums, because the order of sums in BLAS may depend on the number of threads.
 """
 
-from __future__ import annotations
-
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -27,12 +25,7 @@ def _norm(vector: FloatArray) -> float:
 
 
 def clipup(
-    gradient: FloatArray,
-    velocity: FloatArray,
-    *,
-    learning_rate: float,
-    momentum: float,
-    max_speed: float,
+    gradient: FloatArray, velocity: FloatArray, *, learning_rate: float, momentum: float, max_speed: float
 ) -> FloatArray:
     """Return ClipUp's next velocity, which is also the step of mu (Toklu 2020, algorithm 1).
 

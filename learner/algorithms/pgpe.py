@@ -5,8 +5,6 @@ Rollouts of theta = mu + eps and mu - eps are compared, and mu and sigma follow 
 ranks with ClipUp (Toklu 2020) or Adam are the modern variant. Shapes: P parameters, N pairs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -211,11 +209,7 @@ class PGPE(Settings):
             return {"mu": state.mu + rate * gradient_mu, "sigma": sigma}
         if self.optimiser == "clipup":
             velocity = clipup(
-                gradient_mu,
-                state.velocity,
-                learning_rate=rate,
-                momentum=self.momentum,
-                max_speed=self.max_speed,
+                gradient_mu, state.velocity, learning_rate=rate, momentum=self.momentum, max_speed=self.max_speed
             )
             return {"mu": state.mu + velocity, "sigma": sigma, "velocity": velocity}
         step, first, second = adam(
