@@ -92,7 +92,6 @@ class Session:
     """An open session; use `listen` or `connect`."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        """Wrap an open zenoh session."""
         self._session = session
         self.events = Events()
         """Everything received by subscriptions."""
@@ -191,7 +190,6 @@ class Outlet:
     """A publisher for one key; a receiver that is stuck loses messages."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
-        """Made by `Session.outlet`."""
         self._publisher = publisher
 
     @property

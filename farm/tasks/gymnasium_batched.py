@@ -28,7 +28,6 @@ class Batched:
     """Whether initial velocities are drawn from a normal distribution, not a uniform one."""
 
     def __init__(self, env: Any) -> None:  # noqa: ANN401  an unwrapped environment
-        """Take its settings."""
         self.env, self.model = env, env.model
         self.qpos, self.qvel = env.init_qpos.copy(), env.init_qvel.copy()
         self.left_out = self.hidden * bool(getattr(env, "_exclude_current_positions_from_observation", False))

@@ -34,7 +34,6 @@ class ARS(Mirrored):
     """Standard deviation of the exploration, nu; it stays constant."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if self.top is not None and self.top > self.pairs:
             raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")

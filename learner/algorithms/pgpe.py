@@ -88,7 +88,6 @@ class PGPE(Settings):
     """Largest relative change of a sigma per generation, with the capped rule."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if self.initial_sigma < self.sigma_floor:
             raise ConfigError(
