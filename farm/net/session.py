@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, Final, TypeVar
 
 import zenoh
@@ -232,10 +232,9 @@ def router_settings(
     return settings
 
 
-@contextmanager
 def listen(
     endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = ()
-) -> Iterator[Session]:
+) -> AbstractContextManager[Session]:
     """A session that workers connect to; for the arguments see `router_settings`.
 
     Raises:
@@ -243,13 +242,11 @@ def listen(
     """
     settings = router_settings(endpoint, farm, bundle, trusted=trusted, routers=routers)
     try:
-        session = _open(settings)
+        return _closing(_open(settings))
     except zenoh.ZError as error:
         raise ConfigError(
             f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? choose another with --listen"
         ) from None
-    with _closing(session) as opened:
-        yield opened
 
 
 def _raise_descriptors() -> None:
@@ -267,10 +264,9 @@ def _raise_descriptors() -> None:
         raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
 
 
-@contextmanager
 def connect(
     endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None
-) -> Iterator[Session]:
+) -> AbstractContextManager[Session]:
     """A session connected to a learner or a router; keeps trying until one answers.
 
     Args:
@@ -287,8 +283,7 @@ def connect(
     settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
     if bundle is not None:
         settings |= bundle.settings("connect")
-    with _closing(_try(settings, ", ".join(endpoints), timeout, stopped)) as opened:
-        yield opened
+    return _closing(_try(settings, ", ".join(endpoints), timeout, stopped))
 
 
 def _try(

@@ -120,7 +120,7 @@ def _rollouts(
     command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
 ) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show exploring rollouts of a generation: one by itself, several side by side."""
-    from learner.recording.comparison import Shown, record_side_by_side
+    from learner.recording.comparison import Shown, record_comparison
     from learner.recording.drawing import Drawing
     from learner.rewind import rewind, under
 
@@ -140,7 +140,7 @@ def _rollouts(
         table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
         side = [Shown(name, drawing, (), each.trajectory) for name, each in zip(names, shown, strict=True)]
         with writing(path):
-            record_side_by_side(path, folder.name, side, table)
+            record_comparison(path, side, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
     return policy, shown
 
