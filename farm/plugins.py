@@ -69,10 +69,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "cma-es": "learner.algorithms.cma:CMAES",
         "sep-cma": "learner.algorithms.cma:SepCMA",
     },
-    "backends": {
-        "cpu": "workers.backends.cpu:CpuBackend",
-        "warp": "workers.backends.warp:WarpBackend",
-    },
+    "backends": {"cpu": "workers.backends.cpu:CpuBackend", "warp": "workers.backends.warp:WarpBackend"},
     "loggers": {
         "tensorboard": "learner.loggers.tensorboard:TensorBoard",
         "wandb": "learner.loggers.wandb:WeightsAndBiases",

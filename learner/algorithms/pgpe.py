@@ -16,17 +16,20 @@ from farm.errors import ConfigError
 from farm.settings import Settings, setting
 from learner.algorithms.gradients import (
     Normaliser,
+    SigmaRule,
+    adam,
     baseline_contrast,
     centred_ranks,
+    clipup,
     level,
     middle_returns,
     optimal_baseline,
     pair_contrast,
     plain_contrast,
     sigma_characteristic,
+    step_sigma,
     weighted_sum,
 )
-from learner.algorithms.optimisers import SigmaRule, adam, clipup, step_sigma
 from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows
 
 # The authors' code: b = 0.9 b + 0.1 mean return.

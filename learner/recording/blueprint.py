@@ -211,11 +211,7 @@ def _farm() -> rrb.Container:
     )
 
 
-def _plot(
-    name: str,
-    *entities: str,
-    legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop,
-) -> rrb.View:
+def _plot(name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop) -> rrb.View:
     """Curves over all their time, also while the cursor moves and after a change of the timeline."""
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))
