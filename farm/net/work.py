@@ -269,11 +269,8 @@ class Results:
         cls, given: Simulated, jobs: Jobs, *, run: str, incarnation: str, round: int, worker: str
     ) -> "Results":
         """A message with the results of jobs, whose indices are ascending."""
-        return cls(
-            run=run, incarnation=incarnation, round=round, worker=worker, jobs=np.ascontiguousarray(jobs.indices),
-            returns=given.returns, flags=given.flags, steps=given.steps, traces=given.traces,
-            trajectories=given.trajectories, moments=given.moments,
-        )  # fmt: skip
+        own = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
+        return cls(**own, jobs=np.ascontiguousarray(jobs.indices), **vars(given))
 
 
 def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
