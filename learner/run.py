@@ -48,7 +48,6 @@ _REMEMBERED: Final = 5.0  # [s] for which a router may believe that a killed lea
 _LOOK: Final = 0.3  # [s] between two checks for other claims on a run's name
 _TEND: Final = 0.5  # [s] between two checks of the worker processes
 
-
 MOST_WORKERS: Final = 1024
 """Local worker processes of a run."""
 

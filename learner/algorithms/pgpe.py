@@ -36,19 +36,15 @@ from learner.algorithms.state import Diverged, SearchState, StateValue, finite_r
 _BASELINE_MEMORY = 0.9
 
 
-def _empty() -> FloatArray:
-    return np.empty(0)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PGPEState(SearchState):
     """The search distribution, and the memory of the optimiser of mu."""
 
-    velocity: FloatArray = field(default_factory=_empty)
+    velocity: FloatArray = field(default_factory=lambda: np.empty(0))
     """ClipUp's velocity, (P,), or empty if it is not used."""
-    first_moment: FloatArray = field(default_factory=_empty)
+    first_moment: FloatArray = field(default_factory=lambda: np.empty(0))
     """Adam's running mean of the gradient, (P,), or empty."""
-    second_moment: FloatArray = field(default_factory=_empty)
+    second_moment: FloatArray = field(default_factory=lambda: np.empty(0))
     """Adam's running mean of the squared gradient, (P,), or empty."""
 
 

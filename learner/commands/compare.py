@@ -108,7 +108,6 @@ def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
 
 
 def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
-
     def said(key: str, form: str) -> tuple[str, ...]:
         values = [run.summary.get(key) for run in runs]
         return tuple("-" if value is None else format(value, form) for value in values)
