@@ -18,29 +18,6 @@ if TYPE_CHECKING:
 _PIPE: Final = 141
 """Exit status if the reader of standard output went away, as in a shell: 128 and SIGPIPE."""
 
-COMMANDS: Final = {
-    "run": "starts a learner and local workers: learns a task and records it",
-    "learner": "starts only the learner; workers join it from any machine",
-    "worker": "starts only workers; they serve every learner they find",
-    "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
-    "new-task": "writes a task of 31 lines that runs, to start from",
-    "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
-    "evaluate": "tries the learnt mean policy on perturbed starts",
-    "replay": "simulates any policy or rollout of a run again, into a recording or a video",
-    "chain": "runs learnt policies one after another, and counts the cycles",
-    "compare": "puts several runs into one recording: curves together, scenes side by side",
-    "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
-    "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
-    "sweep": "learns settings x seeds on one set of workers; a table and a figure",
-    "record": "records a run on any machine, over the network",
-    "view": "opens the recordings of runs in the Rerun viewer",
-    "runs": "prints a table of the runs in a folder",
-    "status": "shows the runs and workers of a farm, and their state",
-    "router": "starts a permanent router that learners and workers connect to",
-    "certificates": "makes certificates for a farm of several machines",
-}
-"""The built-in commands and their purposes."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; exit status 0, 1 for a failure, 2 for a mistake in its use."""
@@ -145,8 +122,9 @@ def _system(error: OSError) -> str:
 def _overview() -> str:
     from farm import plugins
 
-    others = {name: origin for name, origin in plugins.names("commands").items() if name not in COMMANDS}
-    rows = "".join(f"  farm {name:<14}{text}\n" for name, text in (COMMANDS | others).items())
+    rows = "".join(
+        f"  farm {name:<14}{text}\n" for name, text in (plugins.names("commands") | plugins.COMMANDS).items()
+    )
     return (
         "rolloutfarm: policy search on any MuJoCo task, with as many workers on as many machines as you like.\n\n"
         f"{rows}\n  farm COMMAND --help lists the settings of a command; farm --version prints the version.\n"

@@ -11,7 +11,7 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -20,6 +20,29 @@ from pathlib import Path
 from typing import Any, Final
 
 from farm.errors import ConfigError, UnservedError
+
+COMMANDS: Final = {
+    "run": "starts a learner and local workers: learns a task and records it",
+    "learner": "starts only the learner; workers join it from any machine",
+    "worker": "starts only workers; they serve every learner they find",
+    "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
+    "new-task": "writes a task of 31 lines that runs, to start from",
+    "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
+    "evaluate": "tries the learnt mean policy on perturbed starts",
+    "replay": "simulates any policy or rollout of a run again, into a recording or a video",
+    "chain": "runs learnt policies one after another, and counts the cycles",
+    "compare": "puts several runs into one recording: curves together, scenes side by side",
+    "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
+    "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
+    "sweep": "learns settings x seeds on one set of workers; a table and a figure",
+    "record": "records a run on any machine, over the network",
+    "view": "opens the recordings of runs in the Rerun viewer",
+    "runs": "prints a table of the runs in a folder",
+    "status": "shows the runs and workers of a farm, and their state",
+    "router": "starts a permanent router that learners and workers connect to",
+    "certificates": "makes certificates for a farm of several machines",
+}
+"""The built-in commands and their purposes."""
 
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     "tasks": {
@@ -46,34 +69,15 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "cma-es": "learner.algorithms.cma:CMAES",
         "sep-cma": "learner.algorithms.cma:SepCMA",
     },
-    "backends": {
-        "cpu": "workers.backends.cpu:CpuBackend",
-        "warp": "workers.backends.warp:WarpBackend",
-    },
+    "backends": {"cpu": "workers.backends.cpu:CpuBackend", "warp": "workers.backends.warp:WarpBackend"},
     "loggers": {
         "tensorboard": "learner.loggers.tensorboard:TensorBoard",
         "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
     "commands": {
-        "run": "learner.commands.run:main",
-        "learner": "learner.commands.learner:main",
+        **{name: f"learner.commands.{name.replace('-', '_')}:main" for name in COMMANDS},
+        **{name: f"farm.commands.{name}:main" for name in ("status", "router", "certificates")},
         "worker": "workers.command:main",
-        "tasks": "learner.commands.tasks:main",
-        "check": "learner.commands.check:main",
-        "new-task": "learner.commands.new_task:main",
-        "evaluate": "learner.commands.evaluate:main",
-        "replay": "learner.commands.replay:main",
-        "chain": "learner.commands.chain:main",
-        "compare": "learner.commands.compare:main",
-        "play": "learner.commands.play:main",
-        "export": "learner.commands.export:main",
-        "sweep": "learner.commands.sweep:main",
-        "record": "learner.commands.record:main",
-        "view": "learner.commands.view:main",
-        "runs": "learner.commands.runs:main",
-        "status": "farm.commands.status:main",
-        "router": "farm.commands.router:main",
-        "certificates": "farm.commands.certificates:main",
     },
 }
 """Kinds of plug-ins, and the built-in ones by name. Strings, because farm/ must not import learner/ or workers/."""
@@ -138,7 +142,8 @@ def find(kind: str, name: str) -> Plugin:
     """
     path, _, inside = name.rpartition(":")
     if path.endswith(".py"):
-        return _from_file(kind, Path(path), inside)
+        where = Path(path).resolve()
+        return _of_source(kind, where, _read(where, f"{_one(kind)} {where}"), inside)
     own, _, variant = name.partition(":")
     if own in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][own].partition(":")
@@ -170,17 +175,13 @@ def _from_package(kind: str, own: str, variant: str) -> Plugin:
     raise ConfigError(f"unknown {_one(kind)} {own[:80]!r}; known are {known}{files}")
 
 
-def _from_file(kind: str, path: Path, inside: str) -> Plugin:
-    where = path.resolve()
+def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
     try:
-        source = where.read_bytes()
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise kind(f"{what}: there is no such file") from None
     except OSError as error:
-        raise ConfigError(f"{_one(kind)} {where}: {_missing(error)}") from None
-    return _of_source(kind, where, source, inside)
-
-
-def _missing(error: OSError) -> str:
-    return "there is no such file" if isinstance(error, FileNotFoundError) else f"it cannot be read: {error.strerror}"
+        raise kind(f"{what}: it cannot be read: {error.strerror}") from None
 
 
 def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
@@ -258,10 +259,7 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
     name, _, inside = wire.rpartition(":")
     for path in files:
         if path.name == name:
-            try:
-                source = path.read_bytes()
-            except OSError as error:
-                raise UnservedError(f"{path}: {_missing(error)}") from None
+            source = _read(path, str(path), UnservedError)
             if hashlib.sha256(source).hexdigest() != digest:
                 raise UnservedError(f"{path} differs from the learner's {name}: copy the learner's file there")
             return _of_source(kind, path.resolve(), source, inside)
@@ -298,22 +296,15 @@ def _sources(module: str) -> dict[str, bytes]:
 
 @cache  # task, policy and simulation share most of their modules
 def _imports(source: bytes, parent: str | None, package: str) -> tuple[str, ...]:
-    return tuple(_imported(source, parent, package))
-
-
-def _imported(source: bytes, parent: str | None, package: str) -> Iterator[str]:
     """Modules of the top-level package that a source imports; relative to its parent."""
+    names: list[str] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), parent)
-            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        for name in names:
-            if name.partition(".")[0] == package and _is_module(name):
-                yield name
+            names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return tuple(name for name in names if name.partition(".")[0] == package and _is_module(name))
 
 
 def _is_module(name: str) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.arrays import FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.policies.base import Policy
 from farm.sim.engines import BatchEngine
@@ -77,7 +77,8 @@ def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *
     """
     check(policies)
     first = policies[0]
-    upper: Any = type("Upper", (type(first.problem.task),), {"act": _as_given, "ended": _lost})
+    own = {"act": lambda _, __, action: action, "ended": lambda self, sim: self.lost(sim)}
+    upper: Any = type("Upper", (type(first.problem.task),), own)
     task: Any = _longer(upper, first, steps)
     sim = Sim(task.engine(BatchEngine))
     again(lambda: task.setup(sim))
@@ -110,14 +111,6 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
                 f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different models: learn both on "
                 "the same one"
             )
-
-
-def _as_given(_: Task, __: Sim, action: FloatArray) -> FloatArray:
-    return action
-
-
-def _lost(self: Task, sim: Sim) -> BoolArray:
-    return self.lost(sim)
 
 
 def _longer(kind: type[Task], learnt: LoadedPolicy, steps: int) -> Task:

@@ -81,29 +81,33 @@ def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
     body = codec.encode(checkpoint, _SCHEMA)
     content = _MAGIC + hashlib.sha256(body).digest() + body
     if durable:
-        _replace(_safe(path), content, sync=True)
-    _replace(path, content)
+        replace(_safe(path), content, sync=True)
+    replace(path, content)
 
 
 def settle(path: Path) -> None:
     """Flush the file itself to the disk, and delete the copy."""
+    flush(path)
+    _safe(path).unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Wait until a file is on the disk."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
-    _safe(path).unlink(missing_ok=True)
 
 
 def _safe(path: Path) -> Path:
     return path.with_name(path.name + ".safe")
 
 
-def _replace(path: Path, content: bytes, *, sync: bool = False) -> None:
+def replace(path: Path, content: bytes, *, sync: bool = False) -> None:
+    """Write a whole file, or (an OSError) leave the old one."""
     aside = path.with_name(path.name + ".new")
     try:
-        with aside.open("wb") as file:
-            file.write(content)
-            if sync:
-                file.flush()
-                os.fsync(file.fileno())
+        aside.write_bytes(content)
+        if sync:
+            flush(aside)
         aside.replace(path)
     except OSError:
         aside.unlink(missing_ok=True)

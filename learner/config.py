@@ -18,7 +18,7 @@ from learner.algorithms import Algorithm
 VERSION: Final = 2
 """Version of config.json."""
 
-_PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
+PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
 """Parts of a configuration that are chosen by name and have their own settings, with the kind of plug-in."""
 
 
@@ -67,7 +67,7 @@ class RunConfig(Settings):
 
     def __post_init__(self) -> None:
         """Fill in omitted settings, and check every value."""
-        for part, kind in _PARTS.items():
+        for part, kind in PARTS.items():
             if name := getattr(self, part):
                 object.__setattr__(self, part, plugins.find(kind, name).name)  # of a file: with its absolute path
         for name, value in _filled(self).items():
@@ -75,7 +75,7 @@ class RunConfig(Settings):
         super().__post_init__()
         self._check_interactions()
         owners: dict[str, str] = {"name": "plug-in"}
-        for part in ("run", *_PARTS):
+        for part in ("run", *PARTS):
             for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
                 if owners.setdefault(name, part) != part:
                     whose = f"{part} {getattr(self, part)!r}"
@@ -123,7 +123,7 @@ def _filled(config: RunConfig) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if config.generations is None:
         out["generations"] = given.get("generations", _GENERATIONS)
-    for part, kind in _PARTS.items():
+    for part, kind in PARTS.items():
         name = getattr(config, part) or given.get(part) or _GENERAL[part]
         own = getattr(config, f"{part}_config")
         out |= {part: name, f"{part}_config": own or _part(kind, name, given)}
@@ -193,7 +193,7 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
         raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
     begin = RunConfig(task=task)
     given: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
-    for part, kind in _PARTS.items():  # another policy keeps settings of the preset, another algorithm none
+    for part, kind in PARTS.items():  # another policy keeps settings of the preset, another algorithm none
         own = given.get(part, getattr(begin, part))
         chosen = changed.get(part, own)
         others = set(_fields(settings_class(kind, chosen))) if part == "policy" or chosen == own else set()
@@ -208,7 +208,7 @@ def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = Fal
     """
     parts: dict[str, Any] = {}
     known = {"task", "policy", "algorithm"}
-    for part, kind in _PARTS.items():
+    for part, kind in PARTS.items():
         name = given.get(part, getattr(config, part))
         old = getattr(config, f"{part}_config")
         begin = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
@@ -239,8 +239,8 @@ def properties(config: RunConfig) -> dict[str, str | int]:
 def to_dict(config: RunConfig) -> dict[str, Any]:
     """Its form in config.json and in a checkpoint."""
     parts = {part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
-             for part in _PARTS}  # fmt: skip
-    own = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in _PARTS}
+             for part in PARTS}  # fmt: skip
+    own = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in PARTS}
     return {"version": VERSION, **parts, **own}
 
 
@@ -253,10 +253,10 @@ def from_dict(values: object, where: str) -> RunConfig:
     if not isinstance(values, dict) or values.get("version") != VERSION:
         found = values.get("version") if isinstance(values, dict) else None
         raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(found)[:40]!r})")
-    made: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *_PARTS)}
-    if unknown := [name for name in (f"{part}_config" for part in _PARTS) if name in made]:
+    made: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *PARTS)}
+    if unknown := [name for name in (f"{part}_config" for part in PARTS) if name in made]:
         raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}")
-    for part, kind in _PARTS.items():
+    for part, kind in PARTS.items():
         table = values.get(part)
         if not isinstance(table, dict) or type(table.get("name")) is not str:
             raise ConfigError(f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name")

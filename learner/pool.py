@@ -161,11 +161,9 @@ class Farm:
                 self._taken.release()
 
     def __enter__(self) -> "Farm":
-        """Itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     @contextmanager

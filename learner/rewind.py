@@ -85,21 +85,13 @@ class Rewound:
 def rewind(path: str | Path, generation: int | None = None) -> Rewound:
     """The exploring rollouts of a generation (None: the last) of the run in a folder.
 
-    Raises:
-      ConfigError: the run has not done this generation.
-    """
-    return rewound(RunFolder.open(Path(path)), generation)
-
-
-def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
-    """Like `rewind`, for an open folder.
-
     If `ask` depends on mu and sigma only, the state before the generation is read from `parameters`. For other
     algorithms, and if that generation is not stored, the run is learnt again up to there.
 
     Raises:
       ConfigError: the run has not done this generation.
     """
+    folder = RunFolder.open(Path(path))
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     chosen = last if generation is None else generation
@@ -167,11 +159,8 @@ def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[Search
     state, moments = algorithm.restore(first.state), first.moments
     pairs = 0
     if until:
-        log.warning(
-            "the state of %s before generation %d is not stored: learning the run again up to there",
-            config.algorithm,
-            until + 1,
-        )
+        said = "the state of %s before generation %d is not stored: learning the run again up to there"
+        log.warning(said, config.algorithm, until + 1)
     problem = restored(folder, at)
     runner = problem.runner()
     while state.generation < until:

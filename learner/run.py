@@ -48,7 +48,6 @@ _REMEMBERED: Final = 5.0  # [s] for which a router may believe that a killed lea
 _LOOK: Final = 0.3  # [s] between two checks for other claims on a run's name
 _TEND: Final = 0.5  # [s] between two checks of the worker processes
 
-
 MOST_WORKERS: Final = 1024
 """Local worker processes of a run."""
 
@@ -236,27 +235,16 @@ def dispatch(
     """Publish a problem on the network under a name, and start its local workers; the stack closes all."""
     tend = _Tending(stopped)
     for digest, source in problem.sources.items() if place.tls else ():
-        link.answer(keys.code(place.farm, name, digest), partial(_same, source))
-    farm = Dispatcher(
-        link,
-        place.farm,
-        problem.specification(name),
-        generations,
-        None if place.workers else how_to_join(place, problem),
-        tend,
-        admission,
-        (problem.spec.trace, problem.spec.shapes(len(problem.scene.bodies))),
-        place.scheduler,
-    )
+        link.answer(keys.code(place.farm, name, digest), partial(bytes, source))
+    shapes = problem.spec.trace, problem.spec.shapes(len(problem.scene.bodies))
+    join = None if place.workers else how_to_join(place, problem)
+    spec = problem.specification(name)
+    farm = Dispatcher(link, place.farm, spec, generations, join, tend, admission, shapes, place.scheduler)
     if place.workers:
         flags = [*_worker_flags(place, problem), "--backend", place.backend]
         flags += ["--log-level", "WARNING"]  # the learner reports their state
         tend.pool = stack.enter_context(Pool(place.workers, flags, dict(os.environ)))
     return farm, tend.pool
-
-
-def _same(source: bytes) -> bytes:
-    return source
 
 
 class _Tending:

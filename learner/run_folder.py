@@ -244,8 +244,8 @@ class RunFolder:
         """Replace the checkpoint; durable: also safe against a power failure."""
         if durable:  # first the files that it relies on
             for name in ("config.json", "progress.jsonl", "parameters"):
-                with suppress(FileNotFoundError), (self.path / name).open("rb") as file:
-                    os.fsync(file.fileno())
+                with suppress(FileNotFoundError):
+                    checkpoints.flush(self.path / name)
         checkpoints.save(self.checkpoint, checkpoint, durable=durable)
 
     def settle(self) -> None:
@@ -399,10 +399,4 @@ def _read_head(path: Path) -> tuple[dict[str, Any], int]:
 
 def replace_text(path: Path, text: str) -> None:
     """Write a whole file, or (an OSError) leave the old one."""
-    aside = path.with_name(path.name + ".new")
-    try:
-        aside.write_text(text, "utf-8")
-        aside.replace(path)
-    except OSError:
-        aside.unlink(missing_ok=True)
-        raise
+    checkpoints.replace(path, text.encode())

@@ -216,12 +216,8 @@ def _other(config: RunConfig) -> Checkpoint:
     """The run to start from, if its parameters have the same meaning."""
     folder = RunFolder.open(Path(str(config.init_from)))
     theirs = folder.read_config()
-    same: tuple[tuple[Any, Any], ...] = (
-        (theirs.task, config.task),
-        (theirs.policy, config.policy),
-        (theirs.policy_config, config.policy_config),
-    )
-    for there, here in same:
+    for name in ("task", "policy", "policy_config"):
+        there, here = getattr(theirs, name), getattr(config, name)
         if there != here:
             raise ConfigError(
                 f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"

@@ -63,7 +63,7 @@ PURE = (
     ),
     *("farm/net/messages.py", "farm/net/stats.py", "farm/sim/channels.py", "farm/sim/trajectory.py", "farm/policies/"),
     *(f"farm/tasks/finger_gait/{name}.py" for name in ("hand", "observations", "rewards", "touch")),
-    *(f"learner/algorithms/{name}.py" for name in ("ars", "gradients", "optimisers", "pgpe", "snes", "state")),
+    *(f"learner/algorithms/{name}.py" for name in ("ars", "gradients", "mirrored", "pgpe", "snes", "state")),
     *("learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
     *("learner/scheduler/chunking.py", "learner/scheduler/membership.py", "learner/scheduler/round.py"),
 )

@@ -73,7 +73,6 @@ class Events:
         return events
 
     def __len__(self) -> int:
-        """Number of queued events."""
         return len(self._events)
 
 

@@ -105,19 +105,11 @@ def worker_in(key: str, prefix: str) -> str:
     Raises:
       MessageError: something else follows it; a message published on a pattern has no sender.
     """
-    return _tail(key, prefix, 2)
+    return run_in(key, prefix, 2)
 
 
-def run_in(key: str, prefix: str) -> str:
-    """The run that follows the prefix in a key.
-
-    Raises:
-      MessageError: something else follows it.
-    """
-    return _tail(key, prefix, 1)
-
-
-def _tail(key: str, prefix: str, parts: int) -> str:
+def run_in(key: str, prefix: str, parts: int = 1) -> str:
+    """The run, or another name of so many parts, that follows the prefix in a key; else a MessageError."""
     names = key.removeprefix(prefix).split("/", parts)  # a key may have 64 kB
     if not key.startswith(prefix) or len(names) != parts or not all(map(_NAME.fullmatch, names)):
         raise MessageError("a key without a name", "foreign")

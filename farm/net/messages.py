@@ -42,7 +42,6 @@ class WorkRequest:
     """Number of ignored messages by kind."""
 
     def __post_init__(self) -> None:
-        """Check the numbers, and that the texts are short."""
         for said in (self.worker, self.version, self.canary, self.host):
             if len(said) > _SHORT or not said.isprintable():
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
@@ -78,7 +77,6 @@ class Spec:
     """Constant arrays of the policy by name."""
 
     def __post_init__(self) -> None:
-        """Check texts and constants."""
         for table in (self.code, self.files):
             if any(type(name) is not str or type(text) is not str for name, text in table.items()):
                 raise ValueError("a text that is not a string")

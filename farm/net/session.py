@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, Final, TypeVar
 
 import zenoh
@@ -43,11 +43,7 @@ _COMMON: Final = {
     "transport/link/rx/max_message_size": 64 * 1024 * 1024,
     "transport/shared_memory/enabled": False,
 }
-_ROUTER: Final = {
-    "mode": "router",
-    "transport/unicast/max_sessions": 4096,
-    "transport/unicast/accept_pending": 1024,
-}
+_ROUTER: Final = {"mode": "router", "transport/unicast/max_sessions": 4096, "transport/unicast/accept_pending": 1024}
 _RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
 _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
@@ -96,7 +92,6 @@ class Session:
     """An open session; use `listen` or `connect`."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        """Wrap an open zenoh session."""
         self._session = session
         self.events = Events()
         """Everything received by subscriptions."""
@@ -131,8 +126,7 @@ class Session:
 
     def outlet(self, key: str) -> "Outlet":
         """A publisher for a key that is used repeatedly and may have no subscribers."""
-        publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        return Outlet(publisher)
+        return Outlet(self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP))
 
     def answer(self, key: str, reply: Callable[[], bytes]) -> None:
         """Answer every query on the key with the result of `reply` (called on another thread)."""
@@ -196,7 +190,6 @@ class Outlet:
     """A publisher for one key; a receiver that is stuck loses messages."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
-        """Made by `Session.outlet`."""
         self._publisher = publisher
 
     @property
@@ -231,17 +224,17 @@ def router_settings(
             f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
             "--trust-network if everyone on that network may read everything and pose as a worker"
         )
-    secured = {} if bundle is None else {**bundle.listening(), "access_control": access_control(farm, bundle.roster())}
+    secured = bundle.settings("listen") | {"access_control": access_control(farm, bundle.roster())} if bundle else {}
     settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
     if routers:
-        settings |= {"connect/endpoints": list(routers), **_RETRY, **({} if bundle is None else bundle.connecting())}
+        joined = bundle.settings("connect") if bundle else {}
+        settings |= {"connect/endpoints": list(routers), **_RETRY, **joined}
     return settings
 
 
-@contextmanager
 def listen(
     endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = ()
-) -> Iterator[Session]:
+) -> AbstractContextManager[Session]:
     """A session that workers connect to; for the arguments see `router_settings`.
 
     Raises:
@@ -249,13 +242,11 @@ def listen(
     """
     settings = router_settings(endpoint, farm, bundle, trusted=trusted, routers=routers)
     try:
-        session = _open(settings)
+        return _closing(_open(settings))
     except zenoh.ZError as error:
         raise ConfigError(
             f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? choose another with --listen"
         ) from None
-    with _closing(session) as opened:
-        yield opened
 
 
 def _raise_descriptors() -> None:
@@ -273,10 +264,9 @@ def _raise_descriptors() -> None:
         raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
 
 
-@contextmanager
 def connect(
     endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None
-) -> Iterator[Session]:
+) -> AbstractContextManager[Session]:
     """A session connected to a learner or a router; keeps trying until one answers.
 
     Args:
@@ -292,20 +282,16 @@ def connect(
         check_endpoint(endpoint, encrypted=bundle is not None)
     settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
     if bundle is not None:
-        settings |= bundle.connecting()
-    with _closing(_try(settings, ", ".join(endpoints), timeout, stopped)) as opened:
-        yield opened
+        settings |= bundle.settings("connect")
+    return _closing(_try(settings, ", ".join(endpoints), timeout, stopped))
 
 
 def _try(
     settings: Mapping[str, object], where: str, timeout: float | None, stopped: Callable[[], bool]
 ) -> zenoh.Session:
     # A refused handshake looks like no answer: Zenoh gives no reason.
-    hint = (
-        "; the learner may refuse our certificate: same authority, still valid, on its roster?"
-        if "tls/" in where
-        else ""
-    )
+    refused = "; the learner may refuse our certificate: same authority, still valid, on its roster?"
+    hint = refused if "tls/" in where else ""
     begun = told = time.monotonic()
     while True:
         try:

@@ -39,7 +39,6 @@ class WorkerStatus:
     """Number of messages that it ignored, by kind."""
 
     def __post_init__(self) -> None:
-        """Check the counts."""
         check_counts(self.ignored)
 
 
@@ -62,7 +61,6 @@ class RunStatus:
     workers: tuple[WorkerStatus, ...]
 
     def __post_init__(self) -> None:
-        """Check the counts."""
         check_counts(self.ignored)
 
 
@@ -85,7 +83,6 @@ class Trace:
     """(R, T, N)"""
 
     def __post_init__(self) -> None:
-        """Check name and shape."""
         if self.name not in ("best", "worst", "all"):
             raise ValueError(f"traces {self.name[:40]!r} of shape {self.values.shape}")
         if self.name != "all" and len(self.values) != 1:
@@ -114,7 +111,6 @@ class RunReport:
     """The generation of the best rollout."""
 
     def __post_init__(self) -> None:
-        """Check the table."""
         _check_plain(self.progress)
 
 
@@ -134,7 +130,6 @@ class RunEnd:
     """The final mean policy's rollout at physics rate; None where the run diverged."""
 
     def __post_init__(self) -> None:
-        """Check the table."""
         _check_plain(self.summary)
 
 
@@ -157,6 +152,5 @@ class RunHistory:
     end: RunEnd | None
 
     def __post_init__(self) -> None:
-        """Check the tables."""
         _check_plain(self.config)
         _check_plain(self.files)

@@ -46,22 +46,12 @@ class Bundle:
     hosts: tuple[str, ...] = ()
     """Host names and addresses in the learner's certificate; empty if the bundle does not list them."""
 
-    def listening(self) -> dict[str, object]:
-        """Zenoh's settings for a session that accepts connections."""
+    def settings(self, side: Literal["listen", "connect"]) -> dict[str, object]:
+        """Zenoh's settings for a session that accepts connections, or for one that connects."""
         return {
             "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
-            "transport/link/tls/listen_certificate": str(self.folder / "cert.pem"),
-            "transport/link/tls/listen_private_key": str(self.folder / "key.pem"),
-            "transport/link/tls/enable_mtls": True,
-            "transport/link/tls/close_link_on_expiration": True,
-        }
-
-    def connecting(self) -> dict[str, object]:
-        """Zenoh's settings for a session that connects."""
-        return {
-            "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
-            "transport/link/tls/connect_certificate": str(self.folder / "cert.pem"),
-            "transport/link/tls/connect_private_key": str(self.folder / "key.pem"),
+            f"transport/link/tls/{side}_certificate": str(self.folder / "cert.pem"),
+            f"transport/link/tls/{side}_private_key": str(self.folder / "key.pem"),
             "transport/link/tls/enable_mtls": True,
             "transport/link/tls/close_link_on_expiration": True,
         }
@@ -160,10 +150,8 @@ def access_control(farm: str, roster: Roster) -> dict[str, Any]:
         admit(name, _viewer(farm))
     for name in roster.learners:
         admit(name, _learner(farm))
-    return {
-        "enabled": True, "default_permission": "deny",
-        "rules": rules, "subjects": subjects, "policies": policies,
-    }  # fmt: skip
+    lists = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **lists}
 
 
 _TOKENS: Final = ["liveliness_token"]

@@ -102,7 +102,6 @@ class Jobs:
         return Jobs(table=table, eps=np.concatenate(eps) if len(eps) > 1 else (*eps, np.empty((0, 0)))[0])
 
     def __len__(self) -> int:
-        """Number of jobs."""
         return len(self.table)
 
     @property
@@ -180,7 +179,6 @@ class Chunk(Jobs):
     round: int
 
     def __post_init__(self) -> None:
-        """Check that the jobs are valid."""
         table, seeds = self.table, self.table[:, _SEED]
         if not table.size or table.shape[1] != _COLUMNS:
             raise ValueError(f"jobs in a table of shape {table.shape}")
@@ -271,11 +269,8 @@ class Results:
         cls, given: Simulated, jobs: Jobs, *, run: str, incarnation: str, round: int, worker: str
     ) -> "Results":
         """A message with the results of jobs, whose indices are ascending."""
-        return cls(
-            run=run, incarnation=incarnation, round=round, worker=worker, jobs=np.ascontiguousarray(jobs.indices),
-            returns=given.returns, flags=given.flags, steps=given.steps, traces=given.traces,
-            trajectories=given.trajectories, moments=given.moments,
-        )  # fmt: skip
+        own = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
+        return cls(**own, jobs=np.ascontiguousarray(jobs.indices), **vars(given))
 
 
 def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:

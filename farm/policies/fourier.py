@@ -59,10 +59,7 @@ class Kernel(Policy):
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions in (0, 1]."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            difference = np.ascontiguousarray(prepared) - np.ascontiguousarray(x)[:, None, :]
-            squares = (difference * difference).sum(axis=-1)
-        exponents = squares * (-0.5 / self.config.bandwidth**2)
+        exponents = gaussian_exponents(prepared, x, self.config.bandwidth)
         # Number by number: a step has only a few, for which the numpy calls of `elementary.exp` would take longer.
         return np.fromiter(map(math.exp, exponents.ravel().tolist()), float, exponents.size).reshape(exponents.shape)
 
@@ -135,6 +132,14 @@ class Cosine(Direct):
         """Weights of the features, (B, A, D)."""
         with np.errstate(over="ignore", invalid="ignore"):
             return elementary.cos(_by_action(theta, self.spec.action))
+
+
+def gaussian_exponents(centres: FloatArray, x: FloatArray, bandwidth: float) -> FloatArray:
+    """-|c - x|^2 / (2 h^2) of centres (B, K, d) and observations (B, d), (B, K)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        difference = np.ascontiguousarray(centres) - np.ascontiguousarray(x)[:, None, :]
+        squares = (difference * difference).sum(axis=-1)
+    return squares * (-0.5 / bandwidth**2)
 
 
 def _by_action(theta: FloatArray, actions: int) -> FloatArray:

@@ -34,7 +34,6 @@ class MlpConfig(PolicyConfig):
     """Units of each hidden layer, first to last; repeat the flag for each layer."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if not 1 <= len(self.layers) <= _LAYERS:
             raise ConfigError(f"layers are {len(self.layers)}; expected 1 to {_LAYERS} hidden layers")

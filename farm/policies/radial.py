@@ -21,6 +21,7 @@ import numpy as np
 from farm import elementary
 from farm.arrays import FloatArray
 from farm.policies.base import Policy, PolicyConfig, check_constants
+from farm.policies.fourier import gaussian_exponents
 from farm.settings import setting
 from farm.tasks.base import TaskSpec
 
@@ -95,7 +96,4 @@ class WeightedKernel(Policy):
 
 def _gaussians(centres: FloatArray, x: FloatArray, bandwidth: float) -> FloatArray:
     """exp(-|c - x|^2 / (2 h^2)) of centres (B, K, d) and observations (B, d), (B, K)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = np.ascontiguousarray(centres) - np.ascontiguousarray(x)[:, None, :]
-        squares = (difference * difference).sum(axis=-1)
-    return elementary.exp(squares * (-0.5 / bandwidth**2))
+    return elementary.exp(gaussian_exponents(centres, x, bandwidth))

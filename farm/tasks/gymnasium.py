@@ -52,7 +52,6 @@ class EnvironmentConfig(TaskConfig):
     """Keyword argument of the environment, repeatable: NAME=VALUE as in JSON (terminate_when_unhealthy=false)."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         names = [_argument(said)[0] for said in self.env_arg]
         for name in names:

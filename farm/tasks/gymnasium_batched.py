@@ -7,6 +7,7 @@ precision: actions are in single precision. Sines, cosines and lengths may diffe
 """
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +28,6 @@ class Batched:
     """Whether initial velocities are drawn from a normal distribution, not a uniform one."""
 
     def __init__(self, env: Any) -> None:  # noqa: ANN401  an unwrapped environment
-        """Take its settings."""
         self.env, self.model = env, env.model
         self.qpos, self.qvel = env.init_qpos.copy(), env.init_qvel.copy()
         self.left_out = self.hidden * bool(getattr(env, "_exclude_current_positions_from_observation", False))
@@ -58,9 +58,13 @@ class Batched:
         action = sim.ctrl.astype(np.float32)
         return np.square(action).sum(axis=1)
 
+    def healthy(self, sim: Sim) -> BoolArray:
+        """Which rollouts stand, (B,)."""
+        return np.ones(len(sim), dtype=bool)
+
     def ended(self, sim: Sim) -> BoolArray:
-        """Which rollouts the environment terminates, (B,)."""
-        return np.zeros(len(sim), dtype=bool)
+        """Which rollouts the environment terminates, (B,); those that fell, unless it lets them go on."""
+        return ~self.healthy(sim) & bool(getattr(self.env, "_terminate_when_unhealthy", False))
 
 
 class Swimmer(Batched):
@@ -92,10 +96,6 @@ class Walker2d(Batched):
         rewards = forward + self.healthy(sim) * self.env._healthy_reward
         return rewards - self.env._ctrl_cost_weight * self.effort(sim)
 
-    def ended(self, sim: Sim) -> BoolArray:
-        """Where it fell."""
-        return ~self.healthy(sim) & bool(self.env._terminate_when_unhealthy)
-
 
 class Hopper(Walker2d):
     """Hopper-v5."""
@@ -111,10 +111,10 @@ class Ant(Batched):
 
     hidden, normal = 2, True
 
-    def __init__(self, env: Any) -> None:  # noqa: ANN401
-        """Take its settings."""
-        super().__init__(env)
-        self.main = env.data.body(env._main_body).id
+    @cached_property
+    def main(self) -> int:
+        """Index of its main body."""
+        return int(self.env.data.body(self.env._main_body).id)
 
     def before(self, sim: Sim) -> FloatArray:
         """Position of its main body, (B, 2)."""
@@ -136,9 +136,8 @@ class Ant(Batched):
         speed = (sim.xpos[:, self.main, 0] - before[:, 0]) / self.env.dt
         gained = speed * self.env._forward_reward_weight + self.healthy(sim) * self.env._healthy_reward
         touch = _flat(self.forces(sim))
-        return gained - (
-            self.env._ctrl_cost_weight * self.effort(sim) + self.env._contact_cost_weight * _squared(touch)
-        )
+        cost = self.env._ctrl_cost_weight * self.effort(sim) + self.env._contact_cost_weight * _squared(touch)
+        return gained - cost
 
     def healthy(self, sim: Sim) -> BoolArray:
         """Which rollouts stand with all numbers finite."""
@@ -146,26 +145,14 @@ class Ant(Batched):
         finite = np.isfinite(sim.qpos).all(axis=1) & np.isfinite(sim.qvel).all(axis=1)
         return finite & (low <= sim.qpos[:, 2]) & (sim.qpos[:, 2] <= high)
 
-    def ended(self, sim: Sim) -> BoolArray:
-        """Where it fell."""
-        return ~self.healthy(sim) & bool(self.env._terminate_when_unhealthy)
-
 
 class Humanoid(Ant):
     """Humanoid-v5."""
 
     normal = False
 
-    def __init__(self, env: Any) -> None:  # noqa: ANN401
-        """Take its settings."""
-        Batched.__init__(self, env)
-
     def before(self, sim: Sim) -> FloatArray:
         """Position of its centre of mass, (B, 2)."""
-        return self.centre(sim)
-
-    def centre(self, sim: Sim) -> FloatArray:
-        """The mean place of its bodies by mass, (B, 2)."""
         mass = self.model.body_mass
         return (mass[:, None] * sim.xipos[:, :, :2]).sum(axis=1) / mass.sum()
 
@@ -189,7 +176,7 @@ class Humanoid(Ant):
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
         """Speed, and a bonus for standing, less the effort and the contacts."""
         env = self.env
-        speed = (self.centre(sim)[:, 0] - before[:, 0]) / env.dt
+        speed = (self.before(sim)[:, 0] - before[:, 0]) / env.dt
         gained = env._forward_reward_weight * speed + self.healthy(sim) * env._healthy_reward
         touch = np.clip(env._contact_cost_weight * _squared(_flat(_contact_forces(sim))), *env._contact_cost_range)
         return gained - (env._ctrl_cost_weight * self.effort(sim) + touch)

@@ -1,7 +1,5 @@
 """Learning algorithms: pure functions `ask` and `tell` on immutable states."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import Field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_checkable
@@ -29,20 +27,15 @@ class Algorithm(Protocol[State]):
 
     def signs(self) -> tuple[int, ...]:
         """Signs of eps in the rollouts of a row: (1, -1) for mu + eps and mu - eps, (1,) for mu + eps alone."""
-        ...
 
     def init(self, size: int) -> State:
         """Return the state before the first generation, of `size` parameters."""
-        ...
 
     def restore(self, values: Mapping[str, StateValue]) -> State:
         """Return the state from which `to_dict` made these values; a ValueError names a wrong key."""
-        ...
 
     def ask(self, state: State, rng: np.random.Generator) -> FloatArray:
         """Draw the perturbations of a generation, (rows, P)."""
-        ...
 
     def tell(self, state: State, eps: FloatArray, returns: FloatArray) -> State:
         """Return the state after one update, from returns (rows, signs); raises Diverged if it would not be finite."""
-        ...

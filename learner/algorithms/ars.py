@@ -17,7 +17,7 @@ from farm.errors import ConfigError
 from farm.settings import setting
 from learner.algorithms.gradients import weighted_sum
 from learner.algorithms.mirrored import Mirrored
-from learner.algorithms.state import SearchState, finite_rows, moved
+from learner.algorithms.state import SearchState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,31 +34,16 @@ class ARS(Mirrored):
     """Standard deviation of the exploration, nu; it stays constant."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if self.top is not None and self.top > self.pairs:
             raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")
 
-    def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
-        """Return the state after one update; if all used returns are equal, mu does not move.
-
-        Args:
-          state: the state `eps` was drawn from.
-          eps: from `ask`, (N, P).
-          returns: (N, 2), columns (+, -); all finite.
-
-        Raises:
-          ValueError: a shape is wrong, or a value not finite.
-          Diverged: the update would not be finite.
-        """
-        eps = finite_rows("eps", eps, (self.pairs, state.mu.size))
-        returns = finite_rows("returns", returns, (self.pairs, 2))
+    def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
+        """The next mu; if all used returns are equal, it does not move."""
         top = self.top or -(-self.pairs // 2)
         used = np.sort(np.argsort(-returns.max(axis=1), kind="stable")[:top])
-        with np.errstate(all="ignore"):
-            spread = float(returns[used].std())
-            contrast = returns[used, 0] - returns[used, 1]
-            step = weighted_sum(contrast, eps[used] / state.sigma)
-            rate = self.learning_rate_mu / (top * spread) if spread > 0.0 else 0.0
-            mu = state.mu + rate * step
-        return moved(state, returns, mu=mu)
+        spread = float(returns[used].std())
+        contrast = returns[used, 0] - returns[used, 1]
+        step = weighted_sum(contrast, eps[used] / state.sigma)
+        rate = self.learning_rate_mu / (top * spread) if spread > 0.0 else 0.0
+        return {"mu": state.mu + rate * step}

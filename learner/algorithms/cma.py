@@ -11,7 +11,7 @@ make no difference.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,8 +19,6 @@ from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
 from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows, moved
-
-_LARGEST: Final = 1000  # parameters with a full covariance: its update takes population x P^2 numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,8 +53,13 @@ class CMAES(Settings):
     initial_sigma: float = setting(1.0, above=0.0)
     """First standard deviation of every parameter."""
 
+    name: ClassVar[str] = "cma-es"
     optimiser: ClassVar[str] = "CMA"
     """The library's class."""
+    sizes: ClassVar[tuple[int, int]] = (1, 1000)
+    """Smallest and largest number of parameters: an update with a full covariance takes population x P^2 numbers."""
+    stored: ClassVar[str] = "_c_1d"
+    """The library's attribute that holds C as it is stored here."""
 
     def signs(self) -> tuple[int, ...]:
         """Rollouts of a row of eps: mu + eps alone."""
@@ -68,9 +71,9 @@ class CMAES(Settings):
         Raises:
           ConfigError: cmaes is not installed, or does not support this number of parameters.
         """
-        least, most = self._sizes()
+        least, most = self.sizes
         if not least <= size <= most:
-            raise ConfigError(f"the policy has {size} parameters; {self._name} takes {least} to {most}")
+            raise ConfigError(f"the policy has {size} parameters; {self.name} takes {least} to {most}")
         begun = self._library()(mean=np.full(size, float(self.initial_mu)), sigma=float(self.initial_sigma))
         return CMAState(**self._read(begun))
 
@@ -78,7 +81,7 @@ class CMAES(Settings):
         """Return the state from which `to_dict` made these values."""
         state = CMAState.from_dict(values)
         if state.covariance.size != self._entries(state.mu.size):
-            raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self._name} does not have")
+            raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self.name} does not have")
         return state
 
     def ask(self, state: CMAState, rng: np.random.Generator) -> FloatArray:
@@ -110,14 +113,6 @@ class CMAES(Settings):
                 raise Diverged(f"the update after generation {state.generation} failed: {error}") from None
         return moved(state, returns, **told)
 
-    @property
-    def _name(self) -> str:
-        return "cma-es"
-
-    def _sizes(self) -> tuple[int, int]:
-        """Smallest and largest number of parameters."""
-        return 1, _LARGEST
-
     def _entries(self, size: int) -> int:
         """Number of values that store the covariance of this number of parameters."""
         return size * (size + 1) // 2
@@ -126,7 +121,7 @@ class CMAES(Settings):
         try:
             import cmaes
         except ImportError:
-            raise ConfigError(f"algorithm {self._name} needs cmaes: pip install cmaes") from None
+            raise ConfigError(f"algorithm {self.name} needs cmaes: pip install cmaes") from None
         return getattr(cmaes, self.optimiser)
 
     def _write(self, state: CMAState) -> Any:  # noqa: ANN401  the library's object
@@ -134,24 +129,19 @@ class CMAES(Settings):
         mean, step = np.array(state.mu), float(state.step[0])
         search = self._library()(mean=mean, sigma=step, population_size=self.population)
         own = {"_p_sigma": np.array(state.step_path), "_pc": np.array(state.covariance_path), "_g": state.generation}
-        search.__setstate__({**search.__getstate__(), **own, self._covariance: np.array(state.covariance)})
+        search.__setstate__({**search.__getstate__(), **own, self.stored: np.array(state.covariance)})
         return search
 
     def _read(self, search: Any) -> dict[str, Any]:  # noqa: ANN401
         """Arrays of our state from the library's object."""
         found = search.__getstate__()
-        step, covariance = float(found["_sigma"]), np.array(found[self._covariance])
+        step, covariance = float(found["_sigma"]), np.array(found[self.stored])
         deviation = np.sqrt(self._diagonal(covariance, len(found["_mean"])))
         return {
             "mu": np.array(found["_mean"]), "sigma": step * deviation, "step": np.array([step]),
             "covariance": covariance, "step_path": np.array(found["_p_sigma"]),
             "covariance_path": np.array(found["_pc"]),
         }  # fmt: skip
-
-    @property
-    def _covariance(self) -> str:
-        """The library's attribute that holds C as it is stored here."""
-        return "_c_1d"
 
     def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:
         """Variances, (P,), from the stored form of C."""
@@ -162,21 +152,13 @@ class CMAES(Settings):
 class SepCMA(CMAES):
     """CMA-ES with a diagonal covariance, for many parameters."""
 
+    name: ClassVar[str] = "sep-cma"
     optimiser: ClassVar[str] = "SepCMA"
-
-    @property
-    def _name(self) -> str:
-        return "sep-cma"
-
-    def _sizes(self) -> tuple[int, int]:
-        return 2, 10_000_000
+    sizes: ClassVar[tuple[int, int]] = (2, 10_000_000)
+    stored: ClassVar[str] = "_C"
 
     def _entries(self, size: int) -> int:
         return size
-
-    @property
-    def _covariance(self) -> str:
-        return "_C"
 
     def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:  # noqa: ARG002
         return covariance

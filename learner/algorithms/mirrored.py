@@ -10,12 +10,12 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.settings import Settings, setting
-from learner.algorithms.state import SearchState, StateValue
+from learner.algorithms.state import SearchState, StateValue, finite_rows, moved
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mirrored(Settings):
-    """Settings and methods `init` and `ask`; subclasses add `tell`."""
+    """Settings and methods; subclasses add `_step`."""
 
     pairs: int = setting(16, least=1)
     """Pairs of rollouts per generation, N."""
@@ -39,3 +39,24 @@ class Mirrored(Settings):
     def ask(self, state: SearchState, rng: np.random.Generator) -> FloatArray:
         """Draw eps, (N, P)."""
         return state.sigma * rng.standard_normal((self.pairs, state.mu.size))
+
+    def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
+        """Return the state after one update.
+
+        Args:
+          state: the state `eps` was drawn from.
+          eps: from `ask`, (N, P).
+          returns: (N, 2), columns (+, -); all finite.
+
+        Raises:
+          ValueError: a shape is wrong, or a value not finite.
+          Diverged: the update would not be finite.
+        """
+        eps = finite_rows("eps", eps, (self.pairs, state.mu.size))
+        returns = finite_rows("returns", returns, (self.pairs, 2))
+        with np.errstate(all="ignore"):
+            return moved(state, returns, **self._step(state, eps, returns))
+
+    def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
+        """The arrays that an update changes, by name; for arguments see `tell`."""
+        raise NotImplementedError

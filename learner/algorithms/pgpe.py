@@ -5,8 +5,6 @@ Rollouts of theta = mu + eps and mu - eps are compared, and mu and sigma follow 
 ranks with ClipUp (Toklu 2020) or Adam are the modern variant. Shapes: P parameters, N pairs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -18,36 +16,35 @@ from farm.errors import ConfigError
 from farm.settings import Settings, setting
 from learner.algorithms.gradients import (
     Normaliser,
+    SigmaRule,
+    adam,
     baseline_contrast,
     centred_ranks,
+    clipup,
     level,
     middle_returns,
     optimal_baseline,
     pair_contrast,
     plain_contrast,
     sigma_characteristic,
+    step_sigma,
     weighted_sum,
 )
-from learner.algorithms.optimisers import SigmaRule, adam, clipup, step_sigma
 from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows
 
 # The authors' code: b = 0.9 b + 0.1 mean return.
 _BASELINE_MEMORY = 0.9
 
 
-def _empty() -> FloatArray:
-    return np.empty(0)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PGPEState(SearchState):
     """The search distribution, and the memory of the optimiser of mu."""
 
-    velocity: FloatArray = field(default_factory=_empty)
+    velocity: FloatArray = field(default_factory=lambda: np.empty(0))
     """ClipUp's velocity, (P,), or empty if it is not used."""
-    first_moment: FloatArray = field(default_factory=_empty)
+    first_moment: FloatArray = field(default_factory=lambda: np.empty(0))
     """Adam's running mean of the gradient, (P,), or empty."""
-    second_moment: FloatArray = field(default_factory=_empty)
+    second_moment: FloatArray = field(default_factory=lambda: np.empty(0))
     """Adam's running mean of the squared gradient, (P,), or empty."""
 
 
@@ -90,7 +87,6 @@ class PGPE(Settings):
     """Largest relative change of a sigma per generation, with the capped rule."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         super().__post_init__()
         if self.initial_sigma < self.sigma_floor:
             raise ConfigError(
@@ -211,11 +207,7 @@ class PGPE(Settings):
             return {"mu": state.mu + rate * gradient_mu, "sigma": sigma}
         if self.optimiser == "clipup":
             velocity = clipup(
-                gradient_mu,
-                state.velocity,
-                learning_rate=rate,
-                momentum=self.momentum,
-                max_speed=self.max_speed,
+                gradient_mu, state.velocity, learning_rate=rate, momentum=self.momentum, max_speed=self.max_speed
             )
             return {"mu": state.mu + velocity, "sigma": sigma, "velocity": velocity}
         step, first, second = adam(

@@ -21,7 +21,7 @@ from farm.arrays import FloatArray
 from farm.settings import setting
 from learner.algorithms.gradients import weighted_sum
 from learner.algorithms.mirrored import Mirrored
-from learner.algorithms.state import SearchState, finite_rows, moved
+from learner.algorithms.state import SearchState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,31 +37,16 @@ class SNES(Mirrored):
     sigma_floor: float = setting(1e-6, above=0.0)
     """Smallest standard deviation, in units of the parameters."""
 
-    def tell(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
-        """Return the state after one update.
-
-        Args:
-          state: the state `eps` was drawn from.
-          eps: from `ask`, (N, P).
-          returns: (N, 2), columns (+, -); all finite.
-
-        Raises:
-          ValueError: a shape is wrong, or a value not finite.
-          Diverged: the update would not be finite.
-        """
-        size = state.mu.size
-        eps = finite_rows("eps", eps, (self.pairs, size))
-        returns = finite_rows("returns", returns, (self.pairs, 2))
-        u = utilities(returns)
-        rate = self.learning_rate_sigma
+    def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
+        """The next mu and sigma."""
+        size, u, rate = state.mu.size, utilities(returns), self.learning_rate_sigma
         rate = (3.0 + math.log(size)) / (5.0 * math.sqrt(size)) if rate is None else rate
-        with np.errstate(all="ignore"):
-            s = eps / state.sigma
-            to_mu = weighted_sum(u[:, 0] - u[:, 1], s)
-            to_sigma = weighted_sum(u[:, 0] + u[:, 1], s * s - 1.0)
-            mu = state.mu + self.learning_rate_mu * state.sigma * to_mu
-            sigma = state.sigma * elementary.exp(0.5 * rate * to_sigma)
-        return moved(state, returns, mu=mu, sigma=np.maximum(sigma, self.sigma_floor))
+        s = eps / state.sigma
+        to_mu = weighted_sum(u[:, 0] - u[:, 1], s)
+        to_sigma = weighted_sum(u[:, 0] + u[:, 1], s * s - 1.0)
+        mu = state.mu + self.learning_rate_mu * state.sigma * to_mu
+        sigma = state.sigma * elementary.exp(0.5 * rate * to_sigma)
+        return {"mu": mu, "sigma": np.maximum(sigma, self.sigma_floor)}
 
 
 def utilities(returns: FloatArray) -> FloatArray:

@@ -4,8 +4,6 @@ Shapes: P is the number of parameters. Every array is float64 and read-only, so 
 algorithm nor the recorder can change a state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Final, TypeAlias, TypeVar

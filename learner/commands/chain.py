@@ -15,7 +15,7 @@ from farm import seeds, settings
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
-from farm.errors import ConfigError, writing
+from farm.errors import ConfigError
 from farm.seeds import SEEDS
 from farm.settings import Settings, setting
 from learner.commands import recordings
@@ -113,9 +113,6 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     """The unperturbed chain, at physics rate."""
     from farm.tasks import loop
     from learner.chain import chain
-    from learner.recording.drawing import Drawing
-    from learner.recording.replay import record_replay
-    from learner.recording.run import markdown
 
     first = policies[0].problem
     shown = chain(policies, [None], command.shown, every=1)
@@ -123,13 +120,8 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     # Its reward would be the first policy's throughout.
     trajectory = replace(found, terms=np.zeros_like(found.terms), value=float("nan"), success=None)
     name = f"{len(policies)} policies in turn: the goal is reached {shown.changes[0]} times"
-    with writing(command.to):
-        record_replay(
-            command.to, run="chain", drawing=Drawing.of(first), config=markdown(first.config),
-            rollouts=[(name, trajectory)],
-        )  # fmt: skip
+    recordings.record(command.to, "chain", first, name, trajectory)
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.video is not None:
         qpos = loop.whole(shown.rollouts, 0)["qpos"]
         recordings.film(shown.task, [(trajectory, qpos)], command.video, command.speed)
-        say(f"video: {command.video}")

@@ -34,11 +34,12 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(CompareCommand, words, "farm compare")
     check_rerun()
-    from learner.recording.comparison import COLOURS, Shown, record_comparison
+    from learner.recording.comparison import Shown, record_comparison
+    from learner.recording.curves import PALETTE
     from learner.recording.drawing import Drawing
 
-    if not 2 <= len(command.runs) <= len(COLOURS):
-        raise ConfigError(f"{len(command.runs)} runs to compare; expected 2 to {len(COLOURS)}")
+    if not 2 <= len(command.runs) <= len(PALETTE):
+        raise ConfigError(f"{len(command.runs)} runs to compare; expected 2 to {len(PALETTE)}")
     recordings.target(command.to)
     folders = [RunFolder.open(path) for path in command.runs]
     runs = read(folders)
@@ -107,7 +108,6 @@ def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
 
 
 def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
-
     def said(key: str, form: str) -> tuple[str, ...]:
         values = [run.summary.get(key) for run in runs]
         return tuple("-" if value is None else format(value, form) for value in values)

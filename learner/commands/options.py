@@ -99,8 +99,8 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
       ConfigError: two of --preset, --config and --resume, or one that cannot be used.
     """
     chosen = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
-    named = {name: _value(words, f"--{name}") for name in ("task", "policy", "algorithm")}
-    parts = {name: value for name, value in named.items() if value is not None}
+    named = {part: _value(words, f"--{part}") for part in configs.PARTS}
+    parts = {part: plugins.find(configs.PARTS[part], name).name for part, name in named.items() if name is not None}
     given = [f"--{name}" for name, value in chosen.items() if value is not None]
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} exclude each other: each defines where to start from")
@@ -148,20 +148,6 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
 
 def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[settings.C, RunFolder | None, RunConfig]:
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
-    words = _with_names(words)
     begin, resumed = origin(words)
     default = replace(kind(), run=begin)  # type: ignore[type-var]
     return settings.parse(kind, words, program, default), resumed, begin
-
-
-def _with_names(words: Sequence[str]) -> list[str]:
-    """The words, with absolute paths of plug-ins in files: a run can then be repeated from any folder."""
-    out = list(words)
-    kinds = {"--task": "tasks", "--policy": "policies", "--algorithm": "algorithms"}
-    for i, word in enumerate(words):
-        flag, equals, value = word.partition("=")
-        if flag in kinds and equals:
-            out[i] = f"{flag}={plugins.find(kinds[flag], value).name}"
-        elif flag in kinds and i + 1 < len(out):
-            out[i + 1] = plugins.find(kinds[flag], out[i + 1]).name
-    return out

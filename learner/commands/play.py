@@ -18,7 +18,7 @@ from farm.sim.engines import DataEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskConfig
 from farm.tasks.loop import Batch
-from learner.commands.replay import task_of
+from learner.commands.replay import config_of
 from learner.replay import LoadedPolicy, loaded
 from learner.run_folder import RunFolder
 
@@ -41,8 +41,8 @@ class PlayCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    own = task_of(words)
-    default = PlayCommand(run=tyro.MISSING, task=own or TaskConfig())
+    config = config_of(words)
+    default = PlayCommand(run=tyro.MISSING, task=config.task_config if config else TaskConfig())
     command = settings.parse(PlayCommand, words, "farm play", default)
     policy = loaded(RunFolder.open(command.run), command.generation, command.task)
     if not display():

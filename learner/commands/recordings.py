@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from farm.arrays import FloatArray
-from farm.errors import ConfigError
+from farm.commands.logs import say
+from farm.errors import ConfigError, writing
 
 if TYPE_CHECKING:
     from farm.sim.rendering import Picture
     from farm.sim.trajectory import Trajectory
     from farm.tasks.base import Task
+    from learner.setup import Problem
 
 _MAGIC: Final = b"RRF"  # first bytes of a recording of any release of Rerun
 
@@ -64,6 +66,18 @@ def target(path: Path) -> Path:
     return path
 
 
+def record(path: Path, run: str, problem: "Problem", name: str, rollout: "Trajectory") -> None:
+    """Write a recording of one rollout with its name; a RunError if that fails."""
+    from learner.recording.drawing import Drawing
+    from learner.recording.replay import record_replay
+    from learner.recording.run import markdown
+
+    with writing(path):
+        record_replay(
+            path, run=run, drawing=Drawing.of(problem), config=markdown(problem.config), rollouts=[(name, rollout)]
+        )
+
+
 def film(task: "Task", shown: "Sequence[tuple[Trajectory, FloatArray]]", path: Path, speed: float) -> None:
     """Write a video of rollouts side by side, each with positions qpos (F, nq); one that ended early stands still."""
     from farm.sim import video
@@ -72,6 +86,7 @@ def film(task: "Task", shown: "Sequence[tuple[Trajectory, FloatArray]]", path: P
     chosen = video.moments(longest.times.tolist(), speed, rest=1.0)
     drawn = [_pictures(task, rollout, qpos, chosen) for rollout, qpos in shown]
     video.write(path, [video.tiled(together) for together in zip(*drawn, strict=True)])
+    say(f"video: {path}")
 
 
 def _pictures(task: "Task", rollout: "Trajectory", qpos: FloatArray, moments: Sequence[int]) -> "list[Picture]":

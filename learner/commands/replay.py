@@ -83,7 +83,6 @@ def main(words: Sequence[str]) -> int:
     if command.video is not None:
         frames = [(each.trajectory, each.frames["qpos"]) for each in shown]
         recordings.film(policy.problem.task, frames, command.video, command.speed)
-        say(f"video: {command.video}")
     return 0
 
 
@@ -108,7 +107,7 @@ def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -
     policy = loaded(folder, command.generation, command.task)
     shown = policy.rollout()
     name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
-    _record_one(folder, path, policy, name, shown)
+    recordings.record(path, folder.name, policy.problem, name, shown.trajectory)
     say(f"return {shown.trajectory.value:.3f}{_succeeds(shown)}")
     return policy, [shown]
 
@@ -121,11 +120,11 @@ def _rollouts(
     command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
 ) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show exploring rollouts of a generation: one by itself, several side by side."""
-    from learner.recording.comparison import Shown, record_side_by_side
+    from learner.recording.comparison import Shown, record_comparison
     from learner.recording.drawing import Drawing
-    from learner.rewind import rewound, under
+    from learner.rewind import rewind, under
 
-    found = rewound(folder, command.generation)
+    found = rewind(folder.path, command.generation)
     policy = under(folder, found, command.task) if changed else found.policy  # chosen by the run's own results
     chosen = _chosen(command, found, ending)
     shown = found.again(chosen, policy)
@@ -133,7 +132,7 @@ def _rollouts(
     lines = [f"return {each.trajectory.value:.3f}{_succeeds(each)}" for each in shown]
     title = f"generation {found.generation}" + (f", {changed}" if changed else "")
     if len(shown) == 1:
-        _record_one(folder, path, policy, f"{names[0]} of {title}", shown[0])
+        recordings.record(path, folder.name, policy.problem, f"{names[0]} of {title}", shown[0].trajectory)
     else:
         drawing = Drawing.of(policy.problem)
         rows = [f"| {name} | {line} |" for name, line in zip(names, lines, strict=True)]
@@ -141,7 +140,7 @@ def _rollouts(
         table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
         side = [Shown(name, drawing, (), each.trajectory) for name, each in zip(names, shown, strict=True)]
         with writing(path):
-            record_side_by_side(path, folder.name, side, table)
+            record_comparison(path, side, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
     return policy, shown
 
@@ -167,18 +166,6 @@ def _chosen(command: ReplayCommand, found: "Rewound", ending: str) -> list[int]:
     return chosen
 
 
-def _record_one(folder: RunFolder, path: Path, policy: "LoadedPolicy", name: str, shown: "Replay") -> None:
-    from learner.recording.drawing import Drawing
-    from learner.recording.replay import record_replay
-    from learner.recording.run import markdown
-
-    with writing(path):
-        record_replay(
-            path, run=folder.name, drawing=Drawing.of(policy.problem), config=markdown(policy.problem.config),
-            rollouts=[(name, shown.trajectory)],
-        )  # fmt: skip
-
-
 def config_of(words: Sequence[str]) -> RunConfig | None:
     """The configuration of the run in the words, for its task's flags; None without one.
 
@@ -191,12 +178,6 @@ def config_of(words: Sequence[str]) -> RunConfig | None:
     if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
         RunFolder.open(Path(words[0]))  # raises first: otherwise its task's flags would be reported as unknown
     return None
-
-
-def task_of(words: Sequence[str]) -> TaskConfig | None:
-    """The task's settings in that run."""
-    config = config_of(words)
-    return config.task_config if config else None
 
 
 def differing(own: TaskConfig, chosen: TaskConfig) -> str:

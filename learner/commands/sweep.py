@@ -95,7 +95,7 @@ def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
 
 def _parts(values: dict[str, str]) -> list[str]:
     """The flags that choose task, policy and algorithm, because the other flags depend on them."""
-    return [_word(name, value) for name, value in values.items() if name in ("task", "policy", "algorithm")]
+    return [_word(name, value) for name, value in values.items() if name in configs.PARTS]
 
 
 def _word(name: str, value: str) -> str:

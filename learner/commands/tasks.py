@@ -84,7 +84,6 @@ def described(name: str) -> str:
 
 
 def _kind(name: str) -> str:
-    """The kind of the plug-in with this name."""
     if name.rpartition(":")[0].endswith(".py"):
         target = plugins.find("tasks", name).target
         return "tasks" if issubclass(target, Task) else "policies" if issubclass(target, Policy) else "algorithms"

@@ -110,16 +110,11 @@ def comparison(
         row_shares=[1.5, 1.2, 1],
         name="Learning",
     )
-    curves = (
-        []
-        if compared is None
-        else [
-            plot(f"{title(compared)}: {label}", entity[1:])
-            for label, entity in zip(compared.names, entities(compared), strict=True)
-        ]
-    )
-    reward = plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom)
-    rollout = _stacked([reward, *curves], [], "Rollout (sim_time)")
+    curves = [plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom)]
+    if compared is not None:
+        labelled = zip(compared.names, entities(compared), strict=True)
+        curves += [plot(f"{title(compared)}: {label}", entity[1:]) for label, entity in labelled]
+    rollout = _stacked(curves, [], "Rollout (sim_time)")
     if not learning:
         return _blueprint(_beside(left, _PICTURES, rollout, 0.6), _playing())
     following = rrb.TimePanel(timeline="generation", play_state="following")
@@ -167,13 +162,13 @@ def _picture(origin: str, name: str) -> rrb.View:
 
 def _images(spec: TaskSpec) -> list[rrb.View]:
     """One view per image; with several channels the names are CHANNEL LABEL."""
-    channels = [channel for channel in spec.channels if channel.kind == "images"]
-    names = {c.name: f"{title(c)} " if len(channels) > 1 or not c.labels else "" for c in channels}
-    return [
-        _picture(entity, (names[channel.name] + label)[:1].upper() + (names[channel.name] + label)[1:])
-        for channel in channels
-        for label, entity in zip(channel.names, entities(channel), strict=True)
-    ]
+    channels, views = [channel for channel in spec.channels if channel.kind == "images"], []
+    for channel in channels:
+        before = f"{title(channel)} " if len(channels) > 1 or not channel.labels else ""
+        for label, entity in zip(channel.names, entities(channel), strict=True):
+            name = before + label
+            views.append(_picture(entity, name[:1].upper() + name[1:]))
+    return views
 
 
 def _config() -> rrb.View:
@@ -211,11 +206,7 @@ def _farm() -> rrb.Container:
     )
 
 
-def _plot(
-    name: str,
-    *entities: str,
-    legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop,
-) -> rrb.View:
+def _plot(name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop) -> rrb.View:
     """Curves over all their time, also while the cursor moves and after a change of the timeline."""
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))

@@ -68,8 +68,8 @@ class ChannelDrawing:
             _, height, width = channel.shape
             size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
             style = rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)
-            yield from ((entity, style) for entity in entities(channel))
             for entity in entities(channel):
+                yield entity, style
                 yield from scale(entity, width, height, channel.top, channel.unit)
             for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
                 yield entity, rr.Points3D.from_fields(positions=places, radii=_POINT_RADIUS * self._size)

@@ -26,12 +26,9 @@ from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.channels import entities
-from learner.recording.curves import PALETTE, Colour, lines, palette
+from learner.recording.curves import Colour, lines, palette
 from learner.recording.drawing import Drawing
 from learner.recording.rows import begin, flush, log_static, markdown, times
-
-COLOURS: Final = PALETTE
-"""One colour per run."""
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a separate layout, which is never used for a run
 _BESIDE: Final = "rolloutfarm rollouts"
@@ -50,27 +47,16 @@ class Shown:
     rollout: Trajectory
 
 
-def record_comparison(path: Path, runs: Sequence[Shown], table: str) -> None:
-    """Write the recording of at most as many runs as there are COLOURS, with their table (Markdown).
+def record_comparison(path: Path, runs: Sequence[Shown], table: str, *, rollouts_of: str = "") -> None:
+    """Write the recording of runs, or of the rollouts of one run with this name, with a table of them (Markdown).
+
+    Rollouts of one run have no learning curves.
 
     Raises:
       OSError: the file cannot be written.
     """
-    _record(path, "comparison", "/runs", runs, table)
-
-
-def record_side_by_side(path: Path, run: str, rollouts: Sequence[Shown], table: str) -> None:
-    """Write a run's rollouts with a table of them (Markdown); `progress` is not used.
-
-    Raises:
-      OSError: the file cannot be written.
-    """
-    _record(path, f"{run}-replay", "/rollouts", rollouts, table, learning=False)
-
-
-def _record(
-    path: Path, recording: str, above: str, runs: Sequence[Shown], table: str, *, learning: bool = True
-) -> None:
+    learning = not rollouts_of
+    recording, above = ("comparison", "/runs") if learning else (f"{rollouts_of}-replay", "/rollouts")
     path.touch()  # fails with an errno; Rerun's own error has none
     roots = [f"{above}/{rr.escape_entity_path_part(run.name)}" for run in runs]
     step, eye = _arrangement(runs)

@@ -1,6 +1,6 @@
 """Colours, and the curves of a run: their names, and a generation's values as Rerun entities."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import cycle, islice
 from typing import Any, Final
 
@@ -66,47 +66,39 @@ def pack(colour: Colour) -> int:
     return red << 24 | green << 16 | blue << 8 | 255
 
 
+_RETURNS: Final = ("mean", "min", "max", "best", "baseline")
+_MEAN_POLICY: Final = lines(("mean policy",), (YELLOW,))
+_CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float]]]]] = (
+    ("/learning/return", lines(_RETURNS, (SKY, VERMILLION, GREEN, ORANGE, GREY), hidden=_RETURNS[:3]),
+     lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, np.nan if s.baseline is None else s.baseline]),
+    ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",)),
+     lambda s, _: [s.sigma_mean, s.sigma_min, s.sigma_max]),
+    ("/learning/mean_norm", lines(("norm of mu",), (SKY,)), lambda s, _: [s.mean_norm]),
+    ("/learning/lost", lines(("ended early", "failed", "clamped"), (ORANGE, VERMILLION, GREY)),
+     lambda s, _: [s.ended, s.failed, s.clamped]),
+    ("/farm/workers", lines(("workers",), (GREEN,)), lambda s, _: [s.workers]),
+    ("/farm/rollouts_per_s", lines(("rollouts per s",), (SKY,)), lambda _, rate: [rate]),
+    ("/farm/reissued", lines(("reissued",), (ORANGE,)), lambda s, _: [s.reissued]),
+)  # fmt: skip
+"""Curves of every run: entity, names and colours, and a generation's values, of its statistics and rate [1/s]."""
+
+
 def static(*, success: bool) -> list[tuple[str, Any]]:
-    """Names and colours of the learning curves, in the order of `statistics`; with success if the task defines it."""
-    returns = ("mean", "min", "max", "best", "baseline")
-    colours = (SKY, VERMILLION, GREEN, ORANGE, GREY)
+    """Names and colours of the learning curves; with success if the task defines it."""
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
-    mean_policy = lines(("mean policy",), (YELLOW,))
-    succeeded = [("/learning/success", lines(("exploring",), (SKY,))), ("/learning/mean_policy/success", mean_policy)]
-    return [
-        ("/learning/return", lines(returns, colours, hidden=("mean", "min", "max"))),
-        ("/learning/return_std", band),
-        ("/learning/mean_policy/return", mean_policy),
-        ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",))),
-        ("/learning/mean_norm", lines(("norm of mu",), (SKY,))),
-        *(succeeded if success else []),
-        ("/learning/lost", lines(("ended early", "failed", "clamped"), (ORANGE, VERMILLION, GREY))),
-        ("/farm/workers", lines(("workers",), (GREEN,))),
-        ("/farm/rollouts_per_s", lines(("rollouts per s",), (SKY,))),
-        ("/farm/reissued", lines(("reissued",), (ORANGE,))),
-    ]
+    own: list[tuple[str, Any]] = [("/learning/return_std", band), ("/learning/mean_policy/return", _MEAN_POLICY)]
+    if success:
+        own += [("/learning/success", lines(("exploring",), (SKY,))), ("/learning/mean_policy/success", _MEAN_POLICY)]
+    return own + [(entity, names) for entity, names, _ in _CURVES]
 
 
 def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
     """Statistics of a generation's exploring rollouts; `rate` is theirs [1/s]."""
-    s = stats
-    baseline = np.nan if s.baseline is None else s.baseline
-    success = []
-    if s.success_rate is not None:
-        success.append(("/learning/success", rr.Scalars([s.success_rate])))
-    band = rr.Measurements.from_fields(values=[s.return_mean], variances=[s.return_std**2])
-    returns = [s.return_mean, s.return_min, s.return_max, s.best, baseline]
-    return [
-        ("/learning/return", rr.Scalars(returns)),
-        ("/learning/return_std", band),
-        ("/learning/sigma", rr.Scalars([s.sigma_mean, s.sigma_min, s.sigma_max])),
-        ("/learning/mean_norm", rr.Scalars([s.mean_norm])),
-        *success,
-        ("/learning/lost", rr.Scalars([s.ended, s.failed, s.clamped])),
-        ("/farm/workers", rr.Scalars([s.workers])),
-        ("/farm/rollouts_per_s", rr.Scalars([rate])),
-        ("/farm/reissued", rr.Scalars([s.reissued])),
-    ]
+    band = rr.Measurements.from_fields(values=[stats.return_mean], variances=[stats.return_std**2])
+    own: list[tuple[str, Any]] = [("/learning/return_std", band)]
+    if stats.success_rate is not None:
+        own.append(("/learning/success", rr.Scalars([stats.success_rate])))
+    return own + [(entity, rr.Scalars(values(stats, rate))) for entity, _, values in _CURVES]
 
 
 def mean_policy(value: float, success: bool | None) -> list[tuple[str, Any]]:

@@ -124,11 +124,7 @@ class Recorder:
         log_static(self._stream, static)
 
     def generation(
-        self,
-        stats: GenerationStats,
-        sample: Trajectory | None,
-        traces: Mapping[str, AnyArray],
-        rate: float,
+        self, stats: GenerationStats, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
     ) -> None:
         """Record a finished generation; its rollout may be held back for HOLD, or until `settle` or `close`.
 

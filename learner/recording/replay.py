@@ -19,12 +19,7 @@ PAUSE: Final = 0.1
 
 
 def record_replay(
-    path: Path,
-    *,
-    run: str,
-    drawing: Drawing,
-    config: str,
-    rollouts: Sequence[tuple[str, Trajectory]],
+    path: Path, *, run: str, drawing: Drawing, config: str, rollouts: Sequence[tuple[str, Trajectory]]
 ) -> None:
     """Write rollouts into a separate file; an existing one is replaced.
 

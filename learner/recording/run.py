@@ -93,7 +93,10 @@ class RecorderThread:
         except Exception as error:
             self.failed = True
             log.error("the recording ends here, learning continues: %s", error)
-            self._abandon()
+            while not self._queue.empty():
+                self._queue.get()
+            with contextlib.suppress(Exception):  # save what is recorded as far as possible
+                self._recorder.close(merge=self._merge)
 
     def _next(self) -> Callable[[], None] | None:
         """Return the next call; if there is none for a while, the one that writes held back rollouts."""
@@ -101,13 +104,6 @@ class RecorderThread:
             return self._queue.get(timeout=QUIET)
         except queue.Empty:
             return self._recorder.settle
-
-    def _abandon(self) -> None:
-        """Empty the queue, and save what is recorded as far as possible."""
-        while not self._queue.empty():
-            self._queue.get()
-        with contextlib.suppress(Exception):
-            self._recorder.close(merge=self._merge)
 
 
 class RunRecording(logging.Handler):

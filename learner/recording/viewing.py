@@ -36,29 +36,14 @@ def listens(port: int, gone: Callable[[], bool]) -> bool:
     return False
 
 
-def show_table(port: int, gone: Callable[[], bool]) -> bool:
-    """Switch the viewer on this port from its recordings to the table of all of them.
-
-    Returns:
-      whether it is shown; the recordings are loaded in either case.
-    """
-
-    def go(viewer: ViewerClient, state: ViewerState) -> None:
-        viewer.set_location(_table(state.catalog_url or "", state.location))
-
-    return _once_loaded(port, gone, go)
+def show_table(viewer: ViewerClient, state: ViewerState) -> None:
+    """Switch from the recordings to the table of all of them: in the viewer's catalog, under their application's id."""
+    (application,) = parse_qs(urlsplit(state.location).query)["app_id"]
+    viewer.set_location(f"{state.catalog_url}/entry/{application}")
 
 
-def show_newest(port: int, gone: Callable[[], bool]) -> bool:
-    """Start playing a recording at the newest rollout: a layout cannot contain the cursor.
-
-    Returns:
-      whether the recording is loaded.
-    """
-    return _once_loaded(port, gone, _go_to_newest)
-
-
-def _go_to_newest(viewer: ViewerClient, state: ViewerState) -> None:
+def show_newest(viewer: ViewerClient, state: ViewerState) -> None:
+    """Start playing the recording at the newest rollout: a layout cannot contain the cursor."""
     recording = next(each for each in state.recordings if each.store_id == state.active_recording)
     last = {line.name: line.end for line in recording.timelines}
     if recording.current_timeline == "sim_time" and last.get("generation"):
@@ -67,7 +52,7 @@ def _go_to_newest(viewer: ViewerClient, state: ViewerState) -> None:
         viewer.set_time("sim_time", duration=begin, play_state="playing")
 
 
-def _once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
+def once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
     """Call a function with the viewer on this port as soon as its recordings are loaded; return whether it was done."""
     until = time.monotonic() + _LOADING
     while time.monotonic() < until and not gone():
@@ -81,9 +66,3 @@ def _once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClien
             log.debug("not yet: %s", error)
         time.sleep(_PERIOD)
     return False
-
-
-def _table(catalog: str, recording: str) -> str:
-    """Path in the viewer's catalog of a recording's table: under its application's id."""
-    (application,) = parse_qs(urlsplit(recording).query)["app_id"]
-    return f"{catalog}/entry/{application}"

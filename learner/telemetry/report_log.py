@@ -39,7 +39,7 @@ class ReportLog:
                 at = self._whole.popleft()
                 oldest = self._at(at)
                 self._size -= _size(oldest)
-                self._reports[at] = codec.encode(statistics(oldest))
+                self._reports[at] = codec.encode(replace(oldest, traces=(), sample=None, replay=None))
 
     def page(self, generation: int) -> tuple[RunReport, ...]:
         """Reports from that generation on, as many as fit into a page; at least one, if there is one."""
@@ -63,11 +63,6 @@ class ReportLog:
     def _at(self, i: int) -> RunReport:
         report = self._reports[i]
         return codec.decode(report, RunReport) if isinstance(report, bytes) else report
-
-
-def statistics(report: RunReport) -> RunReport:
-    """A report without rollouts and traces."""
-    return replace(report, traces=(), sample=None, replay=None)
 
 
 def _size(report: RunReport) -> int:

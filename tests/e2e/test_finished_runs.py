@@ -285,7 +285,7 @@ def test_several_recordings_are_a_table_in_the_viewer(done: Farm, tmp_path: Path
     import rerun_cli
     from rerun.experimental import ViewerClient
 
-    from learner.recording.viewing import free_port, show_table
+    from learner.recording.viewing import free_port, once_loaded, show_table
 
     other = tmp_path / "other.rrd"
     done.call("replay", "runs/a", "--to", str(other))
@@ -297,7 +297,7 @@ def test_several_recordings_are_a_table_in_the_viewer(done: Farm, tmp_path: Path
     with (tmp_path / "viewer.log").open("w+") as log:
         viewer = subprocess.Popen(command, env={**os.environ, **home}, stdout=log, stderr=log)
         try:
-            shown = show_table(port, lambda: viewer.poll() is not None)
+            shown = once_loaded(port, lambda: viewer.poll() is not None, show_table)
             if viewer.poll() is not None:
                 log.seek(0)
                 pytest.skip(f"the viewer needs Vulkan (Debian: mesa-vulkan-drivers libvulkan1): {log.read()[-200:]}")

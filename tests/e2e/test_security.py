@@ -187,7 +187,8 @@ def test_who_has_no_good_certificate_is_told_what_to_check(
 class Naked(Bundle):
     """Settings that trust the farm's authority, but have no certificate."""
 
-    def connecting(self) -> dict[str, object]:
+    def settings(self, side: str) -> dict[str, object]:
+        assert side == "connect"
         return {"transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem")}
 
 

@@ -8,8 +8,9 @@ import pytest
 
 from farm import __version__, plugins
 from farm import settings as arguments
-from farm.__main__ import COMMANDS, main
+from farm.__main__ import main
 from farm.errors import ConfigError
+from farm.plugins import COMMANDS
 from farm.settings import Settings, from_dict, setting, to_dict
 
 

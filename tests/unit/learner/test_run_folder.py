@@ -76,7 +76,7 @@ def test_no_configuration_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(ConfigError, match="cannot write to the run folder .*: No space left on device"):
         RunFolder.create(tmp_path / "r", RunConfig())
     assert not (tmp_path / "r").exists()
@@ -293,7 +293,7 @@ def test_parameters_are_begun_whole_or_not_at_all(folder: RunFolder, monkeypatch
         path.touch()
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space left"):
         fill(folder, 1)
     monkeypatch.undo()
