@@ -1,8 +1,10 @@
 """The learnt numbers are the same to the last bit, even if workers die or join late."""
 
+import json
 import os
 import platform
 import signal
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +137,6 @@ def test_workers_serve_two_learners(farm: Farm, reference: dict[str, Any]) -> No
 _AVX512 = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL"  # names of several releases
 
 PROCESSORS = {
-    "as it is": {},
     "BLAS of 2004": {"OPENBLAS_CORETYPE": "Prescott"},
     "BLAS of 2013": {"OPENBLAS_CORETYPE": "Haswell"},
     "BLAS of 2017": {"OPENBLAS_CORETYPE": "SkylakeX"},
@@ -145,31 +146,58 @@ PROCESSORS = {
 }
 """Environments in which numpy and its linear algebra compute as they do on other x86-64 processors."""
 
+SETTINGS: dict[str, dict[str, Any]] = {
+    "kernel": {"generations": 6},
+    "projected": {"policy": "projected", "features": 500, "state": "joints+tactile"},
+    "cosine": {"policy": "cosine", "features": 100, "optimiser": "adam", "perturb": True},
+    "mlp": {"policy": "mlp", "normalise": True, "state": "joints+contacts"},
+    "rbf": {"policy": "rbf", "normalise": True},
+    "weighted-kernel": {"policy": "weighted-kernel", "state": "joints+tactile"},
+    "fitted": {"start": "fitted", "state": "tactile"},
+    "snes": {"generations": 4, "policy": "weighted-kernel", "algorithm": "snes"},
+    "ars": {"generations": 4, "policy": "linear", "algorithm": "ars", "normalise": True},
+}
 
-@pytest.mark.slow
+LEARN = """
+import json, sys
+from pathlib import Path
+from learner.config import configure
+from learner.run import Placement, open_run
+place, found = Placement(connect=(sys.argv[1],), record=False), {}
+for name, values in json.loads(sys.argv[2]).items():
+    with open_run(configure(**{"generations": 3, "pairs": 6, **values}), Path(name), place) as run:
+        for _ in run.learn():
+            pass
+    found[name] = run.summary["parameters_sha256"]
+print(json.dumps(found))
+"""
+"""A learner process that does all these runs, one after another, with the workers at a router."""
+
+
+def learnt(farm: Farm, variables: dict[str, str]) -> dict[str, str]:
+    """The hash of every run's numbers, with learner and workers in this environment."""
+    endpoint = free_endpoint()
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("PYTHONWARNINGS", "ignore")  # numpy's, that a processor has no such features anyway
+        for name, value in variables.items():
+            environment.setenv(name, value)
+        farm.start_router(endpoint)
+        farm.start("worker", "--connect", endpoint, "--processes", "2")
+        learner = farm.start_python("-P", "-c", LEARN, endpoint, json.dumps(SETTINGS))
+    said, _ = learner.communicate(timeout=150)
+    assert learner.returncode == 0, said
+    return json.loads(said.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def as_it_is(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The hashes on this processor."""
+    with closing(Farm(tmp_path_factory.mktemp("processor"))) as farm:
+        return learnt(farm, {})
+
+
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the variables are of x86-64")
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("--generations", "6"),
-        ("--generations", "3", "--policy", "projected", "--features", "500", "--state", "joints+tactile"),
-        ("--generations", "3", "--policy", "cosine", "--features", "100", "--optimiser", "adam", "--perturb"),
-        ("--generations", "3", "--policy", "mlp", "--normalise", "--state", "joints+contacts"),
-        ("--generations", "3", "--policy", "rbf", "--normalise"),
-        ("--generations", "3", "--policy", "weighted-kernel", "--state", "joints+tactile"),
-        ("--generations", "3", "--start", "fitted", "--state", "tactile"),
-        ("--generations", "4", "--policy", "weighted-kernel", "--algorithm", "snes"),
-        ("--generations", "4", "--policy", "linear", "--algorithm", "ars", "--normalise"),
-    ],
-    ids=["kernel", "projected", "cosine", "mlp", "rbf", "weighted-kernel", "fitted", "snes", "ars"],
-)
-def test_any_processor(farm: Farm, monkeypatch: pytest.MonkeyPatch, settings: tuple[str, ...]) -> None:
-    monkeypatch.setenv("PYTHONWARNINGS", "ignore")  # numpy's, that a processor has no such features anyway
-    found = {}
-    for number, (processor, variables) in enumerate(PROCESSORS.items()):
-        with monkeypatch.context() as environment:
-            for name, value in variables.items():
-                environment.setenv(name, value)
-            farm.call("run", "--name", f"r{number}", *settings, *SMALL)
-        found[processor] = farm.summary(f"r{number}")["parameters_sha256"]
-    assert len(set(found.values())) == 1, found
+@pytest.mark.parametrize("processor", PROCESSORS)
+def test_any_processor(farm: Farm, as_it_is: dict[str, str], processor: str) -> None:
+    assert learnt(farm, PROCESSORS[processor]) == as_it_is
+    assert len(set(as_it_is.values())) == len(SETTINGS)
