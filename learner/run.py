@@ -269,7 +269,7 @@ def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[]
     """
     if not place.connect:
         return
-    taken = NameTakenError(f"a learner of run {run} is on farm {place.farm} already: take another --name")
+    taken = NameTakenError(f"a learner of run {run} is on farm {place.farm} already: choose a different --name")
     until = time.monotonic() + _REMEMBERED
     while link.present(keys.learner_token(place.farm, run), 1.0):
         if time.monotonic() > until or stopped():

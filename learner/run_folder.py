@@ -87,7 +87,7 @@ class RunFolder:
         except OSError as error:
             if os.path.isdir(path):  # noqa: PTH112  never raises
                 raise NameTakenError(
-                    f"run folder {path} exists and is never overwritten: choose another --name, or --resume {path}"
+                    f"run folder {path} exists and is never overwritten: choose a different --name, or --resume {path}"
                 ) from None
             raise ConfigError(f"cannot make the run folder {path}: {_in_the_way(path) or error.strerror}") from None
         folder = cls(path)

@@ -163,7 +163,7 @@ def test_a_second_learner_of_one_name_is_refused(farm: Farm) -> None:
     farm.start("learner", "--connect", endpoint, *SETTINGS)
     farm.wait_for(lambda: (farm.folder / "runs/r/log.txt").exists())
     said = farm.call("learner", "--connect", endpoint, "--out", "elsewhere", *SETTINGS, status=2)
-    assert "a learner of run r is on farm farm already: take another --name" in said
+    assert "a learner of run r is on farm farm already: choose a different --name" in said
     assert not (farm.folder / "elsewhere").exists()
 
 

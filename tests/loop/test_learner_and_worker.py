@@ -264,5 +264,5 @@ def test_of_two_learners_of_one_name_that_start_together_one_gives_way(cart: Pat
                 thread.join(30)
     assert len(done) == 1
     ((folder, said),) = refused
-    assert said == "a learner of run same is on farm farm already: take another --name"
+    assert said == "a learner of run same is on farm farm already: choose a different --name"
     assert not (folder / "same").exists()

@@ -59,7 +59,7 @@ def assert_holds(folder: RunFolder, generations: list[int]) -> None:
 def test_created_once(folder: RunFolder) -> None:
     assert folder.name == "r"
     assert RunFolder.open(folder.path).read_config() == RunConfig(seed=4)
-    with pytest.raises(ConfigError, match="exists and is never overwritten: choose another --name, or --resume"):
+    with pytest.raises(ConfigError, match="exists and is never overwritten: choose a different --name, or --resume"):
         RunFolder.create(folder.path, RunConfig())
     assert folder.read_config() == RunConfig(seed=4)
 
