@@ -245,7 +245,8 @@ def listen(
         return _closing(_open(settings))
     except zenoh.ZError as error:
         raise ConfigError(
-            f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? choose a different one with --listen"
+            f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? "
+            "choose a different one with --listen"
         ) from None
 
 
