@@ -4,6 +4,7 @@ import os
 import shutil
 import socket
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -82,6 +83,7 @@ def test_tasks_of_the_job_script_join_leave_and_are_replaced(
     endpoint, certs = free_endpoint().replace("tcp", "tls"), farm.folder / "certs"
     certificates.main(["new", str(certs), "--learner", "127.0.0.1", "--worker", "slurm"])
     farm.start_router(endpoint, "--tls", str(certs / "learner"))
+    monkeypatch.setenv("FARM", str(Path(sys.executable).with_name("farm")))
     monkeypatch.setenv("FARM_ROUTER", endpoint)
     monkeypatch.setenv("FARM_CERTS", str(certs / "worker-slurm"))
     said = slurm("sbatch", "--array=0-49", "--cpus-per-task=2", str(SCRIPT))
