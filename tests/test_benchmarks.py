@@ -40,7 +40,10 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
 @pytest.mark.slow
 def test_ctrl_c_ends_a_script_with_one_line() -> None:
     command = [sys.executable, "-u", FOLDER / "early.py"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background Ctrl-C is ignored
+    ) as process:  # fmt: skip
         assert process.stdout
         process.stdout.readline()  # the table's head, before the first run
         process.send_signal(signal.SIGINT)

@@ -71,7 +71,7 @@ def done(tmp_path_factory: pytest.TempPathFactory):
 @pytest.mark.slow
 def test_the_data_is_what_the_runs_recorded(done: Farm) -> None:
     assert "6 of 6 runs to do" in done.said  # type: ignore[attr-defined]
-    assert "runs are cut to 3 generations" in done.said  # type: ignore[attr-defined]
+    assert "runs shortened to 3 generations" in done.said  # type: ignore[attr-defined]
     for setup in ("joints-D300", "joints-D1500", "joints-D8000"):
         with np.load(done.folder / "side" / "data" / f"{setup}.npz", allow_pickle=False) as data:
             assert data["states"].tolist() == ["finished", "finished"]
@@ -137,7 +137,7 @@ def test_an_interrupted_experiment_goes_on_to_the_same_numbers(farm: Farm, done:
     begun.send_signal(signal.SIGTERM)
     said, _ = begun.communicate(timeout=60)
     assert begun.returncode == 130, said
-    assert "the same command continues with them" in said
+    assert "runs are left; the same command continues" in said
     call(farm, *SHORT, "--out", "side")
     assert hashes(farm.folder / "side").items() <= hashes(done.folder / "side").items()
     assert len(hashes(farm.folder / "side")) == 6
