@@ -1,6 +1,6 @@
 """Every algorithm with every policy, each with the same budget, on the gait and three environments; one table each.
 
-    python benchmarks/learners.py [--tasks gait,Reacher-v5] [--seeds 5] [--out FILE.jsonl]
+    python benchmarks/learners.py [--tasks gait,Reacher-v5] [--policies linear] [--seeds 5] [--out FILE.jsonl]
 
 Nothing is tuned: each policy has the same start and initial sigma with all algorithms. Population and learning rates
 are the algorithms' defaults, and PGPE is that of Toklu 2020 (ranks, ClipUp with a speed derived from sigma). The seeds
@@ -106,6 +106,7 @@ def main() -> None:
     """Learn, and print a table for each task."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", default=",".join(TASKS))
+    parser.add_argument("--policies", help="only these, for example mlp,rbf")
     parser.add_argument("--first", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, help="file to which each row's numbers are added, as a line of JSON")
@@ -115,7 +116,10 @@ def main() -> None:
         task, budget, policies = TASKS[name]
         print(f"\n{name}, {budget} rollouts, seeds {numbers[0]} to {numbers[-1]}\n")
         print(f"| policy | {' | '.join(ALGORITHMS)} |\n|---|{'---|' * len(ALGORITHMS)}")
-        for policy, start in policies.items():
+        for policy in arguments.policies.split(",") if arguments.policies else policies:
+            if policy not in policies:
+                parser.error(f"{name} has no policy {policy!r}; it has {', '.join(policies)}")
+            start = policies[policy]
             cells = []
             for algorithm, own in ALGORITHMS.items():
                 found = _row(task, budget, {"policy": policy, "algorithm": algorithm, **own, **start}, numbers)

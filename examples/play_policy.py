@@ -19,6 +19,7 @@ SINE = (
     *(2.7314447669863995e-15, -7.643970296798572e-13, 1.6058977312464087e-10, -2.5052107616996182e-08),
     *(2.7557319219163234e-06, -0.00019841269841254974, 0.008333333333333316, -0.16666666666666666),
 )
+TURNS = np.array([-39.759827, 76.58117, -81.60248, 41.341682, -6.2831855], dtype=np.float32)
 COTH = (-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 / 6, 2.0)
 
 
@@ -28,6 +29,12 @@ def cos(x: np.ndarray) -> np.ndarray:
     r = (k + 0.5) * PI[0] - x + (k + 0.5) * PI[1] + (k + 0.5) * PI[2]
     r = np.where(k % 2 == 0, r, -r)
     return r + np.polyval(SINE, r * r) * (r * r) * r
+
+
+def cos_turns(x: np.ndarray) -> np.ndarray:
+    """cos(2 pi x) in single precision, with the same bits on every processor."""
+    s = np.abs(x - np.rint(x)) - 0.25
+    return np.polyval(TURNS, s * s) * s
 
 
 def exp(x: np.ndarray) -> np.ndarray:
@@ -67,10 +74,12 @@ class Policy:
         self.bandwidth = self.config.get("bandwidth")
         self.theta = self.p["mu"] if self.p["policy"] in ("rbf", "mlp") else self.p["mu"].reshape(8, -1)
         if "frequencies" in self.p:
-            self.rows = np.ascontiguousarray((self.p["frequencies"] / self.bandwidth).T)  # one per state component
-        if self.p["policy"] in ("projected", "cosine"):
+            single = self.config["precision"] == "single"
+            self.kind, self.cos, unit = (np.float32, cos_turns, 2.0 * math.pi) if single else (np.float64, cos, 1.0)
+            rows = np.ascontiguousarray((self.p["frequencies"] / self.bandwidth).T)  # one per state component
+            self.rows, self.phases = (rows / unit).astype(self.kind), (self.p["phases"] / unit).astype(self.kind)
             maps = {"projected": lambda rows: np.stack([self.features(row) for row in rows]), "cosine": cos}
-            self.theta = maps[self.p["policy"]](self.theta)
+            self.theta = maps.get(self.p["policy"], np.copy)(self.theta).astype(self.kind)
 
     def reset(self) -> None:
         """Set the moment of release: only the fingers hold the object."""
@@ -110,14 +119,14 @@ class Policy:
                 out = (np.ascontiguousarray(rows[:, :-1]) * x).sum(axis=-1) + rows[:, -1]
                 x = tanh(out)
             return out
-        return (theta * self.features(x)).sum(axis=-1)
+        return (theta * self.features(x)).sum(axis=-1).astype(float)
 
     def features(self, x: np.ndarray) -> np.ndarray:
         """Random Fourier features z(x), (d,) -> (D,)."""
-        angle = self.p["phases"].copy()
-        for row, value in zip(self.rows, x, strict=True):
+        angle = self.phases.copy()
+        for row, value in zip(self.rows, x.astype(self.kind), strict=True):
             angle += row * value
-        return np.sqrt(2.0 / len(angle)) * cos(angle)
+        return self.kind(np.sqrt(2.0 / len(angle))) * self.cos(angle)
 
     def feel(self) -> tuple[np.ndarray, np.ndarray, bool]:
         """Taxels (3, 18) [N], centres of force (3, 3) [fingertip radii], and whether there is any contact."""

@@ -12,8 +12,11 @@ Arguments are reduced with a constant split into short parts, whose products wit
     exp(r) = 1 + 2 r / (r coth(r/2) - r), |r| <= ln(2) / 2; r coth(r/2) = 2 + sum B_2k z^k 2 / (2k)! with the Bernoulli
              numbers B_2k (the series that defines them), up to z^6: what is left out is below 1e-17
 
+    cos_turns(x) = -s P(s^2), s = |x - rint(x)| - 1/4; P interpolates sin(2 pi s) / s likewise, at the five nodes of
+             0 <= s^2 <= 1/16: its own error is below 1e-8
+
 Errors, held by `tests/unit/farm/test_elementary.py`: below 1.5 units in the last place for exp, 2.5 for
-cos and sin, 3 for tanh.
+cos and sin, 3 for tanh; 2e-7 for cos_turns.
 """
 
 import math
@@ -22,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm.arrays import AnyArray, FloatArray
 
 _BLOCK: Final = 8192  # elements per block: they and the intermediate results stay in a core's cache
 
@@ -42,6 +45,11 @@ _EVEN, _ODD = _constants(1.5 * 2.0**52, 1.5 * 2.0**52 + 1.0)  # last bit of a wh
 _LAST_TO_SIGN: Final = np.array(63)
 _LARGE: Final = 1e6  # above this, products with the parts of pi are not exact
 
+_QUARTER: Final = np.array(0.25, dtype=np.float32)
+_TURNS: Final = tuple(
+    np.array(value, dtype=np.float32) for value in (-39.759827, 76.58117, -81.60248, 41.341682, -6.2831855)
+)
+
 _LN2: Final = _constants(*map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
 _COTH: Final = _constants(-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 / 6, 2.0)
 _DOUBLINGS, _ONE, _TWO = _constants(float.fromhex("0x1.71547652b82fep+0"), 1.0, 2.0)
@@ -59,7 +67,7 @@ def tanh(x: FloatArray) -> FloatArray:
     return _blockwise(_tanh, x)
 
 
-def cos(x: FloatArray) -> FloatArray:
+def cos(x: AnyArray) -> FloatArray:
     """Cosine of any array [rad], (...) -> (...); nan for elements that are not finite."""
     return _blockwise(_cos, x)
 
@@ -69,7 +77,20 @@ def sin(x: FloatArray) -> FloatArray:
     return _blockwise(_sin, x)
 
 
-def _blockwise(function: Callable[[FloatArray, FloatArray], None], x: FloatArray) -> FloatArray:
+def cos_turns(x: AnyArray) -> AnyArray:
+    """cos(2 pi x) of any array of float32, (...) -> (...); nan for elements that are not finite."""
+    with np.errstate(invalid="ignore"):
+        out = np.rint(x)
+        np.subtract(x, out, out=out)  # exact
+        np.abs(out, out=out)
+        out -= _QUARTER
+        value = np.empty_like(out)
+        _polynomial(_TURNS, out * out, value)
+        value *= out
+    return value
+
+
+def _blockwise(function: Callable[[FloatArray, FloatArray], None], x: AnyArray) -> FloatArray:
     """Call function(x, out) on parts of at most _BLOCK elements."""
     flat = np.asarray(x, dtype=np.float64).ravel()
     out = np.empty(flat.size)
@@ -155,7 +176,7 @@ def _sine(x: FloatArray, half_turns: FloatArray, odd: FloatArray, out: FloatArra
     out += odd
 
 
-def _polynomial(coefficients: tuple[FloatArray, ...], z: FloatArray, out: FloatArray) -> None:
+def _polynomial(coefficients: tuple[AnyArray, ...], z: AnyArray, out: AnyArray) -> None:
     """Horner's scheme, the highest power's coefficient first."""
     np.multiply(z, coefficients[0], out=out)
     for coefficient in coefficients[1:-1]:

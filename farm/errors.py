@@ -5,7 +5,7 @@ FarmError                 anything that can be explained in one line
     CheckpointError       a run folder that cannot be continued or read
     UnservedError         a run that this machine's workers do not know, lack something for, or may not serve
   MessageError            bytes from the network that are no valid message
-  TaskError               a user's task or policy whose arrays make no sense (exit status 1)
+  TaskError               a task, policy, algorithm or engine with invalid results (exit status 1)
   RunError                a run that cannot continue (exit status 1)
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
@@ -66,7 +66,7 @@ class UnservedError(ConfigError):
 
 
 class TaskError(FarmError):
-    """A task or policy with invalid arrays: names the array, its value and what was expected."""
+    """A task, policy, algorithm or engine with invalid results: names the result, its value and what was expected."""
 
 
 class RunError(FarmError):

@@ -1,13 +1,13 @@
 """Builds a run's simulation from its specification and runs jobs; for workers and learners."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from farm import plugins, settings
-from farm.arrays import FloatArray, IntArray
+from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, UnservedError
 from farm.moments import usable
 from farm.net.messages import Spec
@@ -18,7 +18,7 @@ from farm.sim.engines import BatchEngine
 from farm.sim.scene import Scene, quiet
 from farm.sim.sim import Backend, MakeEngine, Sim
 from farm.tasks import loop
-from farm.tasks.base import Task
+from farm.tasks.base import Task, TaskSpec
 
 SIMULATION = "farm.tasks.loop"
 """The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
@@ -47,7 +47,7 @@ class Runner:
     @property
     def size(self) -> int:
         """Parameters of the policy, P."""
-        return self.policy.size
+        return int(self.policy.size)  # a class of one's own may give numpy's integers
 
     def run(
         self, mu: FloatArray, jobs: Jobs, traces: str = "none", normaliser: FloatArray = NOT_NORMALISED
@@ -68,34 +68,39 @@ class Runner:
         kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: has its own normaliser
         if self._judge is not self.sim:
             kinds[(jobs.seen | ~jobs.explores) & ~jobs.physics] = 3  # like 0, but on the processor
-        kind_of, there = np.repeat(kinds, jobs.rollouts), set(kinds.tolist())
-        returns, flags = np.zeros(len(theta)), np.zeros((len(theta), 4), dtype=bool)
-        steps = np.zeros(len(theta), dtype="<i8")
-        moments = np.zeros((len(theta), 1 + 2 * wanted) if wanted else (0, 0))
+        kind_of, there = np.repeat(kinds, jobs.rollouts), sorted(set(kinds.tolist()))
         seen: dict[int, WireTrajectory] = {}
-        done: list[tuple[IntArray, loop.Rollouts]] = []
-        for kind, policy in enumerate((*policies, policies[0])):
-            if kind not in there:
-                continue
+        done: list[_Part] = []
+        for kind in there:
             rows, physics = np.flatnonzero(kind_of == kind), kind in (1, 2)
+            some = (theta, seeds) if len(there) == 1 else (theta[rows], [seeds[row] for row in rows.tolist()])
             rollouts = loop.run(
-                self.task, policy, self._judge if kind else self.sim, theta[rows], [seeds[r] for r in rows.tolist()],
-                int(physics), moments=bool(wanted) and not physics,
+                self.task, policies[kind % 3], self._judge if kind else self.sim, *some, int(physics),
+                moments=bool(wanted) and not physics,
             )  # fmt: skip
-            returns[rows], flags[rows], steps[rows] = rollouts.returns, rollouts.flags, rollouts.steps
-            if rollouts.moments.size:
-                moments[rows] = np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
             for job in np.flatnonzero(jobs.seen & (kinds == kind)).tolist():
                 first = int(jobs.rollouts[:job].sum())
                 seen[job] = WireTrajectory.of(self.trajectory(rollouts, int(np.searchsorted(rows, first))))
             done.append((rows, rollouts))
+        returns = _placed(done, lambda part: part.returns)
         chosen = traced(traces if self.spec.traced else "none", returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        return Simulated(
+            returns,
+            _placed(done, lambda part: part.flags),
+            _placed(done, lambda part: part.steps),
+            self._traces(done, chosen),
+            tuple(seen[job] for job in sorted(seen)),
+            _placed(done, lambda part: _moments(part, wanted)) if wanted else np.empty((0, 0)),
+        )
+
+    def _traces(self, done: "list[_Part]", chosen: IntArray) -> AnyArray:
+        """Traces of the chosen rollouts, (K, T, N)."""
         values = np.zeros((len(chosen), *self.spec.trace), dtype="<f4")
-        for rows, rollouts in done:
+        for rows, rollouts in done if len(chosen) else ():
             mine = np.isin(chosen, rows)
             if mine.any():
                 values[mine] = loop.traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
-        return Simulated(returns, flags, steps, values, tuple(seen[job] for job in sorted(seen)), moments)
+        return values
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy, Policy]:
         """Policies for jobs at control rate, at physics rate, and with parameters of their own."""
@@ -120,6 +125,28 @@ class Runner:
             sim.engine.close()
 
 
+_Part: TypeAlias = tuple[IntArray, loop.Rollouts]
+"""Some of a call's rollouts: their rows, and their results."""
+
+
+def _placed(parts: list[_Part], values: Callable[[loop.Rollouts], AnyArray]) -> AnyArray:
+    """Values of all rollouts (S, ...), from those of each part."""
+    found = [values(rollouts) for _, rollouts in parts]
+    if len(parts) == 1:  # the usual case: its rows are all rows
+        return found[0]
+    out = np.empty((sum(map(len, found)), *found[0].shape[1:]), found[0].dtype)
+    for (rows, _), each in zip(parts, found, strict=True):
+        out[rows] = each
+    return out
+
+
+def _moments(rollouts: loop.Rollouts, size: int) -> FloatArray:
+    """Moments of the observations (n, 1 + 2 d) as they are sent: zeros for those that failed or have none."""
+    if not rollouts.moments.size:
+        return np.zeros((len(rollouts.returns), 1 + 2 * size))
+    return np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
+
+
 def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
     """The task and the policy of a run that a learner specified; these files may be served.
 
@@ -138,7 +165,7 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
                 f"the run uses {spec.task} of {spec.task_release}, but {sizes.release} is installed here"
             )
         config = settings.from_dict(policy_class.target.Config, spec.policy_config, spec.policy)
-        return task, policy_class.target(config, sizes, spec.constants)
+        return task, build_policy(policy_class, config, sizes, spec.constants)
     except UnservedError:
         raise
     except ConfigError as error:
@@ -148,11 +175,28 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
 def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping[str, str] | None) -> Task:
     """A task from its class, the settings in a table, and the run's texts."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
+    return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
+
+
+def build_policy(plugin: plugins.Plugin, config: Any, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> Policy:  # noqa: ANN401
+    """A policy from its class, its settings, the task's sizes and the run's constants.
+
+    Raises:
+      ConfigError: it cannot be constructed, or its size is invalid.
+    """
+    policy = cast("Policy", _constructed(plugin, "config, spec and constants", config, spec, constants))
+    size: object = policy.size
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
+        raise ConfigError(f"size of {plugin.wire} is {size!r}; expected a whole number of at least 1")
+    return policy
+
+
+def _constructed(plugin: plugins.Plugin, arguments: str, *values: Any) -> Any:  # noqa: ANN401
     try:
-        return cast("Task", plugin.target(config, plugin.variant, files))
+        return plugin.target(*values)
     except TypeError as error:
         if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # the error is in the call itself
-            raise ConfigError(f"{plugin.wire}: its __init__ must take config, variant and files ({error})") from None
+            raise ConfigError(f"{plugin.wire}: its __init__ must take {arguments} ({error})") from None
         raise
 
 
@@ -181,6 +225,8 @@ def backend(name: str) -> Backend:
     target = plugins.find("backends", name).target
     if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
         raise ConfigError(f"{name} is no backend: it needs capacity and engine(model)")
+    if type(target.capacity) is not int or target.capacity < 1:
+        raise ConfigError(f"capacity of {name} is {target.capacity!r}; expected a whole number of at least 1")
     return cast("Backend", target())
 
 

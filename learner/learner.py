@@ -19,6 +19,7 @@ from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.work import Jobs
 from farm.tasks.base import Task
+from learner import algorithms
 from learner import config as configs
 from learner.algorithms import Algorithm, SearchState
 from learner.checkpoint import BestRollout, Checkpoint
@@ -112,7 +113,7 @@ class Learner:
             returns = results.returns[:rollouts].reshape(len(eps), len(self._signs))
             before = self.state
             told = learnt_from(self.config, self.problem.task, returns, results.steps[:rollouts])
-            self.state = self._algorithm.tell(before, eps, told)
+            self.state = algorithms.tell(self._algorithm, before, eps, told)
             self._note(before, eps, results, told, time.monotonic() - begun, farm)
             if not self.over:
                 eps = self._explore(farm)
@@ -289,7 +290,7 @@ class Learner:
 def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[FloatArray, Jobs]:
     """A generation's eps, (rows, P), and its exploring jobs: all its random numbers, seeded by its number."""
     algorithm = config.algorithm_of(pairs)
-    eps = algorithm.ask(state, seeds.exploration(config.seed, state.generation))
+    eps = algorithms.ask(algorithm, state, seeds.exploration(config.seed, state.generation))
     drawn = None
     if config.task_config.perturb:
         drawn = [seeds.training(config.seed, state.generation, i) for i in range(len(eps))]

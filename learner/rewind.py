@@ -19,6 +19,7 @@ from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.moments import merged, normaliser
 from farm.tasks.loop import Rollouts, Seed
+from learner import algorithms
 from learner import checkpoint as checkpoints
 from learner.algorithms import SearchState
 from learner.checkpoint import Checkpoint
@@ -167,7 +168,7 @@ def _learnt_again(folder: RunFolder, at: Checkpoint, until: int) -> tuple[Search
         eps, jobs = explored(config, state, pairs)
         found = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
         told = learnt_from(config, problem.task, found.returns.reshape(len(eps), -1), found.steps)
-        state, moments = config.algorithm_of(pairs).tell(state, eps, told), merged(moments, found.moments)
+        state, moments = algorithms.tell(config.algorithm_of(pairs), state, eps, told), merged(moments, found.moments)
         pairs = config.pairs_after(pairs, int(found.steps.sum()))
     runner.close()
     return state, normaliser(moments)

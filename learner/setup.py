@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,10 +14,11 @@ from farm.errors import CheckpointError, ConfigError
 from farm.net.messages import Spec
 from farm.policies.base import Policy
 from farm.policies.fourier import Kernel, Projected
-from farm.rollouts import Runner, build_task
+from farm.rollouts import Runner, build_policy, build_task
 from farm.sim.scene import Scene
 from farm.tasks.base import Task, TaskSpec
 from farm.tasks.standard import nominal, standard
+from learner import algorithms
 from learner import checkpoint as checkpoints
 from learner import config as configs
 from learner.algorithms import SearchState
@@ -102,15 +103,22 @@ def problem(
     spec = task.spec()
     if config.stop_when_solved is not None and not spec.success:
         raise ConfigError(f"--stop-when-solved: {config.task} knows returns, but no success")
-    kind = plugins.find("policies", config.policy).target
+    plugin = plugins.find("policies", config.policy)
+    kind = plugin.target
     if constants is None:
         constants = kind.draw(config.policy_config, spec, seeds.features(config.seed))
+        if not isinstance(constants, dict) or not all(_is_constant(values) for values in constants.values()):
+            raise ConfigError(f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name")
         if kind.standardised:
             own: Any = config.policy_config
             constants = constants | standard(task, own.weight_scale)
-    found = Problem(config, task, spec, cast("Policy", kind(config.policy_config, spec, constants)))
+    found = Problem(config, task, spec, build_policy(plugin, config.policy_config, spec, constants))
     _check_size(found)
     return found
+
+
+def _is_constant(values: object) -> bool:
+    return isinstance(values, np.ndarray) and values.dtype == np.float64 and bool(np.isfinite(values).all())
 
 
 def _check_size(found: Problem) -> None:
@@ -175,7 +183,7 @@ def start(config: RunConfig, run: str) -> tuple[Problem, Checkpoint]:
     """
     other = None if config.init_from is None else _other(config)
     begun = problem(config, other.constants if other else None)
-    state = config.algorithm_config.init(begun.policy.size)
+    state = algorithms.begin(config.algorithm_config, begun.policy.size)
     if other is not None:
         state = _taken_over(config, state, other)
     moments = np.zeros(1 + 2 * begun.spec.observation if config.policy_config.normalise else 0)

@@ -246,12 +246,12 @@ class Worker:
             text = f"no learner on farm {self._config.farm}; learners are on {', '.join(sorted(seen))}: see --farm"
             self._tell(logging.WARNING, text)
 
-    def _tell(self, level: int, text: str) -> None:
-        """Log a message once."""
+    def _tell(self, level: int, text: str, error: Exception | None = None) -> None:
+        """Log a message once, perhaps with an error's traceback."""
         text = brief(text)
         if text not in self._told and len(self._told) < _TELL:
             self._told.add(text)
-            log.log(level, "%s", text)
+            log.log(level, "%s", text, exc_info=error)
 
     def _begin(self, header: RoundHeader, *, asked: bool = False) -> None:
         """Start a new round and drop work of older ones. A header that we asked for overrides published ones."""
@@ -355,8 +355,10 @@ class Worker:
             runner.close()
             self._runners[header.spec] = error
             self._fail(chunk, None, error)
-        except Exception:  # other workers may succeed: the learner decides
-            log.exception("a chunk of run %s failed; trying its jobs one by one", chunk.run)
+        except Exception as error:  # other workers may succeed: the learner decides
+            text = f"a chunk of run {chunk.run} failed ({type(error).__name__}: {error}); trying its jobs one by one"
+            ours = _ours(error)
+            self._tell(logging.ERROR if ours else logging.INFO, text, error if ours else None)
             for at, index in enumerate(jobs.indices.tolist()):
                 try:
                     self._do(chunk, runner, header, jobs.take([at]))
@@ -384,7 +386,7 @@ class Worker:
                 self._runners[header.spec] = made
                 log.info("serving run %s", header.run)
             except Exception as error:  # reported to the learner, which decides
-                log.error("cannot serve run %s: %s", header.run, error, exc_info=not isinstance(error, FarmError))
+                self._tell(logging.ERROR, f"cannot serve run {header.run}: {error}", error if _ours(error) else None)
                 if not isinstance(error, FarmError):
                     return error  # perhaps short of memory: it may work later
                 self._runners[header.spec] = error
@@ -450,6 +452,11 @@ class Worker:
             ignored=dict(self._ignored),
         )
         self._session.publish(keys.want(self._config.farm, self.id), codec.encode(message), urgent=not idle)
+
+
+def _ours(error: Exception) -> bool:
+    """Whether an error is a defect of the farm: others are in the author's code, and its learner shows where."""
+    return not isinstance(error, FarmError) and not plugins.author_traceback(error)
 
 
 def _belongs(chunk: Chunk, header: RoundHeader | None) -> bool:

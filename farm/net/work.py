@@ -141,19 +141,16 @@ class Jobs:
 
     def theta(self, mu: FloatArray) -> FloatArray:
         """Parameters of each rollout around a mean (P,): origin + sign * eps, (S, P)."""
-        origin = np.where(self.table[:, _AROUND, None] != 0, mu, 0.0)
         rows = np.repeat(np.arange(len(self)), self.rollouts)
         signs = self.table[:, _SIGN]
-        signs = signs[signs != 0]
-        out = origin[rows]
-        explores = self.table[rows, _EXPLORES] != 0
+        signs = signs[signs != 0][:, None]
+        out = np.where(self.around[rows, None], mu, 0.0)
+        explores = self.explores[rows]
         if explores.all():  # the usual case
-            out += signs[:, None] * self.eps[rows]
-            return out
-        if not explores.any():  # eps may have no columns then
-            return out
-        at = np.cumsum(self.table[:, _EXPLORES]) - 1  # row of each job's eps
-        out[explores] += signs[explores, None] * self.eps[at[rows[explores]]]
+            out += signs * self.eps[rows]
+        elif explores.any():  # otherwise eps may have no columns
+            at = np.cumsum(self.table[:, _EXPLORES]) - 1  # row of each job's eps
+            out[explores] += signs[explores] * self.eps[at[rows[explores]]]
         return out
 
     def take(self, chosen: Sequence[int]) -> "Jobs":

@@ -9,19 +9,19 @@ One action a_i for each of A controlled joints or actuators:
 
     z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
 
-Numpy's exp and cos depend on the processor. So the kernel uses the C library's exp, and the features the cos of
-`farm/elementary.py`.
+Numpy's exp and cos depend on the processor. So the kernel uses the C library's exp, and the features the cosines of
+`farm/elementary.py`: in single precision the cheaper one of turns, for which W / h and c are divided by 2 pi.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from farm import elementary
-from farm.arrays import FloatArray
+from farm.arrays import AnyArray, FloatArray
 from farm.policies.base import Policy, PolicyConfig, check_constants
 from farm.settings import setting
 from farm.tasks.base import TaskSpec
@@ -41,6 +41,8 @@ class FeaturesConfig(KernelConfig):
 
     features: int = setting(8000, least=1, most=10_000_000)
     """Number of random Fourier features, D."""
+    precision: Literal["double", "single"] = "double"
+    """Number format of the features: single takes half the time and changes actions by about 1e-6."""
 
 
 class Kernel(Policy):
@@ -74,9 +76,13 @@ class Direct(Policy):
         super().__init__(config, spec, constants)
         count = self.config.features
         check_constants(constants, {"frequencies": (count, spec.observation), "phases": (count,)})
+        single = self.config.precision == "single"
+        self._cos, unit = (elementary.cos_turns, 2.0 * math.pi) if single else (elementary.cos, 1.0)
+        self._dtype = np.dtype("<f4" if single else "<f8")
         # One contiguous row per number of x: W x is then d multiply-adds of (D,) vectors, in order.
-        self._rows = np.ascontiguousarray((constants["frequencies"] / self.config.bandwidth).T)
-        self._scale = np.sqrt(2.0 / count)
+        rows = np.ascontiguousarray((constants["frequencies"] / self.config.bandwidth).T)
+        given = rows / unit, constants["phases"] / unit, np.sqrt(2.0 / count)
+        self._rows, self._phases, self._scale = (np.asarray(values, dtype=self._dtype) for values in given)
 
     @classmethod
     def draw(cls, config: PolicyConfig, spec: TaskSpec, rng: np.random.Generator) -> dict[str, FloatArray]:
@@ -90,24 +96,29 @@ class Direct(Policy):
         """A times D."""
         return self.spec.action * len(self.constants["phases"])
 
-    def prepare(self, theta: FloatArray) -> FloatArray:
-        """Weights of the features, (B, A, D)."""
-        return _by_action(theta, self.spec.action)
+    def prepare(self, theta: FloatArray) -> AnyArray:
+        """Weights of the features, (B, A, D), in their precision."""
+        return self._rounded(_by_action(theta, self.spec.action))
 
-    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+    def act(self, prepared: AnyArray, x: FloatArray) -> FloatArray:
         """Actions; may be huge or not finite."""
         weights = np.ascontiguousarray(prepared)  # a different memory order would change the rounding of sums
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.stack([(w * self.features(row)).sum(axis=-1) for w, row in zip(weights, x, strict=True)])
+            rows = [(w * self.features(row)).sum(axis=-1) for w, row in zip(weights, x, strict=True)]
+            return np.stack(rows).astype(np.float64, copy=False)
 
-    def features(self, x: FloatArray) -> FloatArray:
-        """z(x) of one observation, (d,) -> (D,)."""
-        angle = self.constants["phases"].copy()
+    def features(self, x: FloatArray) -> AnyArray:
+        """z(x) of one observation, (d,) -> (D,), in their precision."""
+        angle = self._phases.copy()
         product = np.empty_like(angle)
-        for row, value in zip(self._rows, x, strict=True):
+        for row, value in zip(self._rows, self._rounded(x), strict=True):
             np.multiply(row, value, out=product)
             angle += product
-        return self._scale * elementary.cos(angle)
+        return self._scale * self._cos(angle)
+
+    def _rounded(self, values: FloatArray) -> AnyArray:
+        with np.errstate(over="ignore"):
+            return values.astype(self._dtype, copy=False)
 
 
 class Projected(Direct):
@@ -118,8 +129,8 @@ class Projected(Direct):
         """A times d."""
         return self.spec.action * self.spec.observation
 
-    def prepare(self, theta: FloatArray) -> FloatArray:
-        """Features of the parameters, (B, A, D)."""
+    def prepare(self, theta: FloatArray) -> AnyArray:
+        """Features of the parameters, (B, A, D), in their precision."""
         with np.errstate(over="ignore", invalid="ignore"):
             joints = _by_action(theta, self.spec.action)
             return np.stack([[self.features(joint) for joint in rollout] for rollout in joints])
@@ -128,10 +139,10 @@ class Projected(Direct):
 class Cosine(Direct):
     """Bounded weights of random features: a_i = cos(theta_i) . z(x) (thesis 5.2)."""
 
-    def prepare(self, theta: FloatArray) -> FloatArray:
-        """Weights of the features, (B, A, D)."""
+    def prepare(self, theta: FloatArray) -> AnyArray:
+        """Weights of the features, (B, A, D), in their precision."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return elementary.cos(_by_action(theta, self.spec.action))
+            return self._rounded(elementary.cos(_by_action(theta, self.spec.action)))
 
 
 def gaussian_exponents(centres: FloatArray, x: FloatArray, bandwidth: float) -> FloatArray:

@@ -51,6 +51,7 @@ class Channel:
     """Whether its values are sent with results: of the best and the worst rollout of a generation, or of all."""
 
     def __post_init__(self) -> None:
+        self._check_types()
         sizes = {"scalars": 1, "flags": 1, "images": 3, "arrows": 2, "points": 2}
         if self.kind not in sizes or len(self.shape) != sizes[self.kind]:
             raise ConfigError(f"channel {self.name}: kind {self.kind!r} of shape {self.shape}; see Channel.kind")
@@ -76,6 +77,21 @@ class Channel:
                     f"channel {self.name}: limits {limits!r} of {label!r}; expected two rising finite numbers for "
                     f"scalars, by label: {', '.join(self.names)}"
                 )
+
+    def _check_types(self) -> None:
+        """Check the types of what a task declares."""
+        if not isinstance(self.name, str) or not self.name:
+            raise ConfigError(f"channel {self.name!r}: its name must be a text")
+        shape: object = self.shape
+        if not isinstance(shape, tuple | list) or not all(type(each) is int for each in shape):
+            raise ConfigError(f"channel {self.name}: shape is {shape!r}; expected a tuple of whole numbers, as (3,)")
+        for what in ("labels", "bodies", "geoms"):
+            given: object = getattr(self, what)
+            if not isinstance(given, tuple | list) or not all(isinstance(each, str) for each in given):
+                raise ConfigError(f"channel {self.name}: {what} is {given!r:.60}; expected a tuple of texts")
+        for colour in self.colours:
+            if not isinstance(colour, tuple | list) or len(colour) != 3 or not all(c in range(256) for c in colour):
+                raise ConfigError(f"channel {self.name}: colour {colour!r}; expected red, green, blue from 0 to 255")
 
     @property
     def names(self) -> tuple[str, ...]:

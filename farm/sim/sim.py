@@ -9,7 +9,7 @@ While a rollout is prepared the arrays are writable views; afterwards they are r
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -25,6 +25,7 @@ class Rebound(Exception):  # noqa: N818  not an error
     """An output of the simulator was requested for the first time: the batch is restarted, now with its values."""
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Simulates rows of states of one model. Made by a backend, or by the task itself."""
 
@@ -90,7 +91,11 @@ class Sim:
     """A batch of rollouts in an engine."""
 
     def __init__(self, engine: Engine) -> None:
-        """Use an engine; call `begin` next."""
+        """Use an engine; call `begin` next. A TaskError if it is none."""
+        if not isinstance(engine, Engine):
+            names = [*Engine.__annotations__, *(name for name in vars(Engine) if not name.startswith("_"))]
+            missing = ", ".join(name for name in names if not hasattr(engine, name))
+            raise TaskError(f"the backend gave a {type(engine).__name__}, which is no engine: it has no {missing}")
         self.engine = engine
         self.own: dict[str, AnyArray] = {}
         """The task's memory for each rollout, (B, ...); rows stay with their rollouts when other rollouts end."""

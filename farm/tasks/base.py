@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
@@ -233,7 +234,7 @@ class Task:
 
     # What other code knows of it
 
-    @property
+    @cached_property
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Smallest and largest control of each actuator, (nu,) each; -1 and 1 if it has no range."""
         limited = self.model.actuator_ctrllimited.astype(bool)

@@ -134,7 +134,7 @@ class Environment(Task):
         """An environment has no text of its own: always a ConfigError."""
         raise ConfigError(f"gym:{self.variant} is made by gymnasium: there is no MJCF text to export")
 
-    @property
+    @cached_property
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Smallest and largest action, (A,) each."""
         space: Any = self._first.action_space

@@ -9,12 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
+import mujoco
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, TaskError
 from farm.moments import Moments
-from farm.sim.channels import Camera
+from farm.sim.channels import Camera, Channel
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import Scene, quiet
 from farm.sim.sim import Rebound, Sim
@@ -116,7 +117,10 @@ class Batch:
         """Observations of the active rollouts, (n, d)."""
         x = self.task.observe(self.sim)
         self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
-        return _array("observe", x, (len(self.sim), self._width))
+        x = _array("observe", x, (len(self.sim), self._width))
+        if not np.isfinite(x).all():
+            raise TaskError(f"observe is not finite before control step {self.sim.t + 1}, though the physics is fine")
+        return x
 
     def step(self, action: FloatArray) -> None:
         """One control step of the active rollouts, with raw actions (n, A)."""
@@ -247,7 +251,8 @@ def _run(
     moments: bool,
 ) -> Rollouts:
     batch, seen = Batch(task, sim, seeds, every), None
-    all_prepared = prepared = policy.prepare(theta)
+    prepared = policy.prepare(theta)
+    all_prepared = prepared = _array("prepare of the policy", prepared, (len(theta), *np.shape(prepared)[1:]))
     while not batch.over:
         if len(batch.active) < len(prepared):
             prepared = all_prepared[batch.active]
@@ -346,8 +351,6 @@ def probe(task: Task) -> TaskSpec:
         task.setup(sim)
         batch = Batch(task, sim, [None])
         x = batch.observe()
-        if not np.isfinite(x).all():
-            raise TaskError("observe is not finite at the nominal start")
         with np.errstate(all="ignore"):
             batch.step(np.zeros((1, sim.model.nu)))
             _check_channels(task, batch._frames)
@@ -378,6 +381,12 @@ def _check_class(task: Task) -> None:
             raise ConfigError(f"task {name}: {what} is {value!r}; expected a whole number from 1 to {most}")
     if task.camera is not None and not isinstance(task.camera, Camera):
         raise ConfigError(f"task {name}: camera is {task.camera!r}; expected a farm.Camera")
+    channels: object = task.channels
+    if not isinstance(channels, tuple | list) or not all(isinstance(each, Channel) for each in channels):
+        raise ConfigError(f"task {name}: channels is {channels!r:.60}; expected a tuple of farm.Channel")
+    for geom in (geom for channel in task.channels for geom in channel.geoms):
+        if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
+            raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
     if not task.model.nu:
         raise ConfigError(f"task {name}: its model has no actuator, so that there is nothing to learn")
     for method in ("setup", "prepare", "reset", "observe", "act", "reward", "ended", "success", "measure", "score"):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_chec
 import numpy as np
 
 from farm.arrays import FloatArray
+from farm.errors import TaskError
 from learner.algorithms.pgpe import PGPE, PGPEState
 from learner.algorithms.state import Diverged, SearchState, StateValue
 
@@ -39,3 +40,51 @@ class Algorithm(Protocol[State]):
 
     def tell(self, state: State, eps: FloatArray, returns: FloatArray) -> State:
         """Return the state after one update, from returns (rows, signs); raises Diverged if it would not be finite."""
+
+
+def begin(algorithm: Algorithm[Any], size: int) -> SearchState:
+    """The algorithm's state before the first generation, of `size` parameters.
+
+    Raises:
+      TaskError: it, or the algorithm's signs, are invalid.
+    """
+    signs = algorithm.signs()
+    if signs not in ((1,), (1, -1)):
+        raise TaskError(f"signs of {type(algorithm).__name__} gave {signs!r}; expected (1,) or (1, -1)")
+    return _checked(algorithm, "init", algorithm.init(size), size, 0)
+
+
+def ask(algorithm: Algorithm[Any], state: SearchState, rng: np.random.Generator) -> FloatArray:
+    """The perturbations of a generation, (rows, P).
+
+    Raises:
+      TaskError: they have another shape, or are not finite.
+    """
+    eps = algorithm.ask(state, rng)
+    if not isinstance(eps, np.ndarray) or eps.dtype.kind != "f" or eps.shape[1:] != state.mu.shape or not len(eps):
+        got = f"an array of {eps.dtype} {eps.shape}" if isinstance(eps, np.ndarray) else f"a {type(eps).__name__}"
+        expected = f"expected numbers of shape (rows, {state.mu.size})"
+        raise TaskError(f"ask of {type(algorithm).__name__} gave {got}; {expected}")
+    if not np.isfinite(eps).all():
+        raise TaskError(f"ask of {type(algorithm).__name__} is not finite in generation {state.generation}")
+    return np.ascontiguousarray(eps, dtype=np.float64)
+
+
+def tell(algorithm: Algorithm[Any], state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
+    """The state after one update, from returns (rows, signs).
+
+    Raises:
+      TaskError: it is invalid; Diverged: it would not be finite.
+    """
+    after = algorithm.tell(state, eps, returns)
+    return _checked(algorithm, "tell", after, state.mu.size, state.generation + 1)
+
+
+def _checked(algorithm: Algorithm[Any], method: str, state: object, size: int, generation: int) -> SearchState:
+    where = f"{method} of {type(algorithm).__name__} gave"
+    if not isinstance(state, SearchState):
+        raise TaskError(f"{where} a {type(state).__name__}; expected a farm.SearchState")
+    if (state.mu.size, state.generation) != (size, generation):
+        got = f"{state.mu.size} parameters in generation {state.generation}"
+        raise TaskError(f"{where} a state of {got}; expected {size} in generation {generation}")
+    return state

@@ -133,7 +133,7 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
                 assert f"serving run {name}" in said
 
 
-def test_who_was_not_told_to_accept_code_says_which_flag(farm: Farm, certs: Path, router: str, task: Path) -> None:
+def test_a_worker_without_accept_code_says_which_flag(farm: Farm, certs: Path, router: str, task: Path) -> None:
     plain = hire(farm, router, certs, "w1")
     process = learner(farm, router, certs, "r")
     words = "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls"
@@ -241,7 +241,7 @@ class Posing(Bundle):
 
 
 @pytest.mark.parametrize("who", ["foreign", "worker"])
-def test_who_listens_without_a_learners_certificate_of_this_authority_sends_no_code(certs: Path, who: str) -> None:
+def test_a_listener_without_a_learners_certificate_of_this_authority_sends_no_code(certs: Path, who: str) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     folder = certs / "own" / "worker-w2"
     bundle = find(certs / "foreign", "learner") if who == "foreign" else Posing(folder, "learner", "w2")

@@ -183,7 +183,7 @@ def test_a_port_in_use(farm: Farm) -> None:
 
 
 @pytest.mark.slow
-def test_nobody_answers(farm: Farm) -> None:
+def test_no_answer(farm: Farm) -> None:
     endpoint = free_endpoint()
     said = farm.call("worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1)
     assert f"no answer from {endpoint} yet, trying again" in said

@@ -68,7 +68,7 @@ def test_a_worker(farm: Farm, number: signal.Signals, record_property) -> None:
     assert worker.returncode == 0
 
 
-def test_a_worker_that_finds_nobody(farm: Farm, record_property) -> None:
+def test_a_worker_that_finds_no_learner(farm: Farm, record_property) -> None:
     worker = farm.start("worker", "--connect", free_endpoint(), "--processes", "2")
     assert worker.stdout
     while "no answer from" not in worker.stdout.readline():

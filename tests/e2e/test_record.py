@@ -101,7 +101,7 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
         assert (own / name).read_bytes() == (other / name).read_bytes()
 
 
-def test_who_joins_late_has_everything(farm: Farm) -> None:
+def test_a_late_recorder_has_everything(farm: Farm) -> None:
     endpoint = free_endpoint()
     learning = learner(farm, endpoint, 20)
     worker = hire(farm, endpoint)
@@ -184,7 +184,7 @@ def free_port() -> int:
 
 
 @pytest.mark.slow
-def test_a_frozen_recorder_holds_nobody_up(farm: Farm) -> None:
+def test_a_frozen_recorder_delays_nothing(farm: Farm) -> None:
     endpoint = free_endpoint()
     learning = learner(farm, endpoint, 200)
     processes = [recorder(farm, endpoint), farm.start("record", "--connect", endpoint, "--out", "second")]

@@ -149,6 +149,7 @@ PROCESSORS = {
 SETTINGS: dict[str, dict[str, Any]] = {
     "kernel": {"generations": 6},
     "projected": {"policy": "projected", "features": 500, "state": "joints+tactile"},
+    "single": {"policy": "projected", "features": 500, "precision": "single"},
     "cosine": {"policy": "cosine", "features": 100, "optimiser": "adam", "perturb": True},
     "mlp": {"policy": "mlp", "normalise": True, "state": "joints+contacts"},
     "rbf": {"policy": "rbf", "normalise": True},

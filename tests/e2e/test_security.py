@@ -161,7 +161,7 @@ def json_of(payload: bytes) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("kind", ["none", "foreign", "expired", "plain"])
-def test_who_has_no_good_certificate_is_told_what_to_check(
+def test_a_worker_without_a_good_certificate_is_told_what_to_check(
     farm: Farm, certs: Path, place: tuple[str, list[str]], kind: str
 ) -> None:
     endpoint, learner_flags = place

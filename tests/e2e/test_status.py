@@ -61,13 +61,13 @@ def test_learners_of_another_release(farm: Farm) -> None:
     assert f"a learner answers, but its message cannot be read: {versions}" in said
 
 
-def test_nobody_there(farm: Farm) -> None:
+def test_no_learner(farm: Farm) -> None:
     endpoint = free_endpoint()
     said = farm.call("status", "--connect", endpoint, "--timeout", "1", status=1)
     assert f"no answer from {endpoint}" in said
 
 
-def test_status_fails_when_who_is_named_is_missing(farm: Farm) -> None:
+def test_status_fails_when_the_named_run_or_worker_is_missing(farm: Farm) -> None:
     endpoint = free_endpoint()
     farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
     farm.start("worker", "--connect", endpoint, "--processes", "1", "--name", "w")

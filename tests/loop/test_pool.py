@@ -78,7 +78,7 @@ def test_two_of_three_workers_that_are_killed_change_nothing(thetas: FloatArray,
         assert [found[i] for i in range(len(many))] == np.tile(alone, 6).tolist()
 
 
-def test_an_imap_that_is_left_stands_in_nobodys_way(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
+def test_an_abandoned_imap_does_not_block_other_calls(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
     for index, value in pool.imap(thetas, seeds=range(COUNT)):
         assert value == alone[index]
         break  # what is out is void
@@ -157,7 +157,7 @@ def test_names_and_numbers_that_no_farm_has() -> None:
         farm.Farm("finger-gait", workers=0)
 
 
-def test_closing_ends_whoever_waits(thetas: FloatArray) -> None:
+def test_closing_ends_a_waiting_call(thetas: FloatArray) -> None:
     pool = farm.Farm("finger-gait", policy="linear", workers=1)
     ended = threading.Event()
 

@@ -144,7 +144,7 @@ def test_an_interrupted_experiment_goes_on_to_the_same_numbers(farm: Farm, done:
 
 
 @pytest.mark.slow
-def test_a_killed_experiment_leaves_nobody_behind(farm: Farm) -> None:
+def test_a_killed_experiment_leaves_no_process_behind(farm: Farm) -> None:
     begun = start(farm, *SHORT, "--out", "side")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/*/progress.jsonl")))
     started = children(begun.pid)

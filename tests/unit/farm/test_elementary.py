@@ -148,3 +148,34 @@ def test_the_argument_is_left_alone(name):
     x.setflags(write=False)
     FUNCTIONS[name](x)
     np.testing.assert_array_equal(x, before)
+
+
+# ---------------------------------------------------------------- turns, single precision
+
+
+def single(seed, count):
+    """Arguments of every size, in single precision."""
+    return many(seed, count).astype(np.float32)
+
+
+def test_cosine_of_turns_is_near_the_true_values():
+    x = single(8, 30_000)
+    x = np.concatenate([x, np.arange(-9, 9, dtype=np.float32) / 8])
+    turned = np.remainder(x.astype(float), 1.0)  # exact
+    assert np.abs(elementary.cos_turns(x) - np.cos(2.0 * np.pi * turned)).max() < 2e-7
+
+
+def test_cosine_of_turns_at_the_edges():
+    x = np.array([0, 0.25, 0.5, 2**23 + 1, 2**24 + 2, 3e38, np.inf, -np.inf, np.nan], dtype=np.float32)
+    found = elementary.cos_turns(x)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found[:6], [1, 0, -1, 1, 1, 1], atol=1e-7)
+    assert np.isnan(found[6:]).all()
+
+
+def test_cosine_of_turns_has_the_same_bits_in_any_array():
+    x = single(9, 7000)
+    whole = elementary.cos_turns(x)
+    assert (
+        np.concatenate([elementary.cos_turns(x[i : i + 7]) for i in range(0, len(x), 7)]).tobytes() == whole.tobytes()
+    )

@@ -37,7 +37,7 @@ def test_of_one_rollout_and_of_all():
     np.testing.assert_allclose(deviation, np.concatenate(parts).std(axis=0), rtol=1e-9)
 
 
-def test_a_rollouts_moments_are_the_same_whoever_shares_its_batch():
+def test_a_rollouts_moments_do_not_depend_on_its_batch():
     parts = rollouts(5)
     whole = table(parts)
     alone = [table([part])[0].tobytes() for part in parts]

@@ -17,7 +17,8 @@ from farm.tasks.base import TaskSpec
 
 ACTIONS = 3
 FOURIER = {"direct": Direct, "projected": Projected, "kernel": Kernel, "cosine": Cosine}
-KINDS = FOURIER | {"linear": Linear, "mlp": Mlp, "rbf": Rbf, "weighted-kernel": WeightedKernel}
+SINGLE = {f"{name}, single": kind for name, kind in FOURIER.items() if name != "kernel"}
+KINDS = FOURIER | SINGLE | {"linear": Linear, "mlp": Mlp, "rbf": Rbf, "weighted-kernel": WeightedKernel}
 
 
 def make(name: str = "projected", features: int = 50, size: int = 8, seed: int = 0, bandwidth: float = 1.0) -> Policy:
@@ -29,6 +30,8 @@ def make(name: str = "projected", features: int = 50, size: int = 8, seed: int =
         "rbf": {"centres": features, "bandwidth": bandwidth},
         "weighted-kernel": {"width": bandwidth},
     }.get(name, {"features": features, "bandwidth": bandwidth})
+    if name in SINGLE:
+        own["precision"] = "single"
     config, rng = kind.Config(**own), np.random.default_rng(seed)
     constants = kind.draw(config, spec, rng)
     if kind.standardised:
@@ -134,6 +137,23 @@ def test_actions_are_as_written(name, bandwidth):
             assert actions[i, joint] == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.parametrize("name", SINGLE)
+def test_single_precision_changes_actions_by_rounding_alone(name):
+    single, double = make(name, features=8000), make(name.partition(",")[0], features=8000)
+    theta, x = parameters(single, 20), states(20)
+    found, wanted = act(single, theta, x), act(double, theta, x)
+    assert found.dtype == np.float64
+    assert 0.0 < np.abs(found - wanted).max() < 2e-6
+
+
+def test_single_precision_overflows_like_double():
+    policy = make("direct, single")
+    theta, x = parameters(policy, 3), states(3)
+    theta[1], x[2, 0] = 1e300, 1e300
+    found = act(policy, theta, x)
+    assert np.isfinite(found).all(axis=1).tolist() == [True, False, False]
+
+
 def plain(policy, theta, x):
     """One rollout's actions (A,), by numpy's own products and functions."""
     config, a, d = policy.config, ACTIONS, len(x)
@@ -154,7 +174,7 @@ def plain(policy, theta, x):
     return config.weight_scale * rows[:, -1] * np.exp(-(distance**2) / (2 * d * config.width**2))
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if name not in FOURIER])
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in FOURIER | SINGLE])
 @pytest.mark.parametrize("size", [1, 8, 62])
 def test_actions_are_those_of_plain_numpy(name, size):
     policy = make(name, features=7, size=size, bandwidth=1.3)
@@ -216,7 +236,7 @@ def test_the_kernel_is_one_at_its_centre():
 @pytest.mark.parametrize("features", [1, 7, 50, 1000])
 @pytest.mark.parametrize("size", [1, 8, 62])
 @pytest.mark.parametrize("name", KINDS)
-def test_a_row_is_the_same_whoever_shares_its_batch(name, size, features):
+def test_a_row_does_not_depend_on_its_batch(name, size, features):
     policy = make(name, features, size)
     theta, x = parameters(policy, 32), states(32, size)
     alone = [act(policy, theta[i : i + 1], x[i : i + 1])[0].tobytes() for i in range(32)]

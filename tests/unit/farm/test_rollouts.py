@@ -8,7 +8,7 @@ import pytest
 
 from farm import plugins
 from farm import rollouts as rolling
-from farm.errors import ConfigError, UnservedError
+from farm.errors import ConfigError, TaskError, UnservedError
 from farm.net import codec
 from farm.net.messages import Spec
 from farm.net.work import Jobs, Results, Simulated
@@ -16,7 +16,10 @@ from farm.policies.fourier import Direct, FeaturesConfig
 from farm.rollouts import SIMULATION, Runner, backend, build_task, served
 from farm.settings import setting
 from farm.sim.channels import Channel
+from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
+from learner.config import configure
+from learner.setup import problem
 from workers.backends.cpu import CpuBackend
 
 XML = """<mujoco><option timestep="0.01"/><worldbody>
@@ -303,3 +306,58 @@ def test_backends_by_name(tmp_path):
     with pytest.raises(ConfigError, match=r"its __init__ must take config, variant and files"):
         build_task(plugins.find("tasks", f"{path}:Mine"), {}, None)
     assert rolling.SIMULATION == "farm.tasks.loop"
+
+
+def test_backends_that_cannot_be_are_named(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("class Mine:\n    capacity = 'x'\n    def engine(self, model): return 3\n")
+    with pytest.raises(ConfigError, match="mine.py:Mine is 'x'; expected a whole number of at least 1"):
+        backend(f"{path}:Mine")
+    with pytest.raises(TaskError, match="the backend gave a int, which is no engine: it has no model, size, field"):
+        Sim(3)
+
+
+# ---------------------------------------------------------------- policies of one's own
+
+POLICY = """
+import numpy as np
+import farm
+
+class Mine(farm.Policy):
+    {0}
+
+    @property
+    def size(self):
+        return {1}
+
+    def act(self, prepared, x):
+        return prepared[:, :1]
+"""
+
+
+@pytest.mark.parametrize(
+    ("members", "size", "line"),
+    [
+        ("pass", "'x'", "size of mine.py:Mine is 'x'; expected a whole number of at least 1"),
+        ("pass", "0", "size of mine.py:Mine is 0"),
+        ("pass", "2.5", "size of mine.py:Mine is 2.5"),
+        ("def __init__(self): pass", "2", "mine.py:Mine: its __init__ must take config, spec and constants"),
+        ("draw = classmethod(lambda *_: None)", "2", "draw of mine.py:Mine gave None; expected finite float64 arrays"),
+        ("draw = classmethod(lambda *_: {'a': np.arange(3)})", "2", "draw of mine.py:Mine gave {'a': array"),
+        ("draw = classmethod(lambda *_: {'a': np.array([np.inf])})", "2", "draw of mine.py:Mine gave {'a': array"),
+    ],
+)
+def test_a_policy_of_ones_own_that_cannot_be_is_named(tmp_path, file, members, size, line):
+    path = tmp_path / "mine.py"
+    path.write_text(POLICY.format(members, size))
+    with pytest.raises(ConfigError, match=line):
+        problem(configure(f"{file}:Pole", policy=f"{path}:Mine"))
+
+
+def test_prepared_values_need_a_row_for_each_rollout():
+    task, config = Pole(Pole.Config()), FeaturesConfig(features=3)
+    policy = Direct(config, task.spec(), Direct.draw(config, task.spec(), np.random.default_rng(0)))
+    policy.prepare = lambda theta: theta[:1]
+    line = r"prepare of the policy gave an array of shape \(1, 3\); expected an array of shape \(2, 3\)"
+    with pytest.raises(TaskError, match=line):
+        Runner(task, policy).rollouts(np.zeros((2, 3)), [None, None])

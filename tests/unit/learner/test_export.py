@@ -19,6 +19,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "direct": {"features": 30},
     "projected": {"features": 30},
     "cosine": {"features": 30},
+    "direct, single": {"features": 30, "precision": "single"},
+    "projected, single": {"features": 30, "precision": "single"},
+    "cosine, single": {"features": 30, "precision": "single"},
     "kernel": {},
     "constant": {"pose": "between", "motion": 0.3},
     "linear": {},
@@ -48,7 +51,9 @@ def played(path: Path) -> float:
 @pytest.mark.parametrize("normalise", [False, True])
 @pytest.mark.parametrize("policy", SETTINGS)
 def test_the_example_plays_every_policy(policy: str, normalise: bool, tmp_path: Path) -> None:
-    config = configure(policy=policy, state="joints+contacts", normalise=normalise, **SETTINGS[policy])
+    config = configure(
+        policy=policy.partition(",")[0], state="joints+contacts", normalise=normalise, **SETTINGS[policy]
+    )
     found, _ = start(config, "r")
     if normalise:
         seen = np.random.default_rng(2).uniform(0.5, 1.0, (2, found.spec.observation))

@@ -54,6 +54,19 @@ def test_a_runtime_acts_as_the_policy_does(policy: str, normalise: bool, tmp_pat
     assert (said["policy"], said["generation"], said["task"]) == (policy, "7", "finger-gait")
 
 
+def test_single_precision_is_exported_as_double(tmp_path: Path) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    config = configure(policy="projected", features=300, precision="single")
+    found, _ = start(config, "r")
+    loaded = LoadedPolicy(found, 7, np.random.default_rng(1).normal(0.3, 0.5, found.policy.size))
+    x = np.random.default_rng(3).normal(0.5, 0.5, (100, found.spec.observation))
+    wanted = found.policy.act(np.repeat(found.policy.prepare(loaded.mu[None]), len(x), axis=0), x)
+    onnx.write(tmp_path / "p.onnx", loaded)
+    session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
+    (given,) = session.run(None, {"observation": x})
+    np.testing.assert_allclose(given, wanted, atol=5e-6)
+
+
 def test_a_policy_for_an_environment_of_gymnasium() -> None:
     runtime, _ = pytest.importorskip("onnxruntime"), pytest.importorskip("gymnasium")
     found, _ = start(configure("gym:Reacher-v5", policy="linear"), "r")

@@ -140,7 +140,7 @@ def test_what_does_not_fit_is_not_run(safe: Stage, certs: Path, tmp_path: Path, 
     assert not list(worker._sources._folder.glob("*/*"))
 
 
-def test_who_was_not_told_to_accept_code_fetches_none(safe: Stage, certs: Path, tmp_path: Path) -> None:
+def test_a_worker_without_accept_code_fetches_none(safe: Stage, certs: Path, tmp_path: Path) -> None:
     author, worker = Author(safe, write(tmp_path)), safe.hire(tls=certs)
     author.send(worker.id, 0)
     said = safe.failure()

@@ -112,7 +112,7 @@ def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog
     assert Runner.made == ["r"]
 
 
-def test_a_false_header_stalls_nobody(stage: Stage) -> None:
+def test_a_false_header_does_not_stall_other_runs(stage: Stage) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     for changed in ({"round": 2**63 - 1}, {"incarnation": "zzzz"}, {"round": 2**63 - 1, "mu": np.zeros(P)}):

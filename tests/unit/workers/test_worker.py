@@ -21,7 +21,7 @@ from workers.worker import WorkerConfig
 
 
 @pytest.mark.parametrize("_", range(3))
-def test_whoever_sees_a_worker_can_reach_it(stage: Stage, _: int) -> None:
+def test_a_visible_worker_can_be_reached(stage: Stage, _: int) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     name, alive = stage.next("worker")
@@ -151,7 +151,7 @@ def test_a_task_it_cannot_build(stage: Stage, caplog: pytest.LogCaptureFixture) 
     learner.send(worker.id, 0)
     assert stage.failure().error == "RuntimeError: no such machine"
     assert caplog.messages[0].startswith("cannot serve run r: no such")
-    assert caplog.records[0].exc_info
+    assert caplog.records[0].exc_info is None, "its learner shows the traceback"
 
 
 def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
@@ -163,7 +163,25 @@ def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytes
     assert (failed.index, failed.error) == (13, "ArithmeticError: thirteen")
     assert (failed.run, failed.incarnation, failed.round, failed.worker) == ("r", "first", 2, worker.id)
     assert indices(stage.results()) == [14]
-    assert [r.levelno for r in caplog.records] == [logging.ERROR]
+    assert failed.traceback[-1] == "ArithmeticError: thirteen"
+    assert not caplog.records, "its learner shows the error"
+
+
+def test_a_defect_of_the_farm_is_logged_once_with_its_traceback(
+    stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plugins, "author_traceback", lambda _: ())  # as if no frame were outside the farm
+    learner = Learner(stage.session, "r")
+    worker = stage.hire()
+    learner.send(worker.id, 13, 14)
+    assert stage.failure().traceback == ()
+    learner.send(worker.id, 13)
+    assert indices(stage.results()) == [14]
+    stage.failure()
+    [record] = caplog.records
+    assert record.levelno == logging.ERROR
+    assert record.exc_info
+    assert record.message.startswith("a chunk of run r failed (ArithmeticError: thirteen)")
 
 
 def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
@@ -207,7 +225,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_class_in_a_file_is_served_by_who_was_told_to(real: Stage, file: Path, tmp_path: Path) -> None:
+def test_a_class_in_an_allowed_file_is_served(real: Stage, file: Path, tmp_path: Path) -> None:
     learner = Learner(real.session, "r", pole(file))
     learner.header = replace(learner.header, mu=np.ones(2))
     here = tmp_path / "elsewhere" / "pole.py"
@@ -220,7 +238,7 @@ def test_a_class_in_a_file_is_served_by_who_was_told_to(real: Stage, file: Path,
     assert (returns > 3.9).all(), "four steps of at most 1"
 
 
-def test_a_class_in_a_file_is_refused_by_who_was_not(real: Stage, file: Path) -> None:
+def test_a_class_in_another_file_is_refused(real: Stage, file: Path) -> None:
     learner = Learner(real.session, "r", pole(file))
     worker = real.hire()
     learner.send(worker.id, 0)

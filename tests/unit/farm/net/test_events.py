@@ -27,7 +27,7 @@ def test_first_come_first_served() -> None:
         events.get(timeout=0.001)
 
 
-def test_who_waits_is_woken() -> None:
+def test_a_waiting_thread_is_woken() -> None:
     events = Events()
     threading.Timer(0.05, events.put, [event(1)]).start()
     assert events.waiting(20.0) == [event(1)]

@@ -36,10 +36,29 @@ def test_shapes_that_make_no_sense(kind, shape, words):
 
 @pytest.mark.parametrize("what", ["labels", "colours", "bodies", "geoms"])
 def test_one_each_or_none(what):
+    one = (255, 0, 0) if what == "colours" else "x"
     for count in (0, 2):
-        Channel(name="c", kind="points", shape=(2, 4), **{what: ("x",) * count})
+        Channel(name="c", kind="points", shape=(2, 4), **{what: (one,) * count})
     with pytest.raises(ConfigError, match=f"channel c: 3 {what} for 2"):
-        Channel(name="c", kind="points", shape=(2, 4), **{what: ("x",) * 3})
+        Channel(name="c", kind="points", shape=(2, 4), **{what: (one,) * 3})
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"name": 3}, "channel 3: its name must be a text"),
+        ({"name": ""}, "channel '': its name must be a text"),
+        ({"shape": 1}, r"channel c: shape is 1; expected a tuple of whole numbers, as \(3,\)"),
+        ({"shape": (1.0,)}, r"channel c: shape is \(1.0,\)"),
+        ({"labels": "x"}, "channel c: labels is 'x'; expected a tuple of texts"),
+        ({"bodies": (3,)}, r"channel c: bodies is \(3,\)"),
+        ({"colours": ("red",)}, "channel c: colour 'red'; expected red, green, blue from 0 to 255"),
+        ({"colours": ((0, 0, 256),)}, r"channel c: colour \(0, 0, 256\)"),
+    ],
+)
+def test_values_of_other_types(values, words):
+    with pytest.raises(ConfigError, match=words):
+        Channel(**{"name": "c", "kind": "scalars", "shape": (1,), **values})
 
 
 def test_what_travels_of_them():

@@ -253,7 +253,7 @@ def broken(**methods) -> Runner:
         ({"observe": lambda _, sim: sim.qpos[:, 0]}, r"observe gave an array of shape \(1,\); expected an array of "
          r"shape \(1, 1\)"),
         ({"observe": lambda _, sim: np.full((len(sim), 2), "x")}, "observe gave an array of <U1; expected real"),
-        ({"observe": lambda _, sim: sim.qpos * np.nan}, "observe is not finite at the nominal start"),
+        ({"observe": lambda _, sim: sim.qpos * np.nan}, "observe is not finite before control step 1, though"),
         ({"reward": lambda _, sim, a: {}}, "reward gave no terms"),
         ({"prepare": lambda _, sim, rngs: sim.own.update(goal=3)}, r"sim.own\['goal'\] is a int; expected an array of"),
         ({"steps": 1, "success": lambda _, sim: np.ones(2)}, r"success gave an array of shape \(2,\)"),
@@ -264,12 +264,24 @@ def test_arrays_that_make_no_sense_are_named(methods, line):
         broken(**methods)
 
 
+def test_an_observation_that_is_not_finite_later_is_an_error():
+    made = broken(observe=lambda _, sim: sim.qpos / (1.0 if sim.t < 2 else np.zeros(1)))
+    with np.errstate(all="ignore"), pytest.raises(TaskError, match="observe is not finite before control step 3"):
+        made.rollouts(np.zeros((2, made.size)), [None, None])
+
+
 @pytest.mark.parametrize(
     ("attributes", "line"),
     [
         ({"steps": 0}, "task Broken: steps is 0; expected a whole number from 1 to 10000"),
         ({"substeps": 1.0}, "task Broken: substeps is 1.0"),
         ({"camera": (0, 0, 0)}, "task Broken: camera is .*; expected a farm.Camera"),
+        ({"channels": [1]}, r"task Broken: channels is \[1\]; expected a tuple of farm.Channel"),
+        ({"channels": None}, "task Broken: channels is None"),
+        (
+            {"channels": (Channel(name="angle", kind="scalars", shape=(1,), geoms=("hand",)),)},
+            "task Broken: there is no geometry 'hand', which a channel names, in the model",
+        ),
         ({"reset": lambda _, row, rng: None}, r"reset\(_, row, rng\); expected \(self, sim, row, rng\)"),
         ({"reward": Task.reward}, "task Broken has no reward: give it"),
         ({"xml": XML.replace('<motor joint="slide" ctrlrange="-3 5"/>', "")}, "its model has no actuator"),

@@ -39,7 +39,7 @@ def killed_while_compacting(path: Path) -> None:
     assert ended, "it goes on without its parent"
 
 
-def test_nobody_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_process_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.rrd"
     path.write_text("recorded")
     killed_while_compacting(path)

@@ -77,7 +77,7 @@ def test_no_more_than_a_worker_wants(learner: Learner, hire: Hire) -> None:
     assert done(collected.result(WAIT)) == list(range(30))
 
 
-def test_who_wants_nothing_gets_nothing(learner: Learner, hire: Hire) -> None:
+def test_a_worker_without_credits_gets_no_jobs(learner: Learner, hire: Hire) -> None:
     learner.show()
     lazy, eager = hire("a/1"), hire("b/1")
     lazy.want(0)
@@ -241,7 +241,7 @@ def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:
     assert done(collected.result(WAIT)) == [0]
 
 
-def test_who_does_not_serve_the_run_gets_none_of_it(
+def test_a_worker_that_cannot_serve_the_run_gets_no_more_jobs(
     learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture
 ) -> None:
     farm = learner.show()
@@ -261,7 +261,7 @@ def test_who_does_not_serve_the_run_gets_none_of_it(
     ]
 
 
-def test_who_asks_hears_how_the_run_is_doing(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_status_query_is_answered(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
     learner.show()
     worker, idle = hire("a/1"), hire("b/1")
@@ -287,7 +287,7 @@ def test_who_asks_hears_how_the_run_is_doing(learner: Learner, hire: Hire, monke
         collected.result(WAIT)
 
 
-def test_nobody_there_is_said_once(
+def test_missing_workers_are_reported_once(
     learner: Learner, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dispatchers, "_PATIENCE", 0.0)

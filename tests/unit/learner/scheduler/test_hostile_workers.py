@@ -56,7 +56,7 @@ def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner
     assert farm.ignored == {"version": 1}
 
 
-def test_made_up_names_are_nobody(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_made_up_names_are_ignored(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membership, "_SOON", 0.0)
     monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
     monkeypatch.setattr(dispatchers, "_STATUS_PART", math.inf)
@@ -103,7 +103,7 @@ def test_another_release_hears_why_it_gets_nothing(learner: Learner, hire: Hire)
     assert farm.ignored == {"version": 1}
 
 
-def test_numbers_of_a_worker_that_did_nothing_bind_nobody(learner: Learner, hire: Hire) -> None:
+def test_fingerprint_of_a_worker_without_results_does_not_bind_the_run(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker, odd = hire("b/1"), hire("a/1")
     collected = learner.collect(jobs(3))
@@ -119,7 +119,7 @@ def test_numbers_of_a_worker_that_did_nothing_bind_nobody(learner: Learner, hire
     assert farm.ignored == {"refused": 1}
 
 
-def test_patterns_are_nobodys_name(learner: Learner, hire: Hire) -> None:
+def test_patterns_are_not_names(learner: Learner, hire: Hire) -> None:
     farm = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(1))

@@ -50,7 +50,7 @@ def test_mixed_machines_on_request() -> None:
 # ---------------------------------------------------------------- attendance
 
 
-def test_who_has_a_token_is_there_until_it_goes() -> None:
+def test_a_worker_is_present_while_its_token_is() -> None:
     known = Attendance()
     assert known.came("a/1") is None
     assert known.asked(want("a/1"), 0.0)
@@ -67,7 +67,7 @@ def test_a_question_ahead_of_its_token_is_heard_once_it_comes() -> None:
     assert known.absent(100.0) == []
 
 
-def test_who_never_comes_is_forgotten() -> None:
+def test_a_worker_that_never_comes_is_forgotten() -> None:
     known = Attendance()
     known.asked(want("a/1"), 0.0)
     known.asked(want("b/1"), 2.0)
@@ -78,14 +78,14 @@ def test_who_never_comes_is_forgotten() -> None:
     assert known.came("b/1") == want("b/1")
 
 
-def test_those_who_ask_early_are_looked_after_in_turn() -> None:
+def test_early_requests_are_checked_in_turn() -> None:
     known = Attendance()
     for name in ("a/1", "b/1", "c/1"):
         known.asked(want(name), 0.0)
     assert [known.early(2) for _ in range(3)] == [["a/1", "b/1"], ["c/1", "a/1"], ["b/1", "c/1"]]
 
 
-def test_many_tokens_of_one_name_keep_nobody_else_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_tokens_of_one_name_do_not_exclude_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membership, "_MOST_OF_ONE", 2)
     known = Attendance()
     for i in range(2):

@@ -266,7 +266,7 @@ def test_a_copy_lost_with_its_worker_leaves_the_others():
     assert [scheduler.lost(worker) for worker in "bcd"] == [0, 0, 1]
 
 
-def test_a_worker_does_not_get_a_job_twice_and_nobody_waits_in_a_busy_loop():
+def test_a_worker_does_not_get_a_job_twice_and_there_is_no_busy_loop():
     scheduler = started(1, ["a"])
     scheduler.assign(0.0)
     assert scheduler.assign(1.0) == []
@@ -340,7 +340,7 @@ def test_three_hosts_that_brought_results_are_enough():
     assert failed == [False, False, True]
 
 
-def test_who_failed_gets_nothing_until_it_speaks():
+def test_a_worker_that_failed_gets_nothing_until_it_speaks():
     scheduler = started(8, ["a", "b"], credits=1)
     assert given(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
     scheduler.error("a", 0, 0.1)
@@ -359,7 +359,7 @@ def test_strangers_failures_count_for_nothing():
     assert scheduler.reissued == 0
 
 
-def test_who_hung_when_a_round_ended_is_not_waited_for_again():
+def test_a_worker_that_hung_at_the_end_of_a_round_is_not_waited_for_again():
     scheduler = started(2, ["a", "b"], credits=1)
     assert given(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
     scheduler.results("b", [1], 0.1)
@@ -374,7 +374,7 @@ def test_who_hung_when_a_round_ended_is_not_waited_for_again():
     assert given(scheduler.assign(1.4)) == {"a": [0], "b": [1]}
 
 
-def test_who_alone_is_left_is_asked_again():
+def test_the_last_worker_is_asked_again():
     scheduler = started(1, ["a"])
     scheduler.assign(0.0)
     scheduler.error("a", 0, 5.0)

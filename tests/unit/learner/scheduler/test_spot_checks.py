@@ -86,7 +86,7 @@ def test_two_hosts_that_differ_wait_for_a_third(learner: Learner, hire: Hire, ca
     assert farm.workers == ("a/1", "b/1")
 
 
-def test_a_check_that_nobody_can_answer_holds_nothing_up(learner: Learner, hire: Hire) -> None:
+def test_a_check_without_a_second_host_delays_nothing(learner: Learner, hire: Hire) -> None:
     learner.show(PATIENT.__class__(straggler_seconds=0.2, audit=1.0))
     worker, deaf = hire("a/1", Host), hire("deaf/1", Host)
     worker.want(9)
@@ -170,7 +170,7 @@ def test_only_machines_whose_numbers_are_of_one_kind_are_compared() -> None:
     assert audit.passed(results, list(KINDS)), "no host is like c, and a device is like no host"
 
 
-def test_numbers_of_another_kind_expel_nobody() -> None:
+def test_numbers_of_another_kind_do_not_expel() -> None:
     audit, results = Audit(1.0, KINDS.__getitem__), filled(np.arange(2.0))
     audit.begin(2)
     audit.counted("a/1", np.array([0]))

@@ -79,7 +79,7 @@ def page(other: Session, first: object) -> RunHistory:
     return codec.decode(payload, RunHistory)
 
 
-def test_who_comes_late_hears_everything(publisher: Publisher, link: tuple[Session, Session]) -> None:
+def test_a_late_subscriber_receives_everything(publisher: Publisher, link: tuple[Session, Session]) -> None:
     publisher.generation(report(3))
     said = page(link[1], 1)
     assert (said.run, said.recording, said.generation, said.files) == ("r", "first", 3, {"model.xml": "<mujoco/>"})
