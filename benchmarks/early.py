@@ -65,11 +65,13 @@ def main() -> None:
     arguments = parser.parse_args()
     constant: dict[str, Any] = {"policy": f"{__file__}:Constant", "initial_mu": 0.0, "initial_sigma": 0.1}
     changed = constant if arguments.policy == "constant" else {}
+    chosen = range(arguments.first, arguments.first + arguments.seeds)
+    configs = {seed: configure("finger-gait", arguments.preset, seed=seed, **changed) for seed in chosen}
     print(f"| seed | robust success >= {ENOUGH} % from rollout on | return >= {GOOD} from rollout on ", end="")
     print("| return, last | robust success, lowest in the last half, last |\n|---|---|---|---|---|")
     runner: Runner | None = None
-    for seed in range(arguments.first, arguments.first + arguments.seeds):
-        curve, runner = _learnt(configure("finger-gait", arguments.preset, seed=seed, **changed), runner)
+    for seed, config in configs.items():
+        curve, runner = _learnt(config, runner)
         half = [value for rollouts, value in curve.robust if 2 * rollouts >= curve.robust[-1][0]]
         print(
             f"| {seed} | {_since(curve.robust, ENOUGH)} | {_since(curve.nominal, GOOD)} "
