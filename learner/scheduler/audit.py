@@ -2,18 +2,23 @@
 
 Honest hosts return the same bits for the same job. In a mixed run this holds only for machines of one kind, so only
 these are compared; devices are not checked. If two answers to a job differ, one of the hosts is broken or lies, and
-a third host's answer decides which. The choice of jobs depends on the round, the indices and the returns, never on
-the clock. Checks do not change any result.
+a third host's answer decides which. Checks do not change any result.
+
+Most rounds choose the jobs to check when half of the round is done and every host has answered: the checks are then
+handed out with the other half, and no worker waits for them. Every fourth round chooses at its end, so that late jobs
+are checked too.
 """
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from learner.scheduler.round import RoundResults
+
+_AT_THE_END: Final = 4  # every so many rounds the choice is made at the end
 
 
 class _Party(NamedTuple):
@@ -51,6 +56,8 @@ class Audit:
         self._part, self._round, self._best = part, -1, -np.inf
         self._canary = canary or (lambda _: "one")
         self._parties: list[_Party] = []
+        self._checked: dict[_Party, int] = {}  # the round in which a party's best job was checked last
+        self._hosts: set[str] = set()  # that have answered in this round
         self.begin(0)
 
     def begin(self, jobs: int) -> None:
@@ -60,12 +67,19 @@ class Audit:
         self._by = np.full(jobs, -1)
         self._checks: dict[int, _Check] = {}
         self._agreed: set[int] = set()
-        self._chosen = False
+        self._chosen = self._ended = False
+        self._expected, self._hosts = len(self._hosts), set()
 
     @property
     def on(self) -> bool:
         """Whether anything is checked."""
         return self._part > 0
+
+    @property
+    def early(self) -> bool:
+        """Whether this round's jobs to check are to be chosen now, if half of the round is done."""
+        early = self.on and not self._chosen and self._round % _AT_THE_END != 0
+        return early and len(self._hosts) >= self._expected
 
     def counted(self, worker: str, indices: np.ndarray) -> None:
         """Note that this worker's answers to these jobs were accepted; a device's answers are not checked."""
@@ -74,15 +88,28 @@ class Audit:
             return
         if party not in self._parties:
             self._parties.append(party)
+        self._hosts.add(party.host)
         self._by[indices] = self._parties.index(party)
 
+    def choose(self, results: RoundResults, workers: Sequence[str], *, end: bool) -> None:
+        """Choose the jobs to check among those that are done, once in a round.
+
+        Its end adds the job with the best return of the run so far, which is always checked.
+        """
+        if not self.on or self._ended or len({host(worker) for worker in workers}) < 2:
+            return
+        chosen = [] if self._chosen else self._choose(results)
+        best, value = results.best() if end else (-1, -np.inf)
+        if value > self._best and self._by[best] >= 0:
+            chosen.insert(0, best)
+        for index in chosen:
+            if index not in self._agreed:
+                self._checks.setdefault(index, _Check({self._whose(index): results.answer(index)}))
+        self._chosen, self._ended = True, end
+
     def passed(self, results: RoundResults, workers: Sequence[str]) -> bool:
-        """Whether a round with all jobs done needs no further checks; the first call chooses the jobs to check."""
-        if self.on and not self._chosen and len({host(worker) for worker in workers}) > 1:
-            self._chosen = True
-            for index in self._choose(results):
-                if index not in self._agreed:
-                    self._checks.setdefault(index, _Check({self._whose(index): results.answer(index)}))
+        """Whether a round with all jobs done needs no further checks."""
+        self.choose(results, workers, end=True)
         if self._checks:
             return False
         self._best = max(self._best, results.best()[1])
@@ -123,7 +150,7 @@ class Audit:
             self._checks.pop(index, None)
         for check in self._checks.values():
             check.answers = {party: answer for party, answer in check.answers.items() if party.host != name}
-        self._chosen = False
+        self._chosen = self._ended = False
         return jobs
 
     def lost(self, worker: str) -> None:
@@ -132,19 +159,24 @@ class Audit:
             if check.asked == worker:
                 check.asked = ""
 
+    def due(self, now: float, patience: float) -> bool:
+        """Whether `assign` has a check to send."""
+        return any(not check.asked or now - check.since > patience for check in self._checks.values())
+
     def assign(self, workers: Sequence[str], now: float, patience: float) -> dict[str, list[int]]:
-        """Return the jobs to send now, by worker.
+        """Return the jobs to send now, by worker; of the workers that can answer, earlier ones get more.
 
         A check that no worker can answer is dropped, unless two answers differ; then it waits for one.
         """
         asked: dict[str, list[int]] = {}
-        parties = {name: self._party(name) for name in workers} if self._checks else {}
+        parties: dict[str, _Party] = {}
         for index, check in list(self._checks.items()):
             if check.asked and now - check.since > patience:
                 check.passed.add(check.asked)
                 check.asked = ""
             if check.asked:
                 continue
+            parties = parties or {name: self._party(name) for name in workers}
             hosts, canary = {party.host for party in check.answers}, self._whose(index).canary
             free = [
                 name for name, party in parties.items()
@@ -172,15 +204,13 @@ class Audit:
         return self._parties[self._by[index]]
 
     def _choose(self, results: RoundResults) -> list[int]:
-        """The best job of the run so far, always; then the best job of each host in turn, and some of the others."""
+        """A round's share of jobs: the best of each host, those not checked for longest first; then others by index."""
         jobs = len(self._by)
         count = int((self._round + 1) * self._part * jobs) - int(self._round * self._part * jobs)
-        returns = results.job_returns()
-        checked = self._by >= 0
-        order = [int(np.where(self._by == by, returns, -np.inf).argmax()) for by in np.unique(self._by[checked])]
-        turn = self._round % max(1, len(order))
-        order = order[turn:] + order[:turn]
+        returns, checked = results.job_returns(), self._by >= 0
+        there = sorted(np.unique(self._by[checked]).tolist(), key=lambda by: self._checked.get(self._parties[by], -1))
+        self._checked |= {self._parties[by]: self._round for by in there[:count]}
+        best = [int(np.where(self._by == by, returns, -np.inf).argmax()) for by in there[:count]]
         mixed = (np.arange(jobs, dtype=np.uint64) + 1 + self._round * jobs) * np.uint64(0x9E3779B97F4A7C15)
-        chosen = list(dict.fromkeys([*order, *np.argsort(mixed, kind="stable").tolist()]))[:count]
-        best, value = results.best()
-        return [job for job in ([best, *chosen] if value > self._best else chosen) if checked[job]]
+        order = np.argsort(mixed, kind="stable")
+        return list(dict.fromkeys([*best, *order[checked[order]].tolist()]))[:count]

@@ -177,6 +177,9 @@ class Dispatcher:
             for event in self._events():
                 self._take(event)
             if not self._scheduler.complete:
+                if self._audit.early and self._scheduler.half_done:
+                    self._audit.choose(self._round, self._scheduler.willing, end=False)
+                self._check()
                 self._send(self._scheduler.assign(time.monotonic()))
             self._tell_when_alone()
             self._tell_status()
@@ -189,19 +192,25 @@ class Dispatcher:
         assert self._round is not None
         if not self._scheduler.complete:
             return False
-        willing = self._scheduler.willing
-        if self._audit.passed(self._round, willing):
+        if self._audit.passed(self._round, self._scheduler.willing):
             return True
-        asked = self._audit.assign(willing, time.monotonic(), self._scheduler.patience)
-        for worker, indices in asked.items():
-            self._scheduler.lend(worker, indices)
-        self._send(asked.items())
+        self._check()
         if self._audit.disputed:
             self._warn(
                 f"{self._audit.disputed} returned different numbers for the same job, and there is no third host to "
                 "decide which is right: the run waits for a worker on one more machine"
             )
         return False
+
+    def _check(self) -> None:
+        """Send the spot checks that are open."""
+        now, patience = time.monotonic(), self._scheduler.patience
+        if not self._audit.due(now, patience):
+            return
+        asked = self._audit.assign(self._scheduler.willing, now, patience)
+        for worker, indices in asked.items():
+            self._scheduler.lend(worker, indices)
+        self._send(asked.items())
 
     def _events(self) -> list[Event]:
         """Events that arrived; waits for one until the next deadline at most."""

@@ -93,6 +93,12 @@ class JobTable:
         queue = self.full if len(holders) >= self.copies else self.out
         queue[index] = now
 
+    def lend(self, worker: str, indices: Sequence[int], now: float) -> None:
+        """Give a worker jobs that are done; until it answers they count as held, so that others get its share."""
+        self.given[worker].update(indices)
+        if worker in self.workers:
+            self.workers[worker].held.update(dict.fromkeys(indices, now))
+
     def finish(self, worker: str, indices: Sequence[int]) -> list[bool]:
         """Note results of jobs of this round; return for each whether it was not done before."""
         held: dict[int, float] = {}

@@ -54,6 +54,11 @@ class Scheduler:
         return self._begun and not self._table.open
 
     @property
+    def half_done(self) -> bool:
+        """Whether half of this round's jobs are done."""
+        return 2 * self.remaining <= self._table.size
+
+    @property
     def remaining(self) -> int:
         """Jobs of this round that are not done."""
         return len(self._table.open)
@@ -65,8 +70,9 @@ class Scheduler:
 
     @property
     def willing(self) -> list[str]:
-        """Names of the workers that take jobs, sorted."""
-        return sorted(name for name, known in self._table.workers.items() if known.credits)
+        """Names of the workers that take jobs, those with the fewest jobs first, then by name."""
+        found = sorted((len(known.held), name) for name, known in self._table.workers.items() if known.credits)
+        return [name for _, name in found]
 
     @property
     def reissued(self) -> int:
@@ -137,7 +143,7 @@ class Scheduler:
 
     def lend(self, worker: str, indices: Sequence[int]) -> None:
         """Note that a worker repeats jobs that are done: the verdict on its answers is "doubled"."""
-        self._table.given[worker].update(indices)
+        self._table.lend(worker, indices, self._now)
 
     @property
     def patience(self) -> float:

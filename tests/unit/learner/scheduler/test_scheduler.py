@@ -417,6 +417,21 @@ def test_seconds_per_job_count_from_when_the_worker_could_begin():
     assert scheduler._chunking.median == pytest.approx(0.02)
 
 
+def test_a_job_that_is_repeated_counts_as_work_of_its_worker():
+    scheduler = started(8, ["a", "b"], seconds=0.01, short_seconds=1.0, credits=8)
+    scheduler.begin(6)
+    assert given(scheduler.assign(0.0)) == {"a": [0, 1, 2], "b": [3, 4, 5]}
+    assert not scheduler.half_done
+    assert scheduler.results("a", [0, 1, 2], 0.03) == ["new"] * 3
+    assert scheduler.half_done
+    assert scheduler.willing == ["a", "b"]
+    scheduler.lend("a", [3, 4, 5, 0])
+    assert scheduler.willing == ["b", "a"]
+    assert scheduler.results("b", [3, 4, 5], 0.04) == ["new"] * 3
+    assert scheduler.results("a", [0, 3, 4, 5], 0.07) == ["doubled"] * 4
+    assert scheduler.willing == ["a", "b"]
+
+
 def test_credits_and_jobs_must_not_be_negative():
     scheduler = started(1)
     with pytest.raises(ValueError, match="credits of a is -1"):

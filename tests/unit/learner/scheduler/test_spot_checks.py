@@ -97,6 +97,25 @@ def test_a_check_without_a_second_host_delays_nothing(learner: Learner, hire: Hi
     assert done(result.result(WAIT)) == list(range(6))
 
 
+def test_checks_are_handed_out_before_the_round_ends(learner: Learner, hire: Hire) -> None:
+    learner.show(ALL)
+    result = learner.collect(jobs(8))
+    slow, quick = hire("slow/1", Host), hire("quick/1", Host)
+    slow.want(1)
+    own = slow.chunk()
+    quick.want(4)
+    others = quick.work(7)
+    check = slow.chunk()
+    assert len(own) == 1
+    assert set(check.indices.tolist()) <= set(others), "jobs of the other host, while its own is not done"
+    for chunk in (own, check):
+        slow.answer(slow.results(chunk))
+    while not result.done():
+        slow.serve(learner)
+        quick.serve(learner)
+    assert done(result.result(WAIT)) == list(range(8))
+
+
 @pytest.mark.parametrize("names", [("a/1", "a/2"), ("a/1",)])
 def test_one_host_alone_is_not_checked(learner: Learner, hire: Hire, names) -> None:
     learner.show(ALL)
@@ -116,16 +135,16 @@ def filled(returns: FloatArray) -> RoundResults:
     return results
 
 
-def checked(audit: Audit, returns: FloatArray) -> set[int]:
-    """Play a round of two hosts in turn; return the repeated jobs, all of them answered."""
+def checked(audit: Audit, returns: FloatArray, hosts: str = "ab") -> set[int]:
+    """Play a round of these hosts in turn; return the repeated jobs, all of them answered."""
     audit.begin(len(returns))
     for index in range(len(returns)):
-        audit.counted(f"{'ab'[index % 2]}/1", np.array([index]))
-    results, asked = filled(returns), set()
-    while not audit.passed(results, ("a/1", "b/1")):
-        for worker, indices in audit.assign(("a/1", "b/1"), 0.0, 1.0).items():
+        audit.counted(f"{hosts[index % len(hosts)]}/1", np.array([index]))
+    results, asked, workers = filled(returns), set(), [f"{host}/1" for host in hosts]
+    while not audit.passed(results, workers):
+        for worker, indices in audit.assign(workers, 0.0, 1.0).items():
             for index in indices:
-                assert "ab"[index % 2] != worker[0]
+                assert hosts[index % len(hosts)] != worker[0]
                 asked.add(index)
                 assert audit.answered(worker, index, results.answer(index), results.answer(index))
         assert not audit.settle()
@@ -146,6 +165,38 @@ def test_a_new_best_is_always_checked_before_it_counts() -> None:
         returns[7] = best
         assert checked(audit, returns) == {7}
     assert checked(audit, np.full(20, -5.0)) == set()
+
+
+def test_hosts_are_checked_in_turn() -> None:
+    audit = Audit(0.25)
+    rounds = [checked(audit, np.zeros(4), "abc") for _ in range(7)]
+    assert [{job % 3 for job in jobs} for jobs in rounds] == [{0}, {1}, {2}] * 2 + [{0}]
+
+
+def test_three_of_four_rounds_choose_when_half_of_their_jobs_are_done() -> None:
+    audit, half = Audit(0.5), 4
+    early = []
+    for _ in range(8):
+        audit.begin(2 * half)
+        for index in range(half):
+            audit.counted("ab"[index % 2] + "/1", np.array([index]))
+        early.append(audit.early)
+        if audit.early:
+            audit.choose(filled(np.arange(8.0)), ("a/1", "b/1"), end=False)
+            asked = audit.assign(("a/1", "b/1"), 0.0, 1.0)
+            assert sorted(job for jobs in asked.values() for job in jobs) == list(range(half))
+            assert not audit.early
+    assert early == [True, True, True, False] * 2
+
+
+def test_no_round_chooses_before_as_many_hosts_have_answered_as_before() -> None:
+    audit = Audit(0.5)
+    for number in range(1, 4):
+        audit.begin(4)
+        audit.counted("a/1", np.array([0, 1]))
+        assert audit.early == (number == 1), "the first round does not know how many there are"
+        audit.counted("b/1", np.array([2, 3]))
+        assert audit.early
 
 
 def test_none_are_checked_on_request() -> None:
