@@ -48,8 +48,8 @@ def begin(algorithm: Algorithm[Any], size: int) -> SearchState:
     Raises:
       TaskError: it, or the algorithm's signs, are invalid.
     """
-    signs = algorithm.signs()
-    if signs not in ((1,), (1, -1)):
+    signs: object = algorithm.signs()
+    if not isinstance(signs, tuple) or signs not in ((1,), (1, -1)):
         raise TaskError(f"signs of {type(algorithm).__name__} gave {signs!r}; expected (1,) or (1, -1)")
     return _checked(algorithm, "init", algorithm.init(size), size, 0)
 

@@ -94,7 +94,7 @@ class SearchState:
 def _read_only(name: str, value: object) -> FloatArray:
     """Return a read-only copy of a finite float64 vector."""
     if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.ndim != 1:
-        found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else repr(value)
+        found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else f"{value!r:.60}"
         raise ValueError(f"state: {name} must be a float64 vector, not {found}")
     if not np.isfinite(value).all():
         raise ValueError(f"state: {name} must be finite everywhere")
@@ -108,7 +108,7 @@ def _scalar(name: str, value: object) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, float | int) or not np.isfinite(value):
-        raise ValueError(f"state: {name} must be a finite number or None, not {value!r}")
+        raise ValueError(f"state: {name} must be a finite number or None, not {value!r:.60}")
     return float(value)
 
 

@@ -53,6 +53,7 @@ def test_a_valid_one_passes_through():
     [
         ({"signs": (1, 1)}, r"signs of Mine gave \(1, 1\); expected \(1,\) or \(1, -1\)"),
         ({"signs": None}, "signs of Mine gave None"),
+        ({"signs": np.array([1, -1])}, r"signs of Mine gave array\(\[ 1, -1\]\)"),
         ({"init": None}, "init of Mine gave a NoneType; expected a farm.SearchState"),
         ({"init": a_state(3)}, "init of Mine gave a state of 3 parameters in generation 0; expected 4 in generation 0"),
         ({"init": a_state(generation=2)}, "in generation 2; expected 4 in generation 0"),
