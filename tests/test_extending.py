@@ -72,13 +72,13 @@ def test_a_task_in_a_file(tmp_path: Path) -> None:
     learnt = summary(tmp_path, "first")
     assert learnt["state"] == "finished"
     assert learnt["mean_policy_return"] > 50, "swung up; hanging is -100"
-    assert (tmp_path / "runs/first/run.rrd").stat().st_size > 50_000
-    farm(tmp_path, "run", "--config", "runs/first/config.json", "--name", "again", "--workers", "1", "--no-record")
+    assert (tmp_path / "runs/pendulum/run.rrd").stat().st_size > 50_000
+    farm(tmp_path, "run", "--config", "runs/pendulum/config.json", "--name", "again", "--workers", "1", "--no-record")
     assert summary(tmp_path, "again")["parameters_sha256"] == learnt["parameters_sha256"]
     assert f"return {learnt['mean_policy_return']:.3f}" in farm(tmp_path, *commands(TASK, "replay")[0])
     text = (tmp_path / "pendulum.py").read_text()
     (tmp_path / "pendulum.py").write_text(text.replace("np.cos(sim.qpos[:, 0])", "2 * np.cos(sim.qpos[:, 0])"))
-    said = farm(tmp_path, "run", "--resume", "runs/first", "--generations", "90", status=2)
+    said = farm(tmp_path, "run", "--resume", "runs/pendulum", "--generations", "90", status=2)
     assert "the code of its task has changed since the run began" in said
 
 

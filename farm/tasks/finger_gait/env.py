@@ -21,7 +21,6 @@ from farm.sim.scene import quiet
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS, LOWER, UPPER
 from farm.tasks.finger_gait.observations import STATES, Felt
-from farm.tasks.finger_gait.rewards import TERMS
 from farm.tasks.finger_gait.task import CONTROL_PERIOD, FingerGait, FingerGaitConfig
 from farm.tasks.finger_gait.touch import TAXELS
 from farm.tasks.loop import Batch
@@ -67,6 +66,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._task = FingerGait(config)
         self._sim = Sim(DataEngine(self._task.model))
         self._task.setup(self._sim)
+        self._terms = self._task.spec().terms
         self.render_mode = render_mode
         self._low, self._high = _observed(config)
         self.observation_space = Box(self._low, self._high, dtype=np.float64)
@@ -84,7 +84,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
             drawn = tuple(self.np_random.integers(0, 2**32, 4).tolist())
         self._batch = Batch(self._task, self._sim, [drawn])
         self._x = self._look()
-        return self._x.copy(), _info(np.zeros(len(TERMS)), success=False)
+        return self._x.copy(), self._info(np.zeros(len(self._terms)), success=False)
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Move for one control step of 0.1 s."""
@@ -96,7 +96,7 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         score = self._task.score(batch.record())
         assert score.success is not None
         terms = score.terms[0, t]
-        info = _info(terms, success=bool(over and score.success[0]))
+        info = self._info(terms, success=bool(over and score.success[0]))
         return self._x.copy(), self._task.return_scale * float(terms.sum()), ended, over and not ended, info
 
     def render(self) -> AnyArray | None:  # type: ignore[override]  (Gymnasium's may be a list as well)
@@ -121,6 +121,9 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
     def _look(self) -> FloatArray:
         return np.clip(self._batch.observe()[0], self._low, self._high)
 
+    def _info(self, terms: FloatArray, *, success: bool) -> dict[str, Any]:
+        return {"is_success": success, "reward_terms": dict(zip(self._terms, terms.tolist(), strict=True))}
+
 
 def _observed(config: FingerGaitConfig) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest observation, (d,)."""
@@ -132,10 +135,6 @@ def _observed(config: FingerGaitConfig) -> tuple[FloatArray, FloatArray]:
         return STATES[config.state].observe(Felt(joints, images, points))[0]
 
     return x(-JOINT_BOUND, 0.0, -1.0), x(JOINT_BOUND, FORCE_BOUND, 1.0)
-
-
-def _info(terms: FloatArray, *, success: bool) -> dict[str, Any]:
-    return {"is_success": success, "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True))}
 
 
 # Gymnasium has no other way in: it imports the module that an id names in front of a colon.
