@@ -23,6 +23,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
         ("environments.py --rollouts 2 --steps 3 --repeats 1", 10),
         ("timeline.py --pairs 2 --generations 9", 6),
         ("scaling.py --workers 2,5 --pair 0.001 --seconds 0.5", 5),
+        ("large.py --workers 2,5 --pair 0.001 --seconds 0.5", 2),
     ],
     ids=lambda value: str(value).partition(".")[0],
 )

@@ -9,7 +9,7 @@ handed out with the other half, and no worker waits for them. Every fourth round
 are checked too.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -56,6 +56,7 @@ class Audit:
         self._part, self._round, self._best = part, -1, -np.inf
         self._canary = canary or (lambda _: "one")
         self._parties: list[_Party] = []
+        self._numbers: dict[_Party, int] = {}  # their places in this list
         self._checked: dict[_Party, int] = {}  # the round in which a party's best job was checked last
         self._hosts: set[str] = set()  # that have answered in this round
         self.begin(0)
@@ -86,10 +87,11 @@ class Audit:
         party = self._party(worker)
         if not party.canary:
             return
-        if party not in self._parties:
+        if party not in self._numbers:
+            self._numbers[party] = len(self._parties)
             self._parties.append(party)
         self._hosts.add(party.host)
-        self._by[indices] = self._parties.index(party)
+        self._by[indices] = self._numbers[party]
 
     def choose(self, results: RoundResults, workers: Sequence[str], *, end: bool) -> None:
         """Choose the jobs to check among those that are done, once in a round.
@@ -133,6 +135,8 @@ class Audit:
         """Close the checks in which two hosts agree; return each host that disagreed, and the job."""
         liars: dict[str, int] = {}
         for index, check in list(self._checks.items()):
+            if len(check.answers) < 2:
+                continue
             answer, agree = Counter(check.answers.values()).most_common(1)[0]
             if agree > 1:
                 liars |= {party.host: index for party, other in check.answers.items() if other != answer}
@@ -164,28 +168,29 @@ class Audit:
         return any(not check.asked or now - check.since > patience for check in self._checks.values())
 
     def assign(self, workers: Sequence[str], now: float, patience: float) -> dict[str, list[int]]:
-        """Return the jobs to send now, by worker; of the workers that can answer, earlier ones get more.
+        """Return the jobs to send now, by worker: of those that can answer, one after another.
 
         A check that no worker can answer is dropped, unless two answers differ; then it waits for one.
         """
         asked: dict[str, list[int]] = {}
-        parties: dict[str, _Party] = {}
+        queue = deque((name, self._party(name)) for name in workers)
         for index, check in list(self._checks.items()):
             if check.asked and now - check.since > patience:
                 check.passed.add(check.asked)
                 check.asked = ""
             if check.asked:
                 continue
-            parties = parties or {name: self._party(name) for name in workers}
             hosts, canary = {party.host for party in check.answers}, self._whose(index).canary
-            free = [
-                name for name, party in parties.items()
-                if party.canary == canary and party.host not in hosts and name not in check.passed
-            ]  # fmt: skip
-            if free:
-                check.asked, check.since = min(free, key=lambda name: len(asked.get(name, ()))), now
-                asked.setdefault(check.asked, []).append(index)
-            elif len(check.answers) < 2:
+            for _ in range(len(queue)):
+                name, party = queue[0]
+                queue.rotate(-1)
+                if party.canary == canary and party.host not in hosts and name not in check.passed:
+                    check.asked, check.since = name, now
+                    asked.setdefault(name, []).append(index)
+                    break
+            if check.asked:
+                continue
+            if len(check.answers) < 2:
                 del self._checks[index]
             else:
                 check.passed.clear()
