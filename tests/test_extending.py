@@ -69,7 +69,7 @@ def test_a_task_in_a_file(tmp_path: Path) -> None:
     assert "same bits together, in another order, and one by one" in said
     [learn] = commands(TASK, "run")
     farm(tmp_path, *learn)
-    learnt = summary(tmp_path, "first")
+    learnt = summary(tmp_path, "pendulum")
     assert learnt["state"] == "finished"
     assert learnt["mean_policy_return"] > 50, "swung up; hanging is -100"
     assert (tmp_path / "runs/pendulum/run.rrd").stat().st_size > 50_000
