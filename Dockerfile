@@ -2,7 +2,7 @@
 #
 #   docker build --target worker --tag rolloutfarm-worker .
 #
-# BASE: any image with Python 3.11 and its venv module. UID: the user that the programs run as; files
+# BASE: any image with Python 3.11 or newer and its venv module. UID: the user that the programs run as; files
 # that are mounted into them (certificates) must be readable for this user.
 ARG BASE=python:3.11-slim
 

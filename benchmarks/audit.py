@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from farm.net.session import free_endpoint
-from farm.processes import Pool
-from learner.config import RunConfig, configure
-from learner.run import Placement, open_run
+from farm.processes import LocalWorkers
+from learner.run.config import RunConfig, configure
+from learner.run.launch import Placement, open_run
 from learner.scheduler.scheduler import SchedulerConfig
 
 AUDITS = (0.0, 0.02, 0.1)
@@ -44,7 +44,10 @@ def _rate(config: RunConfig, audit: float) -> float:
     flags = ["--connect", place.listen, "--log-level", "WARNING"]
     times: list[float] = []
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder) / "run", place) as run:
-        with Pool(1, [*flags, "--name", "a"], dict(os.environ)), Pool(1, [*flags, "--name", "b"], dict(os.environ)):
+        with (
+            LocalWorkers(1, [*flags, "--name", "a"], dict(os.environ)),
+            LocalWorkers(1, [*flags, "--name", "b"], dict(os.environ)),
+        ):
             for report in run.learn():
                 times.append(time.perf_counter())
                 last = report.progress

@@ -17,10 +17,10 @@ import numpy as np
 from running import learn
 
 from farm import seeds
-from learner.chain import Chained, chain
-from learner.config import configure
-from learner.replay import LoadedPolicy, load
-from learner.run_folder import RunFolder
+from learner.again.chain import Chained, chain
+from learner.again.replay import LoadedPolicy, load
+from learner.run.config import configure
+from learner.run.folder import RunFolder
 
 GAITS: Final = ("middle-on", "index-off", "index-on", "middle-off")
 SETTINGS: Final[dict[str, dict[str, Any]]] = {
@@ -66,7 +66,7 @@ def _since(run: Path, policy: LoadedPolicy) -> str:
     progress = [line for line in folder.progress() if line.rollouts <= FIRST or line.generation == policy.generation]
     starts = [seeds.trial(0, i) for i in range(TRIALS)]
     for line in progress:
-        mu, _ = folder.mean(line.generation)
+        mu, _ = folder.parameters.mean(line.generation)
         found = policy.runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), starts)
         robust.append(int(found.success.sum()))
     below = [at for at, good in enumerate(robust) if good < ENOUGH]

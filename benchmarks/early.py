@@ -1,4 +1,4 @@
-"""Finds the number of rollouts after which a preset's mean policy succeeds (results: docs/seeds.md). One process.
+"""Finds the rollouts after which a preset's mean policy succeeds (results: docs/results/seeds.md). One process.
 
     python benchmarks/early.py [--preset default] [--first 20] [--seeds 10] [--policy constant]
 
@@ -16,8 +16,8 @@ import numpy as np
 from farm import Policy, seeds
 from farm.arrays import FloatArray
 from farm.rollouts import Runner
-from learner import setup
-from learner.config import configure
+from learner.run import setup
+from learner.run.config import configure
 
 TRIALS = 100
 ENOUGH = 95  # of them

@@ -8,8 +8,8 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.rollouts import Runner
-from learner.config import configure
-from learner.setup import problem
+from learner.run.config import configure
+from learner.run.setup import problem
 
 STILL = 50.0
 """Value of every parameter: so far from every joint position that the kernel is zero and no rollout ends early."""

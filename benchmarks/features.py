@@ -16,8 +16,8 @@ import numpy as np
 
 from farm.rollouts import Runner
 from farm.tasks.loop import Batch, again
-from learner.config import configure
-from learner.setup import problem
+from learner.run.config import configure
+from learner.run.setup import problem
 
 ROLLOUTS = 30
 STEPS = 400  # physics steps of a measurement of MuJoCo alone

@@ -17,8 +17,8 @@ import numpy as np
 from farm import configure, rollouts, seeds
 from farm.rollouts import Runner
 from farm.sim.engines import BatchEngine
-from farm.sim.sim import MakeEngine
-from learner.setup import problem
+from farm.sim.interfaces import MakeEngine
+from learner.run.setup import problem
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, POSES
-from farm.tasks.finger_gait.task import CONTROL_PERIOD, TIMESTEP, FingerGait, FingerGaitConfig, moved
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD, TIMESTEP, moved
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.loop import Batch, Rollouts, again, whole
 
 SECONDS = (0.0, 0.5, 1.0, 2.0, 3.0)
@@ -47,7 +48,7 @@ def hold(object_name: str, pose: str, grip: str, options: Mapping[str, str] | No
     steps = round(SECONDS[-1] / CONTROL_PERIOD)
     config = FingerGaitConfig(object=object_name, pose=pose, start_grip=grip, goal_grip=grip, steps=steps)
     own = POSES[pose] if options is None else replace(POSES[pose], options=options)
-    task = FingerGait(config, files=model.posed(model.files(object_name, "opposed"), own))
+    task = FingerGait(config, files=model.posed(model.files([object_name], "opposed"), own))
     sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
 
     def held() -> Rollouts:

@@ -26,9 +26,9 @@ from farm.net import codec, keys, session
 from farm.net.events import Event
 from farm.net.messages import WorkRequest
 from farm.net.work import Chunk, Results
-from learner import setup
-from learner.config import RunConfig, configure
-from learner.run import Placement, open_run
+from learner.run import setup
+from learner.run.config import RunConfig, configure
+from learner.run.launch import Placement, open_run
 
 FARM = Placement().farm
 CREDITS = 400  # of a worker, in jobs
@@ -103,7 +103,7 @@ class Network:
             self._free[name] = done
             head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": name}
             jobs = chunk.take(np.argsort(chunk.indices).tolist())
-            results = Results.carrying(self._work.run(self._mu, jobs, self._traces), jobs, **head)
+            results = Results.carrying(self._work.run(self._mu, jobs, self._traces), jobs, 0.0, **head)
             self._send(done + self._latency, Event("result", keys.result(FARM, chunk.run, name), codec.encode(results)))
 
     def nothing(self, *_: object, **__: object) -> None:
@@ -135,7 +135,7 @@ def measure(workers: int, pair: float, latency: float, seconds: float) -> tuple[
         tempfile.TemporaryDirectory() as folder,
         patch.object(session, "listen", listen),
         patch.object(time, "monotonic", network.now),
-        open_run(config, Path(folder) / "run", Placement(record=False)) as run,
+        open_run(config, Path(folder) / "run", Placement(record=False, numbers="c")) as run,
         closing(run.learn()) as generations,
     ):
         for _ in generations:

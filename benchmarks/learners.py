@@ -21,9 +21,9 @@ from farm.arrays import FloatArray
 from farm.moments import merged, normaliser, usable
 from farm.rollouts import Runner
 from farm.tasks import loop
-from learner import setup
-from learner.config import RunConfig, configure
-from learner.learner import explored, learnt_from
+from learner.run import setup
+from learner.run.config import RunConfig, configure
+from learner.run.learner import explored, learnt_from
 
 ALGORITHMS: Final[Mapping[str, dict[str, Any]]] = {
     "pgpe": {
@@ -173,7 +173,7 @@ def _generation(runner: Runner, searches: Sequence[Search]) -> None:
     starts = [start for _, jobs in asked for start in jobs.seeds()]
     found = _together(runner, searches, thetas, starts)
     for search, (eps, _), rollouts in zip(searches, asked, found, strict=True):
-        told = learnt_from(search.config, search.problem.task, rollouts.returns.reshape(len(eps), -1), rollouts.steps)
+        told = learnt_from(search.config, search.problem.task, rollouts.returns, rollouts.steps)
         search.state = search.config.algorithm_config.tell(search.state, eps, told)
         search.rollouts += len(rollouts.returns)
         if search.moments.size:

@@ -6,8 +6,9 @@ The backends run in turn, several times, each time in a separate process. All ev
 of 100 mirrored pairs of the finger gait with perturbed starts, held still so that no rollout ends early, and
 generations of empty evaluations. Their rate of physics steps is divided by that of MuJoCo alone with two threads,
 measured in the same process just before and after. The other tools get each worker's half of a generation in one call,
-which is fastest for them, and do not update or save anything. The time of `farm run` includes updates and checkpoints,
-but not recording. Tools that are not installed are left out: `pip install ray distributed evotorch` installs all.
+which is fastest for them, and do not update or save anything. The time of `farm run` includes updates, checkpoints
+and, as users type it, the recording. Tools that are not installed are left out: `pip install ray distributed evotorch`
+installs all.
 """
 
 import argparse
@@ -26,6 +27,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +42,11 @@ from farm.arrays import FloatArray
 from farm.net.session import free_endpoint
 from farm.rollouts import Runner
 from farm.sim.engines import BatchEngine
-from farm.tasks.finger_gait.task import CLOSING, SUBSTEPS
+from farm.tasks.finger_gait.holding import CLOSING, SUBSTEPS
 from farm.tasks.loop import Batch, again
-from learner.config import RunConfig, configure
-from learner.run import Placement, open_run
-from learner.setup import problem
+from learner.run.config import RunConfig, configure
+from learner.run.launch import Placement, open_run
+from learner.run.setup import problem
 
 PAIRS = (15, 100)
 SECONDS = 1.0  # duration of each measurement
@@ -349,13 +351,13 @@ _LINEAR: Any = {"policy": "linear"}
 
 
 @contextmanager
-def of_run() -> Opened:
-    """`farm run` without recording, but with learning."""
+def of_run(*, record: bool) -> Opened:
+    """`farm run`: it learns, and records if wanted."""
     runs: dict[tuple[str, int], Any] = {}
     with tempfile.TemporaryDirectory() as folder:
 
         def begun(kind: str, pairs: int) -> Any:  # noqa: ANN401
-            place = Placement(workers=2, listen=free_endpoint(), record=False)
+            place = Placement(workers=2, listen=free_endpoint(), record=record)
             with open_run(_config(kind, pairs), Path(folder) / secrets.token_hex(4), place) as run:
                 yield from run.learn()
 
@@ -390,7 +392,8 @@ BACKENDS = {
     "evotorch": ("EvoTorch's PGPE on Ray, 2 actors", "evotorch", of_evotorch),
     "dask": ("Dask, 2 workers", "distributed", of_dask),
     "pool": ("`farm.Farm`, 2 workers", "farm", of_pool),
-    "run": ("`farm run`, 2 workers, learning", "farm", of_run),
+    "run": ("`farm run --no-record`, 2 workers, learning", "farm", partial(of_run, record=False)),
+    "recorded": ("`farm run`, 2 workers, learning and recording", "rerun", partial(of_run, record=True)),
 }
 
 

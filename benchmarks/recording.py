@@ -17,17 +17,17 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import rerun_cli
 
 from farm.net.session import free_endpoint
-from learner.config import RunConfig, configure
 from learner.recording.drawing import Drawing
-from learner.recording.run import RunRecording
-from learner.run import Placement, Run, open_run
+from learner.recording.run import RunRecording, open_recording
+from learner.run.config import RunConfig, configure
+from learner.run.launch import Placement, Run, open_run
 
 BLOCK = 10
 """Generations per block; the first of each block is left out, and the first four blocks of every run."""
@@ -91,21 +91,17 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
     place = Placement(workers=2, listen=free_endpoint(), record=False)
     port = int(free_endpoint().rpartition(":")[2])
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
-        recording = RunRecording(
-            Path(folder, "run.rrd"), replay=Path(folder, "replay.rrd"), run="r", config=config,
-            drawing=Drawing.of(run.learner.problem), done=0, serve=("127.0.0.1", port) if kind else None,
+        opened = open_recording(
+            Path(folder, "run.rrd"), run="r", config=config, drawing=Drawing.of(run.learner.problem), done=0,
+            serve=("127.0.0.1", port) if kind else None,
         )  # fmt: skip
-        looking = (
-            _viewer(str(recording.uri), stopped=kind == "stopped") if kind in ("watches", "stopped") else nullcontext()
-        )
-        try:
-            with looking:
-                _learn(run, recording, without, with_)
-        finally:
-            recording.finish()
+        with opened as made, ExitStack() as stack:
+            if kind in ("watches", "stopped"):
+                stack.enter_context(_viewer(str(made.uri), stopped=kind == "stopped"))
+            _learn(run, made, without, with_)
 
 
-def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> None:
+def _learn(run: Run, made: RunRecording, without: Times, with_: Times) -> None:
     """Collect each generation's times, except the first of a block and those of the first four blocks."""
     before = _now()
     for report in run.learn():
@@ -113,7 +109,7 @@ def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> N
         block, within = divmod(number, BLOCK)
         recorded = block % 4 in (1, 2)
         if within == 0:
-            recording.thread.settled()
+            made.settled()
         now = _now()
         if block >= 4 and within:
             times = with_ if recorded else without
@@ -121,7 +117,7 @@ def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> N
                 values.append(1e3 * (b - a))
         before = now
         if recorded:
-            recording.generation(report)
+            made.put(report)
 
 
 def _now() -> tuple[float, float, float]:

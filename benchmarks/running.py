@@ -7,10 +7,10 @@ from pathlib import Path
 from farm.commands.signals import INTERRUPTED
 from farm.errors import ConfigError, FarmError
 from farm.net.session import free_endpoint
-from learner.config import RunConfig
-from learner.run import Placement, open_run
-from learner.run_folder import RunFolder
-from learner.setup import fitted
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+from learner.run.launch import Placement, open_run
+from learner.run.setup import fitted
 
 
 def script(main: Callable[[], None]) -> None:

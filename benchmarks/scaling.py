@@ -26,7 +26,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -39,12 +39,14 @@ from farm.net import codec, keys, session
 from farm.net.events import Event, Events
 from farm.net.messages import Spec
 from farm.net.session import free_endpoint
-from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated, WireTrajectory, traced
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated, traced
 from farm.policies.base import Policy
 from farm.rollouts import served
 from farm.sim.scene import Scene
+from farm.sim.trajectory import Trajectory
 from farm.tasks.base import Task
-from workers.worker import IDLE, Worker, WorkerConfig
+from workers.config import WorkerConfig
+from workers.worker import IDLE, Worker
 
 TOGETHER = 32  # emulated workers per process
 MOST = 3200  # largest number of pairs per second
@@ -55,9 +57,6 @@ LOOK = 1.0  # [s] timeout of queries, and time between two idle checks
 class MadeUp:
     """Does a run's jobs as `Runner` does, but invents the numbers, which takes no time."""
 
-    known: ClassVar[dict[str, "MadeUp"]] = {}
-    """By the specification's digest; shared by all workers of a process."""
-
     def __init__(self, task: Task, policy: Policy) -> None:
         """Compute the shapes that the learner expects."""
         self.size, self.spec, self._parts = policy.size, policy.spec, task.substeps
@@ -65,7 +64,9 @@ class MadeUp:
         self._plain = {name: shape for name, shape in shapes.items() if not name.startswith("channels/")}
         self._channels = {name[9:]: shape for name, shape in shapes.items() if name.startswith("channels/")}
 
-    def run(self, mu: FloatArray, jobs: Jobs, traces: str = "none", _: FloatArray | None = None) -> Simulated:
+    def run(
+        self, mu: FloatArray, jobs: Jobs, traces: str = "none", _: FloatArray | None = None, **__: object
+    ) -> Simulated:
         """Invent results."""
         returns = jobs.theta(mu).sum(axis=1)
         exploring = ~np.repeat(jobs.seen, jobs.rollouts)
@@ -73,14 +74,41 @@ class MadeUp:
         seen = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
         flags = np.zeros((len(returns), 4), dtype=bool)
         steps = np.full(len(returns), self.spec.steps)
-        return Simulated(returns, flags, steps, np.zeros((len(rows), *self.spec.trace), "<f4"), seen)
+        traces = np.zeros((len(rows), *self.spec.trace), "<f4")
+        return Simulated(returns=returns, flags=flags, steps=steps, traces=traces, trajectories=seen)
 
-    def _trajectory(self, *, physics: bool) -> WireTrajectory:
+    def _trajectory(self, *, physics: bool) -> Trajectory:
         frames = self.spec.steps * (self._parts if physics else 1) + 1
         plain = {name: np.zeros((frames, *shape), "<f4") for name, shape in self._plain.items()}
         channels = {name: np.zeros((frames, *shape), "<f4") for name, shape in self._channels.items()}
         success = False if self.spec.success else None
-        return WireTrajectory(value=0.0, success=success, times=np.arange(frames) * 0.1, channels=channels, **plain)
+        return Trajectory(value=0.0, success=success, times=np.arange(frames) * 0.1, channels=channels, **plain)
+
+
+class MadeUpRunners:
+    """Instead of a worker's runners: one that makes up its numbers, shared by all workers of a process."""
+
+    known: ClassVar[dict[str, MadeUp]] = {}
+    """By the specification's digest."""
+
+    def __init__(self, farm: str, link: session.Session) -> None:
+        """Ask the learners of a farm for their specifications."""
+        self._farm, self._link = farm, link
+
+    def of(self, header: RoundHeader) -> MadeUp | None:
+        """A run's runner; None if its learner does not answer."""
+        if header.spec not in self.known:
+            payload = self._link.ask(keys.spec(self._farm, header.run), LOOK)
+            if payload is None:
+                return None
+            self.known[header.spec] = MadeUp(*served(codec.decode(payload, Spec)))
+        return self.known[header.spec]
+
+    def left(self, header: RoundHeader) -> None:
+        """A learner left."""
+
+    def close(self) -> None:
+        """End."""
 
 
 class Emulated(Worker):
@@ -95,6 +123,7 @@ class Emulated(Worker):
     def __init__(self, config: WorkerConfig, link: session.Session, agenda: "Agenda") -> None:
         """Send results by this agenda."""
         super().__init__(config, link)
+        self.runners = MadeUpRunners(config.farm, link)  # type: ignore[assignment]
         link.events = Noted(lambda: agenda.came.put((time.monotonic(), self)))
         self._agenda, self._until = agenda, 0.0
         self._arrived = self._cpu = 0.0
@@ -111,16 +140,10 @@ class Emulated(Worker):
         if time.monotonic() >= self._until + IDLE:  # until then it "simulates"
             super()._tell_idle()
 
-    def _runner(self, header: RoundHeader) -> Any:  # noqa: ANN401  instead of a Runner
-        if header.spec not in MadeUp.known:
-            payload = self._session.ask(keys.spec(self._config.farm, header.run), LOOK)
-            if payload is None:
-                return None
-            MadeUp.known[header.spec] = MadeUp(*served(codec.decode(payload, Spec)))
-        return MadeUp.known[header.spec]
-
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
-        key, payload = keys.result(self._config.farm, chunk.run, self.id), codec.encode(message)
+        if isinstance(message, Results):
+            message = replace(message, seconds=0.0)  # the learner measures: inventing takes no time
+        key, payload = keys.result(self._farm, chunk.run, self.id), codec.encode(message)
         took = self.pair * chunk.rollouts.sum() / 2 + time.thread_time() - self._cpu
         self._until = max(self._until, self._arrived) + took
         self._agenda.add(self._until, lambda: self._session.publish(key, payload))

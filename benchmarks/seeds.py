@@ -1,4 +1,4 @@
-"""Tests how reliably a preset learns: runs with several seeds, one table (results: docs/seeds.md).
+"""Tests how reliably a preset learns: runs with several seeds, one table (results: docs/results/seeds.md).
 
     python benchmarks/seeds.py [--preset default] [--seeds 10] [--out runs/seeds-default]
 

@@ -20,8 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from farm.net.session import free_endpoint
-from learner.config import RunConfig
-from learner.run import Placement, open_run
+from learner.run.config import RunConfig
+from learner.run.launch import Placement, open_run
 from learner.telemetry import report_log as history
 
 MOST = 4  # workers at a time

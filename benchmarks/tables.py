@@ -33,8 +33,8 @@ from farm.commands.signals import INTERRUPTED
 from farm.moments import merged, normaliser, usable
 from farm.rollouts import Runner
 from farm.tasks import loop
-from learner import setup
-from learner.config import RunConfig, configure
+from learner.run import setup
+from learner.run.config import RunConfig, configure
 
 LOOKS: Final = 20  # points of the learning curve
 
@@ -62,7 +62,7 @@ _BONUS: Final[Mapping[str, Any]] = {"normalise": True, "reward_offset": -1.0}
 TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
     # rl-baselines3-zoo, hyperparams/ars.yml and benchmark.md: one run each, of v3 environments.
     "ars": {
-        "Swimmer-v5": Row(_ars(0.02, 0.01, 1, 1, 2_000_000), 355.267, 12.796),
+        "Swimmer-v5": Row(_ars(0.02, 0.01, 1, 1, 2_000_000, bias=False), 355.267, 12.796),
         "Hopper-v5": Row(_ars(0.01, 0.025, 8, 4, 7_000_000, **_BONUS), 3343.919, 5.730),
         "HalfCheetah-v5": Row(_ars(0.02, 0.03, 32, 4, 12_500_000, **_KNOWN), 4815.192, 1340.752),
         "Walker2d-v5": Row(_ars(0.03, 0.025, 40, 30, 75_000_000, **_BONUS), 2993.582, 166.289),
@@ -73,6 +73,7 @@ TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
         "Walker2d-v5": Row(
             {
                 "policy": "linear",
+                "bias": False,
                 "normalise": True,
                 "algorithm": "pgpe",
                 "shaping": "ranks",
@@ -307,7 +308,10 @@ def _flags(values: Mapping[str, Any]) -> str:
     words = []
     for name, value in values.items():
         flag = "--" + name.replace("_", "-")
-        words += [flag] if value is True else [flag, f"{value:g}" if isinstance(value, float) else str(value)]
+        if isinstance(value, bool):
+            words.append(flag if value else f"--no-{name.replace('_', '-')}")
+        else:
+            words += [flag, f"{value:g}" if isinstance(value, float) else str(value)]
     return shlex.join(words)
 
 

@@ -23,8 +23,9 @@ from typing import Any, Final
 from farm import configure
 from farm.net import session
 from farm.net.session import free_endpoint
-from learner.run import Placement, open_run
-from workers.worker import Worker, WorkerConfig
+from learner.run.launch import Placement, open_run
+from workers.config import WorkerConfig
+from workers.worker import Worker
 
 PARTS: Final = {
     "simulate": "#009e73", "send results": "#e69f00", "hand out jobs": "#56b4e9", "take results": "#0072b2",
@@ -108,14 +109,14 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
         run = stack.enter_context(
             open_run(config, Path(folder, "r"), Placement(workers=0, listen=endpoint, record=False))
         )
-        begin, collect, take = run.farm.begin, run.farm.collect, run.farm._take
+        begin, collect, take = run.dispatcher.begin, run.dispatcher.collect, run.dispatcher._take
 
         def begun(*words: Any, **more: Any) -> None:  # noqa: ANN401
             rounds.append(time.monotonic())
             begin(*words, **more)
 
-        run.farm.begin = noting(learner, "hand out jobs", begun)  # type: ignore[method-assign]
-        run.farm._take = noting(learner, "take results", take)  # type: ignore[method-assign]
+        run.dispatcher.begin = noting(learner, "hand out jobs", begun)  # type: ignore[method-assign]
+        run.dispatcher._take = noting(learner, "take results", take)  # type: ignore[method-assign]
         ended = [0.0]
 
         def collected() -> Any:  # noqa: ANN401
@@ -125,7 +126,7 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
             ended[0] = time.monotonic()
             return results
 
-        run.farm.collect = collected  # type: ignore[method-assign]
+        run.dispatcher.collect = collected  # type: ignore[method-assign]
         command = [sys.executable, __file__, "--work", endpoint]
         pipe = subprocess.PIPE
         workers = [subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) for _ in range(2)]
@@ -134,10 +135,10 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
                 assert worker.stdin is not None
                 worker.stdin.write("\n")
                 worker.stdin.flush()
-            while len(run.farm.workers) < 2:
-                for event in run.farm._events():
+            while len(run.dispatcher.workers) < 2:
+                for event in run.dispatcher._events():
                     take(event)
-            for _ in run.learner.learn(run.farm):
+            for _ in run.learner.learn(run.dispatcher):
                 pass
         finally:
             said = [worker.communicate("\n")[0] for worker in workers]

@@ -26,8 +26,9 @@ from farm.sim.sim import Sim
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS, LOWER, UPPER
+from farm.tasks.finger_gait.holding import MAX_SHIFT, TIMESTEP
 from farm.tasks.finger_gait.model import Hand
-from farm.tasks.finger_gait.task import MAX_SHIFT, TIMESTEP, FingerGait, FingerGaitConfig
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.finger_gait.turning import Turning, turned, upright
 from farm.tasks.loop import Seed, again
 
@@ -166,7 +167,7 @@ def task(object_name: str = "plate", torsion: float | None = None) -> FingerGait
     config = FingerGaitConfig(object=object_name, pose="between", start_grip=three, goal_grip=three)
     if torsion is None:
         return FingerGait(config)
-    files = model.files(config.object, config.pose)
+    files = model.files([object_name], config.pose)
     thing = ET.fromstring(files["object.xml"])
     for geom in thing.iterfind(".//geom[@friction]"):
         sliding, _, rolling = geom.attrib["friction"].split()

@@ -25,8 +25,8 @@ from farm.policies.base import Policy
 from farm.sim import video
 from farm.tasks import loop
 from farm.tasks.finger_gait.hand import FINGERS
-from farm.tasks.finger_gait.task import CONTROL_PERIOD, SUBSTEPS
-from learner.replay import LoadedPolicy
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD, SUBSTEPS
+from learner.again.replay import LoadedPolicy
 
 ROWS: Final = "phase,phase+forces,phase+joints,phase+joints+forces"
 LONG: Final[Mapping[str, Any]] = {"steps": 160}

@@ -23,7 +23,7 @@ import rerun_cli
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 SIZE: Final = "1600x1000"
 _BAR: Final = 37  # [pixels] on top, where the viewer warns of the machine that it runs on
@@ -113,12 +113,12 @@ def main() -> None:
         _farm(folder, "run", *swim, "--name", "swim", "--quiet")
         _farm(folder, "run", "--task", "fragile-bar", "--name", "bar", "--quiet")
         for name, source, tab, at in (
-            ("viewer", "runs/first/run.rrd", "Learning", ("generation", {"sequence": 90})),
+            ("viewer", "runs/first/run.rrd", "", ("generation", {"sequence": 90})),
             ("rollout", "runs/first/run.rrd", "Rollout", ("sim_time", {"duration": 135.7})),
             ("replay", "runs/first/rollout.rrd", "", ("sim_time", {"duration": 1.2})),
             ("compare", "compare.rrd", "", None),
             ("fragile", "runs/bar/run.rrd", "Rollout", ("sim_time", {"duration": 51.2})),
-            ("gym", "runs/swim/run.rrd", "Learning", ("generation", {"sequence": 15})),
+            ("gym", "runs/swim/run.rrd", "", ("generation", {"sequence": 15})),
         ):
             with viewer() as shown:
                 shown.open(str(Path(folder, source)))

@@ -21,6 +21,6 @@ if __name__ == "__main__":
     with SummaryWriter("runs/logged/tensorboard") as writer:
         for report in farm.learn(config, "runs/logged/run", workers=2):
             for name, value in asdict(report.progress).items():
-                if value is not None:
-                    writer.add_scalar(name, float(value), report.progress.generation)
+                if isinstance(value, int | float):
+                    writer.add_scalar(name, value, report.progress.generation)
     print(f"logged {config.generations} generations: tensorboard --logdir runs/logged")

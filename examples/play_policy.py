@@ -31,6 +31,14 @@ def cos(x: np.ndarray) -> np.ndarray:
     return r + np.polyval(SINE, r * r) * (r * r) * r
 
 
+def sin(x: np.ndarray) -> np.ndarray:
+    """Sine for |x| < 10^6, with the same bits on every processor."""
+    k = np.rint(x * (1.0 / math.pi))
+    r = k * PI[0] - x + k * PI[1] + k * PI[2]
+    r = np.where(k % 2 == 0, -r, r)
+    return r + np.polyval(SINE, r * r) * (r * r) * r
+
+
 def cos_turns(x: np.ndarray) -> np.ndarray:
     """cos(2 pi x) in single precision, with the same bits on every processor."""
     s = np.abs(x - np.rint(x)) - 0.25
@@ -72,7 +80,7 @@ class Policy:
         self.sites = [self.model.site(name).id for name in self.p["tips"]]
         self.config = json.loads(self.p["policy_config"])
         self.bandwidth = self.config.get("bandwidth")
-        self.theta = self.p["mu"] if self.p["policy"] in ("rbf", "mlp") else self.p["mu"].reshape(8, -1)
+        self.theta = self.p["mu"] if self.p["policy"] in ("rbf", "mlp", "rnn") else self.p["mu"].reshape(8, -1)
         if "frequencies" in self.p:
             single = self.config["precision"] == "single"
             self.kind, self.cos, unit = (np.float32, cos_turns, 2.0 * math.pi) if single else (np.float64, cos, 1.0)
@@ -85,13 +93,14 @@ class Policy:
         """Set the moment of release: only the fingers hold the object."""
         mujoco.mj_setState(self.model, self.data, self.p["state"], self.p["state_kind"])
         self.x, self.last, self.released = self.p["x"], self.p["start_command"], self.data.qpos[8:].copy()
+        self.memory = self.p.get("memory")  # of a policy that has one
 
     def act(self) -> np.ndarray:
         """Compute one action (8,) [rad] and set the servos' targets from it."""
         x = self.x
         if "observation_mean" in self.p:
             x = (x - self.p["observation_mean"]) / self.p["observation_deviation"]
-        a = self.action(self.p["policy"], self.theta, x)
+        a = self.oscillate() if self.p["policy"] == "cpg" else self.action(self.p["policy"], self.theta, x)
         base = {"offset": self.p["start_command"], "absolute": 0.0, "increment": self.last}[self.p["action"]]
         target = base + a
         target[np.isnan(target)] = 0.0
@@ -112,14 +121,25 @@ class Policy:
             return self.config["weight_scale"] * theta[:, -1] * exp(powers(theta[:, :-1], y, bandwidth))
         if policy in ("linear", "constant"):  # a constant policy has no weights for x
             return (theta[:, :-1] * x[: theta.shape[1] - 1]).sum(axis=-1) + theta[:, -1]
-        if policy == "mlp":
-            for units in (*self.config["layers"], 8):
+        if policy in ("mlp", "rnn"):
+            layers = self.config["layers"] if policy == "mlp" else [self.config["units"]]
+            x = x if policy == "mlp" else np.concatenate([x, self.memory])
+            for units in (*layers, 8):
                 rows, theta = np.split(theta, [units * (len(x) + 1)])
-                rows = rows.reshape(units, -1)
+                rows, hidden = rows.reshape(units, -1), x
                 out = (np.ascontiguousarray(rows[:, :-1]) * x).sum(axis=-1) + rows[:, -1]
                 x = tanh(out)
+            self.memory = hidden  # the last hidden layer; an mlp does not read it
             return out
         return (theta * self.features(x)).sum(axis=-1).astype(float)
+
+    def oscillate(self) -> np.ndarray:
+        """The action (8,) of oscillators, whose phases advance."""
+        frequency, amplitude, shift, offset = self.theta.T
+        a = offset + amplitude * sin(2.0 * math.pi * self.memory + shift)
+        turns = self.memory + frequency * self.p["control_period"]
+        self.memory = turns - np.floor(turns)
+        return a
 
     def features(self, x: np.ndarray) -> np.ndarray:
         """Random Fourier features z(x), (d,) -> (D,)."""

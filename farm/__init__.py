@@ -19,24 +19,28 @@ if TYPE_CHECKING:
     from farm.settings import setting as setting
     from farm.sim.channels import Camera as Camera
     from farm.sim.channels import Channel as Channel
-    from farm.sim.sim import Backend as Backend
+    from farm.sim.channels import Measure as Measure
+    from farm.sim.interfaces import Backend as Backend
     from farm.sim.sim import Sim as Sim
     from farm.tasks.base import Record as Record
     from farm.tasks.base import Score as Score
     from farm.tasks.base import Task as Task
     from farm.tasks.base import TaskConfig as TaskConfig
     from farm.tasks.base import TaskSpec as TaskSpec
+    from farm.tasks.touch import Touch as Touch
+    from farm.tasks.touch import TouchConfig as TouchConfig
 
 _WHERE: Final = {
-    "learn": "learner.run", "Farm": "learner.pool", "load": "learner.replay",
-    "rewind": "learner.rewind",
-    "RunConfig": "learner.config", "configure": "learner.config",
+    "learn": "learner.run.launch", "tune": "learner.sweep.tune", "Farm": "learner.farm", "Evaluated": "learner.farm",
+    "load": "learner.again.replay", "rewind": "learner.again.rewind",
+    "RunConfig": "learner.run.config", "configure": "learner.run.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
-    "Channel": "farm.sim.channels", "Camera": "farm.sim.channels",
+    "Channel": "farm.sim.channels", "Camera": "farm.sim.channels", "Measure": "farm.sim.channels",
+    "Touch": "farm.tasks.touch", "TouchConfig": "farm.tasks.touch",
     "Record": "farm.tasks.base", "Score": "farm.tasks.base",
     "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",
     "Algorithm": "learner.algorithms", "SearchState": "learner.algorithms",
-    "Backend": "farm.sim.sim", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",
+    "Backend": "farm.sim.interfaces", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",
     "FarmError": "farm.errors", "ConfigError": "farm.errors", "CheckpointError": "farm.errors",
     "RunError": "farm.errors", "TaskError": "farm.errors",
 }  # fmt: skip

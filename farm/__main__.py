@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _streams()
         status = _run(list(sys.argv[1:] if arguments is None else arguments), own=own)
         sys.stdout.flush()
-    except (KeyboardInterrupt, Exception) as error:
+    except (KeyboardInterrupt, SystemExit, Exception) as error:
         status = _ended(error)
     if own:
         _signals(signal.SIG_DFL)
@@ -85,7 +85,9 @@ def _ended(error: BaseException) -> int:
         said, status = f"farm: cannot write to standard output: {unwritten.strerror}\n", 1
     else:
         plugins = sys.modules.get("farm.plugins")  # not imported here: there may be no file left to open
-        frames = plugins.author_frames(error) if plugins else []  # of a task of the user's own, whose lines help
+        frames = (
+            plugins.author_frames(error).format() if plugins else []
+        )  # of a task of the user's own, whose lines help
         if not frames and not isinstance(error, OSError):
             raise error
         reason = _system(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"

@@ -35,7 +35,18 @@ def printable(text: str, kept: str = "") -> str:
 
 
 class FarmError(Exception):
-    """One clear line: what was wrong, what was expected, what to do."""
+    """One clear line: what was wrong, what was expected, what to do.
+
+    Example:
+      ```python
+      import farm
+
+      try:
+          farm.configure("finger-gait", friction=-1.0)
+      except farm.FarmError as error:  # a ConfigError
+          print(error)
+      ```
+    """
 
     traceback: tuple[str, ...] = ()
     """The traceback of an error in code that ran in another process, in printable lines for its author."""

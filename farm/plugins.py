@@ -9,17 +9,22 @@ import ast
 import hashlib
 import importlib
 import importlib.util
+import re
+import stat
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, wraps
 from importlib.metadata import EntryPoint, entry_points
 from itertools import dropwhile
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, ParamSpec, TypeVar
 
-from farm.errors import ConfigError, UnservedError
+from farm.errors import ConfigError, TaskError, UnservedError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 COMMANDS: Final = {
     "run": "starts a learner and local workers: learns a task and records it",
@@ -29,12 +34,14 @@ COMMANDS: Final = {
     "new-task": "writes a task of 31 lines that runs, to start from",
     "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
     "evaluate": "tries the learnt mean policy on perturbed starts",
+    "verify": "repeats a run, and compares its numbers to the last bit",
     "replay": "simulates any policy or rollout of a run again, into a recording or a video",
     "chain": "runs learnt policies one after another, and counts the cycles",
     "compare": "puts several runs into one recording: curves together, scenes side by side",
     "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
     "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
     "sweep": "learns settings x seeds on one set of workers; a table and a figure",
+    "tune": "races policies and algorithms on one task; the best one learns to the end",
     "record": "records a run on any machine, over the network",
     "view": "opens the recordings of runs in the Rerun viewer",
     "runs": "prints a table of the runs in a folder",
@@ -43,7 +50,6 @@ COMMANDS: Final = {
     "certificates": "makes certificates for a farm of several machines",
 }
 """The built-in commands and their purposes."""
-
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     "tasks": {
         "finger-gait": "farm.tasks.finger_gait.task:FingerGait",
@@ -61,11 +67,14 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "mlp": "farm.policies.networks:Mlp",
         "rbf": "farm.policies.radial:Rbf",
         "weighted-kernel": "farm.policies.radial:WeightedKernel",
+        "rnn": "farm.policies.recurrent:Rnn",
+        "cpg": "farm.policies.recurrent:Cpg",
     },
     "algorithms": {
         "pgpe": "learner.algorithms.pgpe:PGPE",
         "snes": "learner.algorithms.snes:SNES",
         "ars": "learner.algorithms.ars:ARS",
+        "es": "learner.algorithms.es:ES",
         "cma-es": "learner.algorithms.cma:CMAES",
         "sep-cma": "learner.algorithms.cma:SepCMA",
     },
@@ -74,6 +83,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "tensorboard": "learner.loggers.tensorboard:TensorBoard",
         "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
+    "portfolios": {"general": "learner.sweep.portfolio:General"},
     "commands": {
         **{name: f"learner.commands.{name.replace('-', '_')}:main" for name in COMMANDS},
         **{name: f"farm.commands.{name}:main" for name in ("status", "router", "certificates")},
@@ -83,11 +93,12 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
 """Kinds of plug-ins, and the built-in ones by name. Strings, because farm/ must not import learner/ or workers/."""
 
 SOURCE_LIMIT: Final = 1_000_000
-"""Largest size of a file that is sent to workers [bytes]."""
+"""Largest size of a class's file, which may be sent to workers [bytes]."""
 
-_LINES: Final = 40  # most lines of a traceback that is sent to other machines
-_WIDTH: Final = 250  # most characters per line
+FILE_NAME: Final = re.compile(r"\w[\w. -]{0,100}\.py")
+"""Names of files that workers accept; such a name cannot lead out of its folder."""
 
+_LINES, _WIDTH = 40, 250  # most lines of a traceback that is sent to other machines, and characters per line
 _MODULES: Final = "rolloutfarm_file_"  # prefix of the names of modules made from files
 
 
@@ -171,17 +182,56 @@ def _from_package(kind: str, own: str, variant: str) -> Plugin:
                 ) from error
             return Plugin(kind, f"{own}:{variant}" if variant else own, target, variant, _release(point))
     known = ", ".join(names(kind))
-    files = "" if kind == "commands" else ", or FILE.py:CLASS"
+    files = "" if kind == "commands" else f", or FILE.py:CLASS{_beside(own)}"
     raise ConfigError(f"unknown {_one(kind)} {own[:80]!r}; known are {known}{files}")
 
 
-def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
+def _beside(name: str) -> str:
+    """A hint if there is a file with this name and classes in it, which is read but not run; else nothing."""
+    path = Path(name if name.endswith(".py") else f"{name}.py")
     try:
+        if not path.is_file() or path.stat().st_size > SOURCE_LIMIT:
+            return ""
+        classes = [node.name for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)]
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return ""
+    meant = " or ".join(f"{path}:{each}" for each in classes[:3])
+    return f"; did you mean {meant}?" if meant else ""
+
+
+def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
+    """A class's source; anything but a file of sensible name and size is refused before it is opened."""
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise kind(f"{what}: it is not a file")
+        if not FILE_NAME.fullmatch(path.name):
+            raise kind(f"{what}: its name may have letters, digits, '_', '.', '-' and spaces only; rename it")
+        if found.st_size > SOURCE_LIMIT:
+            raise kind(
+                f"{what} has {found.st_size} bytes; a class's file travels to workers and has at most {SOURCE_LIMIT}: "
+                "put data into a package"
+            )
         return path.read_bytes()
     except FileNotFoundError:
         raise kind(f"{what}: there is no such file") from None
     except OSError as error:
         raise kind(f"{what}: it cannot be read: {error.strerror}") from None
+
+
+def no_exit(call: Callable[P, T]) -> Callable[P, T]:
+    """Let a sys.exit in a plug-in's code be an error of this function: it must not end a program of the farm."""
+
+    @wraps(call)
+    def guarded(*values: P.args, **named: P.kwargs) -> T:
+        try:
+            return call(*values, **named)
+        except SystemExit as error:
+            last = author_frames(error)[-1:]
+            where = "".join(f" in {Path(each.filename).name}, line {each.lineno}" for each in last)
+            raise TaskError(f"sys.exit({error.code!r}){where}: raise an error instead") from error
+
+    return guarded
 
 
 def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
@@ -219,10 +269,11 @@ def _where(error: BaseException, path: Path) -> str:
     return f"{place}{type(error).__name__}: {error}"
 
 
-def author_frames(error: BaseException) -> list[str]:
-    """The frames of a traceback that are in plug-in files, as text; empty if there are none."""
+def author_frames(error: BaseException) -> traceback.StackSummary:
+    """The frames of a traceback that are in plug-in files; `format` gives their texts."""
     files = {module.__file__ for name, module in list(sys.modules.items()) if name.startswith(_MODULES)}
-    return traceback.format_list([each for each in traceback.extract_tb(error.__traceback__) if each.filename in files])
+    frames = traceback.extract_tb(error.__traceback__)
+    return traceback.StackSummary.from_list([each for each in frames if each.filename in files])
 
 
 def root(error: BaseException) -> BaseException:
@@ -239,7 +290,8 @@ def author_traceback(error: BaseException) -> tuple[str, ...]:
     frames = list(dropwhile(lambda each: each.filename.startswith(ours), traceback.extract_tb(error.__traceback__)))
     if not frames and not isinstance(error, SyntaxError):
         return ()
-    text = "".join([*traceback.format_list(frames), *traceback.format_exception_only(error)])
+    plain = traceback.format_list([(*each,) for each in frames])  # without carets, which differ between releases
+    text = "".join([*plain, *traceback.format_exception_only(error)])
     shown = ("".join(letter if letter.isprintable() else "?" for letter in line) for line in text.splitlines())
     return tuple(line[:_WIDTH] for line in shown)[-_LINES:]
 

@@ -27,7 +27,7 @@ def end(processes: "Sequence[subprocess.Popen[Any]]", grace: float) -> None:
             process.wait()
 
 
-class Pool:
+class LocalWorkers:
     """K processes `python -m workers`; one that dies is replaced."""
 
     def __init__(self, processes: int, arguments: Sequence[str], environment: dict[str, str]) -> None:
@@ -76,7 +76,7 @@ class Pool:
             if process.stdin:
                 process.stdin.close()
 
-    def __enter__(self) -> "Pool":
+    def __enter__(self) -> "LocalWorkers":
         return self
 
     def __exit__(self, *_: object) -> None:

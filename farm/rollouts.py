@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -11,14 +12,19 @@ from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, UnservedError
 from farm.moments import usable
 from farm.net.messages import Spec
-from farm.net.work import NOT_NORMALISED, Jobs, Simulated, WireTrajectory, traced
-from farm.policies.base import Policy
+from farm.net.work import NOT_NORMALISED, Jobs, Simulated, traced
+from farm.policies.base import Policy, check_vector
 from farm.policies.normalised import Normalised
 from farm.sim.engines import BatchEngine
+from farm.sim.interfaces import Backend, MakeEngine
+from farm.sim.model_files import Files, joined
 from farm.sim.scene import Scene, quiet
-from farm.sim.sim import Backend, MakeEngine, Sim
+from farm.sim.sim import Sim
+from farm.sim.trajectory import Trajectory
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
+from farm.tasks.outcomes import shares
+from farm.tasks.probe import specification
 
 SIMULATION = "farm.tasks.loop"
 """The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
@@ -27,6 +33,7 @@ SIMULATION = "farm.tasks.loop"
 class Runner:
     """Runs one run's jobs."""
 
+    @plugins.no_exit
     def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine, *, exact: bool = True) -> None:
         """Prepare the simulation; a ConfigError if the task cannot start.
 
@@ -39,7 +46,7 @@ class Runner:
         """
         quiet()
         self.task, self.policy = task, policy
-        self.spec, self.scene = policy.spec, Scene(task.model)
+        self.spec, self.scene = policy.spec, Scene.of(task.simulated)
         self.sim = Sim(task.engine(make))
         self._judge = self.sim if exact else Sim(task.engine(BatchEngine))
         loop.again(lambda: task.setup(self._judge))
@@ -49,8 +56,15 @@ class Runner:
         """Parameters of the policy, P."""
         return int(self.policy.size)  # a class of one's own may give numpy's integers
 
+    @plugins.no_exit
     def run(
-        self, mu: FloatArray, jobs: Jobs, traces: str = "none", normaliser: FloatArray = NOT_NORMALISED
+        self,
+        mu: FloatArray,
+        jobs: Jobs,
+        traces: str = "none",
+        normaliser: FloatArray = NOT_NORMALISED,
+        *,
+        terms: bool = False,
     ) -> Simulated:
         """Run jobs around a mean (P,).
 
@@ -59,39 +73,50 @@ class Runner:
           jobs: what to run.
           traces: which traces of exploring rollouts to return, one of TRACES.
           normaliser: as in a RoundHeader, (2, 2, d); with d > 0 the result has moments of the observations.
+          terms: whether the result has each reward term's part of the returns.
 
         Raises:
           UnservedError: the normaliser does not match the observations.
         """
-        theta, seeds = jobs.theta(mu), jobs.seeds()
-        policies, wanted = self._normalised(normaliser), normaliser.shape[-1]
-        kinds = jobs.physics * (1 + ~jobs.around) if wanted else jobs.physics * 1  # 2: has its own normaliser
-        if self._judge is not self.sim:
-            kinds[(jobs.seen | ~jobs.explores) & ~jobs.physics] = 3  # like 0, but on the processor
-        kind_of, there = np.repeat(kinds, jobs.rollouts), sorted(set(kinds.tolist()))
-        seen: dict[int, WireTrajectory] = {}
+        theta, seeds, wanted = jobs.theta(mu), jobs.seeds(), normaliser.shape[-1]
+        around, own = self._normalised(normaliser)
+        elsewhere = jobs.physics & ~jobs.around & bool(wanted)  # a rollout of an earlier generation
+        judged = (jobs.seen | ~jobs.explores) & ~jobs.physics & (self._judge is not self.sim)
+        seen: dict[int, Trajectory] = {}
         done: list[_Part] = []
-        for kind in there:
-            rows, physics = np.flatnonzero(kind_of == kind), kind in (1, 2)
-            some = (theta, seeds) if len(there) == 1 else (theta[rows], [seeds[row] for row in rows.tolist()])
-            rollouts = loop.run(
-                self.task, policies[kind % 3], self._judge if kind else self.sim, *some, int(physics),
-                moments=bool(wanted) and not physics,
-            )  # fmt: skip
-            for job in np.flatnonzero(jobs.seen & (kinds == kind)).tolist():
+        for chosen, policy, sim, every in (
+            (~jobs.physics & ~judged, around, self.sim, 0),
+            (judged, around, self._judge, 0),
+            (jobs.physics & ~elsewhere, around, self._judge, 1),
+            (elsewhere, own, self._judge, 1),
+        ):
+            rows = np.flatnonzero(np.repeat(chosen, jobs.rollouts))
+            if not len(rows):
+                continue
+            some = (theta, seeds) if chosen.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
+            moments = bool(wanted) and not every
+            rollouts = loop.run(self.task, policy, sim, *some, every, moments=moments)
+            for job in np.flatnonzero(jobs.seen & chosen).tolist():
                 first = int(jobs.rollouts[:job].sum())
-                seen[job] = WireTrajectory.of(self.trajectory(rollouts, int(np.searchsorted(rows, first))))
+                seen[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
             done.append((rows, rollouts))
         returns = _placed(done, lambda part: part.returns)
         chosen = traced(traces if self.spec.traced else "none", returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
-            returns,
-            _placed(done, lambda part: part.flags),
-            _placed(done, lambda part: part.steps),
-            self._traces(done, chosen),
-            tuple(seen[job] for job in sorted(seen)),
-            _placed(done, lambda part: _moments(part, wanted)) if wanted else np.empty((0, 0)),
+            returns=returns,
+            flags=_placed(done, lambda part: part.flags),
+            steps=_placed(done, lambda part: part.steps),
+            traces=self._traces(done, chosen),
+            trajectories=tuple(seen[job] for job in sorted(seen)),
+            measures=_placed(done, lambda part: part.measures) if self.spec.measures else np.empty((0, 0)),
+            terms=_placed(done, lambda part: shares(self.task, part.terms, part.clamped))
+            if terms
+            else np.empty((0, 0)),
+            moments=_placed(done, lambda part: _moments(part, wanted)) if wanted else np.empty((0, 0)),
         )
+
+    def _shares(self, rollouts: loop.Rollouts) -> FloatArray:
+        return shares(self.task, rollouts.terms, rollouts.clamped)
 
     def _traces(self, done: "list[_Part]", chosen: IntArray) -> AnyArray:
         """Traces of the chosen rollouts, (K, T, N)."""
@@ -102,20 +127,21 @@ class Runner:
                 values[mine] = loop.traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
         return values
 
-    def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy, Policy]:
-        """Policies for jobs at control rate, at physics rate, and with parameters of their own."""
+    def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy]:
+        """Policies for jobs of this round, and for a rollout of an earlier one."""
         if normaliser.shape[-1] not in (0, self.spec.observation):
             raise UnservedError(f"a normaliser of {normaliser.shape[-1]} numbers, not {self.spec.observation}")
         if not normaliser.size:
-            return (self.policy,) * 3
+            return self.policy, self.policy
         around, own = (Normalised(self.policy, each) for each in normaliser)
-        return around, around, own
+        return around, own
 
+    @plugins.no_exit
     def rollouts(self, theta: FloatArray, seeds: list[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
         """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
         return loop.run(self.task, self.policy, self.sim, theta, seeds, 1 if physics else 0)
 
-    def trajectory(self, rollouts: loop.Rollouts, row: int) -> Any:  # noqa: ANN401  a Trajectory
+    def trajectory(self, rollouts: loop.Rollouts, row: int) -> Trajectory:
         """One of them, frame by frame."""
         return loop.trajectory(self.task, self.spec, self.scene, rollouts, row)
 
@@ -147,8 +173,15 @@ def _moments(rollouts: loop.Rollouts, size: int) -> FloatArray:
     return np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
 
 
-def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
-    """The task and the policy of a run that a learner specified; these files may be served.
+def served(
+    spec: Spec, files: tuple[Path, ...] = (), contents: Mapping[str, bytes] = MappingProxyType({})
+) -> tuple[Task, Policy]:
+    """The task and the policy of a run that a learner specified.
+
+    Args:
+      spec: what it says.
+      files: files whose classes may be served.
+      contents: what is in the run's files that are no texts, by SHA-256.
 
     Raises:
       UnservedError: it names something that is missing here, is not allowed, or has different code here.
@@ -158,8 +191,8 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
         policy_class = _plugin("policies", spec.policy, spec.code.get("policy"), spec.policy_release, files)
         if plugins.code_digest(SIMULATION) != spec.code.get("simulation"):
             raise UnservedError(f"its simulation's code differs from the learner's (farm/); {_SAME}")
-        task = build_task(task_class, spec.task_config, spec.files)
-        sizes = task.spec()
+        task = build_task(task_class, spec.task_config, joined(spec.files, spec.assets, contents))
+        sizes = specification(task)
         if sizes.release != spec.task_release:
             raise UnservedError(
                 f"the run uses {spec.task} of {spec.task_release}, but {sizes.release} is installed here"
@@ -172,8 +205,8 @@ def served(spec: Spec, files: tuple[Path, ...] = ()) -> tuple[Task, Policy]:
         raise UnservedError(str(error)) from error
 
 
-def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Mapping[str, str] | None) -> Task:
-    """A task from its class, the settings in a table, and the run's texts."""
+def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Files | None) -> Task:
+    """A task from its class, the settings in a table, and the run's files."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
     return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
 
@@ -182,15 +215,20 @@ def build_policy(plugin: plugins.Plugin, config: Any, spec: TaskSpec, constants:
     """A policy from its class, its settings, the task's sizes and the run's constants.
 
     Raises:
-      ConfigError: it cannot be constructed, or its size is invalid.
+      ConfigError: it cannot be constructed, or its size, memory or scale is invalid.
     """
     policy = cast("Policy", _constructed(plugin, "config, spec and constants", config, spec, constants))
     size: object = policy.size
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
         raise ConfigError(f"size of {plugin.wire} is {size!r}; expected a whole number of at least 1")
+    check_vector(f"memory of {plugin.wire}", policy.memory)
+    check_vector(f"scale of {plugin.wire}", policy.scale, int(size))
+    if policy.scale is not None and not (policy.scale > 0.0).all():
+        raise ConfigError(f"scale of {plugin.wire} has {policy.scale.min()}; expected positive numbers")
     return policy
 
 
+@plugins.no_exit
 def _constructed(plugin: plugins.Plugin, arguments: str, *values: Any) -> Any:  # noqa: ANN401
     try:
         return plugin.target(*values)

@@ -11,7 +11,7 @@ import numpy as np
 SEEDS: Final = 2**32
 """Seeds are below this: one 32-bit word each."""
 
-_FEATURES, _EXPLORATION, _TRAINING, _TRIAL = range(1, 5)
+_FEATURES, _EXPLORATION, _TRAINING, _TRIAL, _START = range(1, 6)
 
 
 def features(seed: int) -> np.random.Generator:
@@ -19,14 +19,22 @@ def features(seed: int) -> np.random.Generator:
     return np.random.default_rng((_FEATURES, seed, 0, 0))
 
 
+def start(seed: int) -> np.random.Generator:
+    """Generator for the parameters at which a run's search starts."""
+    return np.random.default_rng((_START, seed, 0, 0))
+
+
 def exploration(seed: int, generation: int) -> np.random.Generator:
     """Generator for the perturbations eps of a generation."""
     return np.random.default_rng((_EXPLORATION, seed, generation, 0))
 
 
-def training(seed: int, generation: int, pair: int) -> tuple[int, ...]:
-    """Seed of the task's perturbation for a pair of exploring rollouts."""
-    return (_TRAINING, seed, generation, pair)
+def training(seed: int, generation: int, start: int) -> tuple[int, ...]:
+    """Seed of the task's perturbation for exploring rollouts: of a pair, or with several episodes of all that share it.
+
+    `start` is the pair's number, or the episode's.
+    """
+    return (_TRAINING, seed, generation, start)
 
 
 def trial(seed: int, rollout: int) -> tuple[int, ...]:

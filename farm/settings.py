@@ -11,11 +11,17 @@ import sys
 import types
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from farm.errors import ConfigError
 
 C = TypeVar("C")
+
+if TYPE_CHECKING:
+    Texts: TypeAlias = str | tuple[str, ...]
+    """One text, or several: its flag can be repeated. The dataclass itself makes it one or the other."""
+else:
+    Texts = tuple[str, ...]
 
 _NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+(None|'')\)")
 _OR_NONE: Final = re.compile(r"\{None\}\|(\S+)|\{None,(\S+)")
@@ -24,7 +30,25 @@ _FRAME: Final = "│╭╮╰╯─ \n"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Base of frozen, keyword-only settings; every value is checked against its annotation and bounds."""
+    """Base of frozen, keyword-only settings; every value is checked against its annotation and bounds.
+
+    Raises:
+      ConfigError: names the first value that is invalid, and what was expected.
+
+    Example:
+      ```python
+      from dataclasses import dataclass
+
+      import farm
+
+      @dataclass(frozen=True, kw_only=True)
+      class Climb(farm.Settings):
+          rate: float = farm.setting(0.1, above=0.0)
+          '''Length of a step.'''
+
+      assert Climb(rate=1).rate == 1.0
+      ```
+    """
 
     def __post_init__(self) -> None:
         check(self)
@@ -38,7 +62,18 @@ def setting(
     above: float | None = None,
     below: float | None = None,
 ) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
-    """A field with bounds: inclusive (least, most) or exclusive (above, below)."""
+    """A field with bounds: inclusive (least, most) or exclusive (above, below).
+
+    A value beyond them is a ConfigError of the dataclass, a `farm.Settings`.
+
+    Example:
+      ```python
+      import farm
+
+      share = farm.setting(0.5, above=0.0, most=1.0)  # a field of a dataclass: share: float = ...
+      assert share.default == 0.5
+      ```
+    """
     return field(default=default, metadata={"bounds": (least, most, above, below)})
 
 
@@ -201,8 +236,11 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
     out = copy.copy(default)
     for each in dataclasses.fields(default):  # type: ignore[arg-type]
         value = getattr(default, each.name)
-        if isinstance(value, tuple) and f"--{_flag(each.name)}" in given:
+        several = isinstance(value, tuple) or (isinstance(value, str) and _hints(type(default))[each.name] == Texts)
+        if several and f"--{_flag(each.name)}" in given:
             object.__setattr__(out, each.name, ())  # not checked here: the given values replace them
+        elif several and isinstance(value, str):
+            object.__setattr__(out, each.name, (value,))
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
             object.__setattr__(out, each.name, _emptied(value, arguments))
     return out

@@ -12,10 +12,10 @@ with atheris.instrument_imports(include=["farm"]):
     from farm.errors import MessageError
     from farm.net import codec
     from farm.net.messages import Refusal, Spec, WorkRequest
-    from farm.net.telemetry import RunHistory, RunReport, RunStatus
+    from farm.net.telemetry import Report, RunHistory, RunStatus
     from farm.net.work import Chunk, Failure, Results, RoundHeader
 
-KINDS = (Chunk, Failure, RoundHeader, Refusal, Results, RunHistory, RunReport, RunStatus, Spec, WorkRequest)
+KINDS = (Chunk, Failure, RoundHeader, Refusal, Results, Report, RunHistory, RunStatus, Spec, WorkRequest)
 
 
 def one(data: bytes) -> None:

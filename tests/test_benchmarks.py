@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from farm.net.session import free_endpoint
-from learner.config import RunConfig, configure
-from learner.run import Placement, open_run
-from learner.run_folder import RunFolder
+from learner.run.config import RunConfig, configure
+from learner.run.folder import RunFolder
+from learner.run.launch import Placement, open_run
+from learner.run.setup import problem
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
@@ -24,6 +25,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
         ("timeline.py --pairs 2 --generations 9", 6),
         ("scaling.py --workers 2,5 --pair 0.001 --seconds 0.5", 5),
         ("large.py --workers 2,5 --pair 0.001 --seconds 0.5", 2),
+        ("own_tasks.py --tasks Hopper --methods still,pycma --seeds 1 --rollouts 100 --out /dev/null", 1),
     ],
     ids=lambda value: str(value).partition(".")[0],
 )
@@ -66,6 +68,19 @@ def test_an_interrupted_run_continues(tmp_path: Path, monkeypatch: pytest.Monkey
     written = (tmp_path / "parts/summary.json").stat().st_mtime_ns
     learn(config, tmp_path / "parts", workers=1)
     assert (tmp_path / "parts/summary.json").stat().st_mtime_ns == written, "a finished run is not repeated"
+
+
+@pytest.mark.slow
+def test_the_fragile_bar_needs_no_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    from touch import FITS, Zeroed
+
+    runner = problem(configure("fragile-bar", joint_bias=0.2)).runner()
+    try:
+        success = Zeroed(runner, FITS[:64]).rollouts([(2, 0, 78, i) for i in range(64)])[0]
+    finally:
+        runner.close()
+    assert success.mean() >= 0.95
 
 
 def interrupt(config: RunConfig, path: Path, after: int) -> None:

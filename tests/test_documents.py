@@ -28,10 +28,31 @@ def test_messages_that_are_explained_exist(message: str) -> None:
     assert message in SAID
 
 
-def test_links_lead_somewhere() -> None:
-    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]:
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text("utf-8")):
-            assert (path.parent / target).exists(), f"{path.name}: {target}"
+WRITTEN = [
+    *ROOT.glob("*.md"),
+    *(path for f in (".github", "docs", "examples", "benchmarks", "assets") for path in (ROOT / f).rglob("*.md")),
+]
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    """Each relative link of a page leads to a file, and its anchor to a heading there."""
+    for target, anchor in re.findall(r"\]\(([^)#:]*)#?([^):]*)\)", page.read_text("utf-8")):
+        path = page.parent / target if target else page
+        assert path.exists(), target
+        assert not anchor or anchor in anchors(path.read_text("utf-8")), f"{target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", [page for page in WRITTEN if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
+def test_tests_that_pages_name_exist(page: Path) -> None:
+    known = {path.name for path in (ROOT / "tests").rglob("*.py")}
+    assert set(re.findall(r"\btest_\w+\.py\b", page.read_text("utf-8"))) <= known
+
+
+def anchors(text: str) -> set[str]:
+    """The addresses of a page's headings, as GitHub makes them."""
+    headings = [line.lstrip("#").strip() for line in text.splitlines() if line.startswith("#")]
+    return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
 SCRIPTS = "\n".join(path.read_text("utf-8") for name in ("benchmarks", "docs") for path in (ROOT / name).rglob("*.py"))
@@ -64,20 +85,6 @@ def parts(source: str) -> list[str]:
     return [re.sub(r">(\\n|\s)*<", "><", ast.dump(node)) for node in body]
 
 
-def _made(docs: Path) -> list[Path]:
-    """The index of the results and its pages."""
-    return [docs / "results.md", *(page for page in (docs / "results").glob("*.md") if page.name != "notes.md")]
-
-
-def test_the_results_anchors_exist() -> None:
-    """Each link from the index or a page of results leads to a heading."""
-    for path in _made(ROOT / "docs"):
-        for target, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", path.read_text("utf-8")):
-            text = (path.parent / target if target else path).read_text("utf-8")
-            headings = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")]
-            assert anchor in {re.sub(r"[^a-z0-9 -]", "", each.lower()).replace(" ", "-") for each in headings}, anchor
-
-
 @pytest.mark.slow
 def test_the_pages_of_results_are_what_the_recorded_data_says(tmp_path: Path) -> None:
     """Pages and figures made from a copy of docs/results are those of the project."""
@@ -85,12 +92,15 @@ def test_the_pages_of_results_are_what_the_recorded_data_says(tmp_path: Path) ->
     docs = ROOT / "docs"
     shutil.copytree(docs / "results", tmp_path / "results")
     shutil.copy(docs / "results.py", tmp_path)
-    for made in (*(tmp_path / "results").glob("*.svg"), *_made(tmp_path)):
-        made.unlink(missing_ok=True)
+    for copy in (tmp_path / "results").glob("*.svg"):
+        copy.unlink()
+    for copy in (tmp_path / "results").glob("*.md"):
+        os.utime(copy, (0, 0))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}  # benchmarks/ is in the checkout alone
     subprocess.run([sys.executable, tmp_path / "results.py", tmp_path / "results"], env=environment, check=True)
-    for page in _made(docs):
-        assert (tmp_path / page.relative_to(docs)).read_text("utf-8") == page.read_text("utf-8"), page.name
-    assert {page.name for page in _made(tmp_path)} == {page.name for page in _made(docs)}
+    made = [page.relative_to(tmp_path) for page in tmp_path.rglob("*.md") if page.stat().st_mtime > 0]
+    assert {Path("results.md"), Path("results/chain.md"), Path("results/future-work.md")} < set(made)
+    for page in made:
+        assert (tmp_path / page).read_text("utf-8") == (docs / page).read_text("utf-8"), page
     assert len((docs / "results.md").read_text("utf-8").splitlines()) <= 120
     assert {f.name for f in (tmp_path / "results").glob("*.svg")} == {f.name for f in (docs / "results").glob("*.svg")}

@@ -2,11 +2,17 @@ import ast
 import importlib.util
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from learning import learnt
+
+from learner.again.replay import load
+from learner.run.config import configure
 
 LEARN = Path(__file__).parents[1] / "examples" / "learn.py"
 
@@ -69,11 +75,58 @@ def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str)
     assert returns[-1] >= returns[0]
 
 
+@pytest.mark.slow
+def test_map_elites_fills_an_archive_and_repeats_its_elites(tmp_path: Path) -> None:
+    pytest.importorskip("ribs")
+    command = [sys.executable, LEARN.parent / "map_elites.py"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    counts = [int(count) for count in re.findall(r"(\d+) grips", said)]
+    assert len(counts) == 4
+    assert counts == sorted(counts)
+    assert counts[-1] > 70, "of 144 cells"
+    assert said.splitlines()[-1] == "every tenth elite again from its seed: the same returns"
+    with np.load(tmp_path / "archive.npz") as archive:
+        assert len(archive["solution"]) == counts[-1] == len(np.unique(archive["seed"]))
+        assert (archive["measures"] >= 0.0).all()
+        assert (archive["measures"] <= [0.5, 0.015]).all()
+        assert archive["objective"].max() > -1.0 > archive["objective"].min()
+    assert (tmp_path / "archive.svg").read_text().startswith("<?xml")
+
+
+@pytest.mark.slow
+def test_nsga2_finds_a_front_within_its_constraint(tmp_path: Path) -> None:
+    pytest.importorskip("pymoo")
+    command = [sys.executable, LEARN.parent / "nsga2.py"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    front = [tuple(map(float, pair)) for pair in re.findall(r"shift ([0-9.]+) mm, largest offset ([0-9.]+) rad", said)]
+    assert len(front) >= 5
+    assert front == sorted(front)
+    assert [offset for _, offset in front] == sorted((offset for _, offset in front), reverse=True), "a front"
+    assert front[0][0] < 4.0
+
+
 @pytest.mark.parametrize("name", SEARCHES)
 def test_a_search_takes_ten_lines(name: str) -> None:
     (main,) = [node for node in ast.parse((LEARN.parent / f"{name}.py").read_text()).body if isinstance(node, ast.If)]
     statements = [node for node in ast.walk(main) if isinstance(node, ast.stmt) and node is not main]
     assert len(statements) <= 10
+
+
+def test_a_robot_with_meshes_of_a_package(tmp_path: Path) -> None:
+    """The arm of dm_control, copied as the page says, learnt by a worker that has neither package nor files."""
+    found = importlib.util.find_spec("dm_control")
+    if found is None or not found.submodule_search_locations:
+        pytest.skip("dm_control is not installed")
+    theirs = Path(found.submodule_search_locations[0]) / "third_party/kinova"
+    shutil.copytree(theirs, tmp_path / "mine/kinova")
+    task = Path(shutil.copy(LEARN.parent / "tasks/jaco.py", tmp_path / "mine"))
+    config = configure(f"{task}:Jaco", generations=8, pairs=10)
+    summary = learnt(config, tmp_path / "r", 1, Path(shutil.copy(task, tmp_path)))
+    policy = load(tmp_path / "r")
+    assert policy.problem.task.model.nmesh == 5
+    before = load(tmp_path / "r", generation=0).rollout().trajectory.value
+    assert summary["mean_policy_return"] > before + 10.0
+    assert policy.rollout().trajectory.value == summary["mean_policy_return"]
 
 
 _SCRIPT = """

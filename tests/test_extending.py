@@ -5,10 +5,17 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from farm import Task
+from farm.sim.engines import BatchEngine
+from farm.sim.sim import Sim
+from farm.tasks import loop
 from learner.commands import new_task
 
 ROOT = Path(__file__).parent.parent
@@ -56,17 +63,65 @@ def test_the_page_shows_the_file_that_new_task_writes() -> None:
 
 def test_every_section_has_its_example() -> None:
     wanted = {"A policy": "linear.py", "An algorithm": "elite.py", "A backend": "threads.py", "A channel": "swing.py"}
-    wanted["A logger"] = "lines.py"
+    wanted |= {"A logger": "lines.py", "A policy with memory": "leaky.py"}
     for section, name in wanted.items():
         assert list(files(section)) == [name]
         assert commands(section, "run")
+
+
+def test_what_the_page_says_of_sim() -> None:
+    """`own` is created as the page shows, only `act` can write states, and outputs are one physics step late."""
+    [create] = re.findall(r"`(sim\.own\.setdefault.*?)`", SECTIONS[TASK])
+    write = textwrap.dedent("".join(re.findall(r"^    (?:now|sim\.).*\n", SECTIONS[TASK], re.M)))
+    assert len(write.splitlines()) == 3
+    found: dict[str, np.ndarray] = {}
+
+    class Slides(Task):
+        xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size="1"/></body>
+          <body name="goal" mocap="true"/></worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
+        steps, substeps = 3, 5
+
+        def reset(self, sim: Any, row: int, rng: np.random.Generator | None) -> None:
+            exec(create, {"sim": sim, "row": row, "rng": rng, "np": np})
+            sim.own["when"] = np.array([1, 2])
+
+        def observe(self, sim: Any) -> np.ndarray:
+            if sim.t == 0:
+                found["goal"] = sim.own["goal"].copy()
+                np.testing.assert_array_equal(sim.xpos[:, 1, 0], sim.qpos[:, 0])
+            else:
+                lag = sim.qpos[:, 0] - sim.xpos[:, 1, 0]
+                np.testing.assert_allclose(lag, sim.qvel[:, 0] * sim.model.opt.timestep, rtol=1e-9)
+            for name in ("qpos", "mocap_pos", "xfrc_applied", "ctrl"):
+                with pytest.raises(ValueError, match="read-only"):
+                    getattr(sim, name)[:] = 0.0
+            return sim.qpos
+
+        def act(self, sim: Any, action: np.ndarray) -> np.ndarray:
+            exec(write, {"sim": sim})
+            assert sim.xfrc_applied[:, 1, 0].tolist() == [5.0 * (sim.t >= 1), 5.0 * (sim.t >= 2)]
+            assert sim.mocap_pos[:, 0, 0].tolist() == [0.01 * sim.t] * 2
+            return np.ones((len(sim), 1))
+
+        def reward(self, sim: Any, action: np.ndarray) -> np.ndarray:
+            return sim.qpos[:, 0]
+
+    task = Slides()
+    sim = Sim(BatchEngine(task.model, 2))
+    batch = loop.again(lambda: loop.Batch(task, sim, [None, (1,)]))
+    for _ in range(task.steps):
+        loop.again(batch.observe)
+        batch.step(np.zeros((2, 1)))
+    assert found["goal"].shape == (2, 2)
+    assert (found["goal"][0] == 0.0).all()
+    assert (found["goal"][1] != 0.0).all()
 
 
 @pytest.mark.slow
 def test_a_task_in_a_file(tmp_path: Path) -> None:
     assert "farm check pendulum.py:Pendulum" in farm(tmp_path, "new-task", "pendulum")
     said = farm(tmp_path, *commands(TASK, "check")[0])
-    assert "same bits together, in another order, and one by one" in said
+    assert "same bits together, in another order, one by one, and in another process" in said
     [learn] = commands(TASK, "run")
     farm(tmp_path, *learn)
     learnt = summary(tmp_path, "pendulum")
@@ -84,11 +139,14 @@ def test_a_task_in_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_policy_an_algorithm_a_backend_and_a_channel(tmp_path: Path) -> None:
-    write(tmp_path, TASK, "A policy", "An algorithm", "A backend", "A channel")
-    for section in ("A policy", "An algorithm", "A backend", "A channel"):
+    write(tmp_path, TASK, "A policy", "A policy with memory", "An algorithm", "A backend", "A channel")
+    for section in ("A policy", "A policy with memory", "An algorithm", "A backend", "A channel"):
         for words in commands(section, "run"):
             farm(tmp_path, *words, *([] if section == "A channel" else ["--no-record"]))
-    assert summary(tmp_path, "linear")["rollouts"] == 300
+    assert summary(tmp_path, "linear")["rollouts"] == 320
+    assert summary(tmp_path, "leaky")["state"] == "finished"
+    words = commands("A policy with memory", "check")[0]
+    assert "same bits together, in another order" in farm(tmp_path, *words)
     assert summary(tmp_path, "elite")["generations"] == 8
     farm(tmp_path, "run", "--task", "pendulum.py:Pendulum", "--generations", "2", "--name", "plain", "--no-record")
     same = [summary(tmp_path, name)["parameters_sha256"] for name in ("threads", "plain")]

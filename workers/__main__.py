@@ -10,14 +10,16 @@ from dataclasses import dataclass
 from farm import settings as arguments
 from farm.commands.logs import Formatter
 from farm.errors import ConfigError, FarmError, printable
-from workers.worker import WorkerConfig, work
+from farm.settings import Settings
+from workers.config import WorkerConfig
+from workers.worker import work
 
 BROKEN = 70
 """Exit status after an error of the software itself, as in sysexits.h; the parent may start another worker."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Process:
+class Process(Settings):
     """One worker process."""
 
     worker: WorkerConfig

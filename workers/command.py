@@ -8,9 +8,9 @@ from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError
-from farm.processes import Pool
+from farm.processes import LocalWorkers
 from farm.settings import Settings, setting
-from workers.worker import WorkerConfig
+from workers.config import WorkerConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +29,8 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
-    processes = command.processes or len(os.sched_getaffinity(0))
-    with stop_flag("leaving") as stop, Pool(processes, _flags(command), dict(os.environ)) as pool:
+    processes = command.processes or _cores()
+    with stop_flag("leaving") as stop, LocalWorkers(processes, _flags(command), dict(os.environ)) as pool:
         while not stop.wait(0.2):
             ended = pool.tend()
             if ended and not pool.pids:
@@ -38,6 +38,11 @@ def main(words: Sequence[str]) -> int:
                     raise ConfigError("the workers could not start; see their messages above")
                 raise FarmError("no worker is left; see their messages above")
     return 0
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _flags(command: WorkerCommand) -> list[str]:

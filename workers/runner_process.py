@@ -5,23 +5,23 @@ the results. For what such a process can still access see docs/protocol.md, "Cod
 """
 
 import ctypes
-import resource
 import signal
 import socket
 import struct
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from farm import plugins, rollouts
-from farm.arrays import FloatArray
+from farm.arrays import FloatArray, array
 from farm.errors import FarmError, MessageError, UnservedError, brief
 from farm.net import codec
-from farm.net.codec import M, array
+from farm.net.codec import M
 from farm.net.messages import Spec
-from farm.net.work import Jobs, Results
+from farm.net.work import Jobs, Simulated
 from farm.rollouts import Runner, served
 
 _MOST: Final = 4 * codec.MAX_BYTES  # [bytes] of a mean, a chunk, a normaliser and their headers
@@ -38,6 +38,8 @@ class Begin:
     files: tuple[str, ...]
     """Paths of the files whose classes it may load."""
     backend: str
+    assets: str = ""
+    """Folder of the files that its model reads, by digest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,7 @@ class Order:
     traces: str
     mu: FloatArray = array("<f8", 1)
     normaliser: FloatArray = array("<f8", 3)
+    terms: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +59,8 @@ class Answer:
 
     size: int = 0
     """Number of policy parameters; in the reply to Begin."""
-    results: Results | None = None
-    """In the reply to an Order; without the names of run and worker, which this process does not know."""
+    results: Simulated | None = None
+    """In the reply to an Order."""
     error: str = ""
     served: bool = True
     """False: this process can run no job of this run."""
@@ -106,38 +109,47 @@ def serve(link: socket.socket) -> None:
     begin = receive(link, Begin)
     try:
         files = tuple(Path(path) for path in begin.files)
-        own = rollouts.backend(begin.backend)
-        runner = Runner(*served(begin.spec, files), own.engine, exact=rollouts.exact(own))
+        contents = {name: (Path(begin.assets) / name).read_bytes() for name in begin.spec.assets.values()}
+        backend = rollouts.backend(begin.backend)
+        runner = Runner(*served(begin.spec, files, contents), backend.engine, exact=rollouts.exact(backend))
     except Exception as error:  # the code may raise anything
-        send(link, _failed(error, begin.files))
+        send(link, _failed(error, begin.files, built=False))
         return
     send(link, Answer(size=runner.size))
     while True:
         order = receive(link, Order)
         try:
-            given = runner.run(order.mu, order.jobs, order.traces, order.normaliser)
-            answer = Answer(results=Results.carrying(given, order.jobs, run="", incarnation="", round=0, worker=""))
+            answer = Answer(results=runner.run(order.mu, order.jobs, order.traces, order.normaliser, terms=order.terms))
         except Exception as error:
             answer = _failed(error, begin.files)
         send(link, answer)
 
 
-def _failed(error: Exception, files: tuple[str, ...]) -> Answer:
+def _failed(error: Exception, files: tuple[str, ...], *, built: bool = True) -> Answer:
     text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
     if isinstance(plugins.root(error), FileNotFoundError):
-        text += "; files beside a class do not travel, but texts that its files() reads do"
+        text += "; files beside a class do not travel, but those that its xml names do"
     lines = plugins.author_traceback(error)
     for path in files:  # the author knows the file by its name, not by its path here
         text, lines = text.replace(path, Path(path).name), tuple(line.replace(path, Path(path).name) for line in lines)
-    return Answer(error=brief(text), served=not isinstance(error, UnservedError), traceback=lines)
+    return Answer(error=brief(text), served=built and not isinstance(error, UnservedError), traceback=lines)
+
+
+def _bound() -> None:
+    """End with the worker, gain no privileges (both on Linux only), and dump no core."""
+    if sys.platform == "linux":
+        kernel = ctypes.CDLL(None)
+        kernel.prctl(_PARENT_DIED, signal.SIGKILL, 0, 0, 0)
+        kernel.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
+    with suppress(ImportError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def main() -> None:
     """Drop privileges, then serve on the inherited socket."""
-    kernel = ctypes.CDLL(None)
-    kernel.prctl(_PARENT_DIED, signal.SIGKILL, 0, 0, 0)
-    kernel.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _bound()
     with socket.socket(fileno=int(sys.argv[1])) as link:
         link.set_inheritable(False)
         try:

@@ -1,16 +1,27 @@
-"""Source files received from learners, each in a folder named after its digest; deleted when the worker ends."""
+"""Files received from learners, by their digests; deleted when the worker ends: sources, and what models read.
 
+A worker that is killed leaves its files behind. Each worker locks its folder, and one that starts deletes those of this
+user whose lock is free.
+"""
+
+import fcntl
 import hashlib
+import os
 import re
+import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from farm.errors import UnservedError
-from farm.plugins import SOURCE_LIMIT
+from farm.plugins import FILE_NAME, SOURCE_LIMIT
+from farm.sim.model_files import FILE_LIMIT
+from farm.sim.model_files import digest as digest_of
 
+_PREFIX: Final = "rolloutfarm-code-"
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
-_NAME: Final = re.compile(r"\w[\w. -]{0,100}\.py")  # cannot lead out of its folder
+_ASSETS: Final = 1 << 30  # [bytes] of files that models read
 
 
 class SourceCache:
@@ -19,11 +30,13 @@ class SourceCache:
     def __init__(self) -> None:
         """Start without a folder: most workers need none."""
         self._root: tempfile.TemporaryDirectory[str] | None = None
+        self._lock = -1  # descriptor of the locked folder
 
     @property
     def _folder(self) -> Path:
         if self._root is None:
-            self._root = tempfile.TemporaryDirectory(prefix="rolloutfarm-code-")  # mode 0700
+            _clear()
+            self._root, self._lock = _locked()
         return Path(self._root.name)
 
     @property
@@ -39,7 +52,7 @@ class SourceCache:
         Raises:
           UnservedError: the name or the digest is malformed.
         """
-        if not _NAME.fullmatch(name) or not _DIGEST.fullmatch(digest):
+        if not FILE_NAME.fullmatch(name) or not _DIGEST.fullmatch(digest):
             raise UnservedError(f"{name[:100]!r} is not a valid name for a file; expected letters, digits and .py")
         return self._folder / digest / name
 
@@ -58,8 +71,55 @@ class SourceCache:
         path.write_bytes(source)
         return path
 
+    @property
+    def assets(self) -> Path:
+        """The folder of files that models read, named by their digests."""
+        folder = self._folder / "assets"
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def keep_asset(self, digest: str, content: bytes) -> None:
+        """Store a received file that a model reads.
+
+        Raises:
+          UnservedError: it is too large, does not match its digest, or there is no room for it.
+        """
+        if len(content) > FILE_LIMIT or digest_of(content) != digest:
+            raise UnservedError(f"a received file of {len(content)} bytes does not match its digest, or is too large")
+        held = sum(path.stat().st_size for path in self.assets.iterdir())
+        if held + len(content) > _ASSETS:
+            raise UnservedError(f"this worker holds {held >> 20} MiB of models' files and takes no more: restart it")
+        (self.assets / digest).write_bytes(content)
+
     def close(self) -> None:
         """Delete all files."""
         if self._root is not None:
             self._root.cleanup()
+            os.close(self._lock)
             self._root = None
+
+
+def _locked() -> tuple["tempfile.TemporaryDirectory[str]", int]:
+    """A new folder, and the descriptor that keeps it locked until this process ends, however it ends."""
+    while True:
+        root = tempfile.TemporaryDirectory(prefix=_PREFIX, ignore_cleanup_errors=True)  # mode 0700
+        with suppress(FileNotFoundError):
+            folder = os.open(root.name, os.O_RDONLY)
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            if Path(root.name).is_dir():
+                return root, folder
+            os.close(folder)
+        root.cleanup()  # another worker took it for one that was left, in the moment before it was locked
+
+
+def _clear() -> None:
+    """Delete the folders of this user's workers that were killed: their locks are free."""
+    for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with suppress(OSError):  # it is locked, or another worker is deleting it
+            folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                if os.fstat(folder).st_uid == os.getuid():
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(path)
+            finally:
+                os.close(folder)

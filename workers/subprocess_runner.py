@@ -90,7 +90,7 @@ class SubprocessRunner:
           process: one that is already waiting.
 
         Raises:
-          FarmError: the task cannot be built; with the reason, and the traceback if the code raised.
+          UnservedError: the task cannot be built; with the reason, and the traceback if the code raised.
         """
         self._begin, self._folder = begin, folder
         if process is not None and process.ended:
@@ -105,7 +105,13 @@ class SubprocessRunner:
         return self._process.pid
 
     def run(
-        self, mu: FloatArray, jobs: Jobs, traces: str = "none", normaliser: FloatArray = NOT_NORMALISED
+        self,
+        mu: FloatArray,
+        jobs: Jobs,
+        traces: str = "none",
+        normaliser: FloatArray = NOT_NORMALISED,
+        *,
+        terms: bool = False,
     ) -> Simulated:
         """Run jobs around a mean (P,); as `Runner.run`.
 
@@ -116,10 +122,11 @@ class SubprocessRunner:
         if self._process.ended:
             self._process.close()
             self._start(RunnerProcess(self._folder))
-        found = self._process.ask(Order(jobs=jobs, traces=traces, mu=mu, normaliser=normaliser), _JOBS).results
-        if found is None:
+        order = Order(jobs=jobs, traces=traces, mu=mu, normaliser=normaliser, terms=terms)
+        results = self._process.ask(order, _JOBS).results
+        if results is None:
             raise FarmError("the process that runs the run's code returned no results")
-        return Simulated(found.returns, found.flags, found.steps, found.traces, found.trajectories, found.moments)
+        return results
 
     def close(self) -> None:
         """End the process."""

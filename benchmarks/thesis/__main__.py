@@ -16,17 +16,17 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.thesis import catalogue
-from benchmarks.thesis.catalogue import EXPERIMENTS, TRIALS
+from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import judge, verdict
 from benchmarks.thesis.folder import ExperimentFolder, find
 from farm import settings
 from farm.commands import logs
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
-from learner import sweep
 from learner.commands.sweep import Runs, check_sharing
-from learner.figure import INSTALL, available
-from learner.sweep import Sharing
+from learner.sweep import runs as sweep
+from learner.sweep.figure import INSTALL, available
+from learner.sweep.runs import Sharing
 
 ALL: Final = "thesis"
 """The name for all experiments."""
@@ -45,8 +45,8 @@ class ExperimentCommand:
     """Names of experiments (see --list); thesis means all."""
     list: bool = False
     """List the experiments, and exit."""
-    trials: int = TRIALS
-    """Runs of each set-up, with seeds 0, 1, ..."""
+    trials: int | None = None
+    """Runs of each set-up, with seeds 0, 1, ...; None: those of the experiment, as in the results."""
     generations: int | None = None
     """Shorten every run to this number of generations."""
     out: Path | None = None
@@ -56,7 +56,7 @@ class ExperimentCommand:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        if not 1 <= self.trials <= 1000:
+        if self.trials is not None and not 1 <= self.trials <= 1000:
             raise ConfigError(f"trials is {self.trials}; expected 1 to 1000")
         if self.generations is not None and not 1 <= self.generations <= 10_000_000:
             raise ConfigError(f"generations is {self.generations}; expected 1 to 10000000")
@@ -146,7 +146,7 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
     lines = [f"{name}: {' and '.join(map(str, paths))}"]
     lines += [f"  {label}: {failure}" for label, series in data.series.items() for failure in series.failures()]
     found = judge(experiment, data)
-    lines += [f"  {'yes' if finding.holds else 'no '}  {finding.part}: {finding.numbers}" for finding in found]
+    lines += [f"  {finding.answer:<3}  {finding.part}: {finding.numbers}" for finding in found]
     if folder.generations is not None:
         lines.append(f"  runs shortened to {folder.generations} generations say little about the claim")
     elif experiment.claim and found:
@@ -158,18 +158,21 @@ def _list() -> None:
     table = Table()
     for column in ("experiment", "question", "runs", "rollouts", "minutes"):
         table.add_column(column, justify="left" if column in ("experiment", "question") else "right")
-    for name, experiment in EXPERIMENTS.items():
-        table.add_row(name, experiment.question, *_cost(tuple(experiment.curves.values())))
-    every = tuple(dict.fromkeys(s for e in EXPERIMENTS.values() for s in e.curves.values()))
-    table.add_row(ALL, "all experiments; a run that several of them share is done once", *_cost(every))
+    for name in EXPERIMENTS:
+        table.add_row(name, EXPERIMENTS[name].question, *_cost((name,)))
+    every = "all experiments; a run that several of them share is done once"
+    table.add_row(ALL, every, *_cost(tuple(EXPERIMENTS)))
     Console().print(table)
-    sys.stdout.write(f"Runs, rollouts and minutes on two cores, for {TRIALS} trials (--trials changes it)\n")
+    sys.stdout.write("Runs, rollouts and minutes on two cores (--trials changes the number of runs)\n")
 
 
-def _cost(setups: tuple[str, ...]) -> tuple[str, str, str]:
-    """Runs, rollouts and minutes of all trials of some set-ups."""
-    rollouts = TRIALS * sum(map(catalogue.rollouts, setups))
-    return str(TRIALS * len(setups)), str(rollouts), f"{TRIALS * catalogue.minutes(setups):.0f}"
+def _cost(names: tuple[str, ...]) -> tuple[str, str, str]:
+    """Runs, rollouts and minutes of experiments."""
+    folder = ExperimentFolder(path=Path(), experiments=names, trials=None, generations=None)
+    counts = {setup: folder.count(setup) for setup in folder.setups}
+    rollouts = sum(count * catalogue.rollouts(setup) for setup, count in counts.items())
+    minutes = sum(count * catalogue.minutes((setup,)) for setup, count in counts.items())
+    return str(sum(counts.values())), str(rollouts), f"{minutes:.0f}"
 
 
 def _exit(words: Sequence[str]) -> int:

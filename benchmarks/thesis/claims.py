@@ -1,10 +1,35 @@
 """Tests the claims of Plage 2016, and answers our own questions, from data: one function per experiment. Pure."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from benchmarks.thesis import shapes
-from benchmarks.thesis.experiment import Data, Finding, counted, spread
-from benchmarks.thesis.series import known_mean
+from benchmarks.thesis import shapes, statistics
+from benchmarks.thesis.experiment import UNDECIDED, UNTESTABLE, Data, Finding, counted, spread
+from benchmarks.thesis.series import Series, known_mean
+from farm.arrays import FloatArray
+
+
+def compared(
+    part: str, data: Data, found: tuple[statistics.Answer, float], said: str, which: Sequence[Series] = ()
+) -> Finding:
+    """A comparison of learning, with its p; it cannot be tested if none of the set-ups learns (`which`; else all)."""
+    answer, p = found
+    if not any(series.learnt.any() for series in which or data.series.values()):
+        return Finding(part, UNTESTABLE, f"{said}; none of them learns")
+    return Finding(part, answer, f"{said}; p = {p:.2g}")
+
+
+def near(part: str, data: Data, values: tuple[FloatArray, FloatArray], said: str, *, both: bool = True) -> Finding:
+    """Whether two set-ups' returns are equal up to NEAR; with both=False, whether the first is not lower than that."""
+    if not any(series.learnt.any() for series in data.series.values()):
+        return Finding(part, UNTESTABLE, f"{said}; none of them learns")
+    low, high = statistics.difference(*values)
+    said = f"{said}; 95 % interval of the difference {low:.2f} to {high:.2f}"
+    if low > -statistics.NEAR and (high < statistics.NEAR or not both):
+        return Finding(part, True, said)
+    apart = high < -statistics.NEAR or (both and low > statistics.NEAR)
+    return Finding(part, False if apart else UNDECIDED, said)
 
 
 def race(data: Data) -> list[Finding]:
@@ -55,23 +80,24 @@ def features(data: Data) -> list[Finding]:
     ends = [series.end("mean_policy_return") for series in (few, some, many)]
     areas = [np.nanmean(series.columns["return_mean"], axis=1) for series in (few, some, many)]
     nothing = bool(np.isnan(shapes.rise(few)).all()) and not few.learnt.any()
-    found = [
+    return [
         Finding("with D 300 nothing is learnt in 150 generations", nothing, counted(few)),
-        Finding(
+        compared(
             "D 8000 learns faster than D 1500, and D 1500 faster than D 300",
-            bool(areas[2].mean() > areas[1].mean() > areas[0].mean()),
+            data, statistics.all_above((areas[2], areas[1]), (areas[1], areas[0])),
             "return over all generations, D 300 first: " + "; ".join(spread(a) for a in areas),
         ),
-        Finding(
+        compared(
             "and ends with higher returns",
-            bool(ends[2].mean() > ends[1].mean() > ends[0].mean()),
+            data, statistics.all_above((ends[2], ends[1]), (ends[1], ends[0])),
             "mean policy at the end " + "; ".join(spread(e) for e in ends),
         ),
-    ]
-    if few.trials > 1:
-        said = f"standard deviation of these {ends[1].std():.2f} with D 1500, {ends[2].std():.2f} with D 8000"
-        found.append(Finding("with less spread between trials", bool(ends[2].std() < ends[1].std()), said))
-    return found
+        compared(
+            "with less spread between trials",
+            data, statistics.less_spread(ends[2], ends[1]),
+            f"standard deviation of these {ends[1].std():.2f} with D 1500, {ends[2].std():.2f} with D 8000",
+        ),
+    ]  # fmt: skip
 
 
 def learnt_within_90(data: Data) -> list[Finding]:
@@ -98,51 +124,52 @@ def learnt_within_90(data: Data) -> list[Finding]:
 def states(data: Data) -> list[Finding]:
     """Figure 4.4: with joints learning is fastest and returns are highest; with the tactile image it is slow."""
     joints, contacts, touch = data.series.values()
-    areas = [np.nanmean(s.columns["return_mean"][:, :80], axis=1).mean() for s in (joints, contacts, touch)]
-    ends = [s.end("mean_policy_return").mean() for s in (joints, contacts, touch)]
-    said = ", ".join(f"{area:.2f}" for area in areas)
+    areas = [np.nanmean(s.columns["return_mean"][:, :80], axis=1) for s in (joints, contacts, touch)]
+    ends = [s.end("mean_policy_return") for s in (joints, contacts, touch)]
+    said = "return over 80 generations " + ", ".join(f"{area.mean():.2f}" for area in areas)
+    slowest = statistics.all_above((areas[1], areas[2]), (areas[0], areas[2]))
     return [
-        Finding("with joints learning is fastest", bool(areas[0] == max(areas)), f"return over 80 generations {said}"),
-        Finding(
+        compared(
+            "with joints learning is fastest",
+            data, statistics.all_above((areas[0], areas[1]), (areas[0], areas[2])), said,
+        ),
+        compared(
             "and returns are highest",
-            bool(ends[0] == max(ends)),
-            "mean policy at the end " + ", ".join(f"{e:.2f}" for e in ends),
+            data, statistics.all_above((ends[0], ends[1]), (ends[0], ends[2])),
+            "mean policy at the end " + ", ".join(f"{e.mean():.2f}" for e in ends),
         ),
-        Finding(
-            "with joints and tactile image learning is slowest",
-            bool(areas[2] == min(areas)),
-            f"return over 80 generations {said}",
-        ),
-    ]
+        # Slower than with contact points: at least one of these two has to learn.
+        compared("with joints and tactile image learning is slowest", data, slowest, said, (contacts, touch)),
+    ]  # fmt: skip
 
 
 def pairs_per_generation(data: Data) -> list[Finding]:
     """Figure 4.5: N 50 rises sooner, drops, recovers; N 15 later, smoother."""
     many, few = data.series.values()
     rises, drops = (shapes.rise(many), shapes.rise(few)), (shapes.largest_drop(many), shapes.largest_drop(few))
-    ends = many.end("return_mean"), few.end("return_mean")
+    ends = few.end("return_mean"), many.end("return_mean")
+    learnt = any(series.learnt.any() for series in (many, few))
     return [
         Finding(
             "N 50 rises at generation 30 to 40",
-            shapes.about(rises[0], 25, 50),
+            shapes.about(rises[0], 25, 50) if learnt else UNTESTABLE,
             f"half of the rise at generation {spread(rises[0], 0)}",
         ),
         Finding(
             "N 15 rises at about 90",
-            shapes.about(rises[1], 60, 120),
+            shapes.about(rises[1], 60, 120) if learnt else UNTESTABLE,
             f"half of the rise at generation {spread(rises[1], 0)}",
         ),
-        Finding(
+        compared(
             "N 15 is smoother",
-            bool(drops[1].mean() < drops[0].mean()),
+            data, statistics.above(*drops),
             f"largest drop within 10 generations {spread(drops[1])}; with N 50 {spread(drops[0])}",
         ),
-        Finding(
+        near(
             "and ends nearly as high",
-            bool(ends[1].mean() > ends[0].mean() - 0.5),
-            f"return at the end {spread(ends[1])}; with N 50 {spread(ends[0])}",
+            data, ends, f"return at the end {spread(ends[0])}; with N 50 {spread(ends[1])}", both=False,
         ),
-    ]
+    ]  # fmt: skip
 
 
 def rollouts_count(data: Data) -> list[Finding]:
@@ -151,17 +178,14 @@ def rollouts_count(data: Data) -> list[Finding]:
     budget = few.rollouts * few.columns["return_mean"].shape[1]
     until = budget // many.rollouts
     area = (
-        np.nanmean(many.columns["return_mean"][:, :until], axis=1),
         np.nanmean(few.columns["return_mean"], axis=1),
+        np.nanmean(many.columns["return_mean"][:, :until], axis=1),
     )
-    said = f"return over the first {budget} rollouts {spread(area[1])}; with N 50 {spread(area[0])}"
-    found = [
-        Finding("with the same number of rollouts, N 15 learns faster", bool(area[1].mean() > area[0].mean()), said)
+    said = f"return over the first {budget} rollouts {spread(area[0])}; with N 50 {spread(area[1])}"
+    return [
+        compared("with the same number of rollouts, N 15 learns faster", data, statistics.above(*area), said),
+        near("what matters is the number of rollouts: N 15 and N 50 learn as fast", data, area, said),
     ]
-    if many.trials > 1:
-        near = abs(area[1].mean() - area[0].mean()) < max(np.ptp(area[0]), np.ptp(area[1]))
-        found.append(Finding("N matters less than chance: what matters is the number of rollouts", bool(near), said))
-    return found
 
 
 def remedies(data: Data) -> list[Finding]:
@@ -181,17 +205,14 @@ def remedies(data: Data) -> list[Finding]:
 
 def no_difference(data: Data) -> list[Finding]:
     """4.1.2: over 2000 histories the number per generation makes no difference."""
-    if min(series.trials for series in data.series.values()) < 2:
-        return []
     ends = {}
     for label, series in data.series.items():
         kept = max(1, round(500 / series.rollouts))
         ends[label] = known_mean(series.columns["return_mean"][:, -kept:], axis=1)
-    means = np.array([e.mean() for e in ends.values()])
     said = "; ".join(f"{label}: {spread(e)}" for label, e in ends.items())
-    within = max(float(np.ptp(e)) for e in ends.values())
-    what = "after 2000 histories, values of N differ less than trials with one N (last 500 rollouts)"
-    return [Finding(what, bool(np.ptp(means) < within), said)]
+    lowest, *_, highest = sorted(ends.values(), key=np.mean)
+    what = "after 2000 histories the returns do not depend on N (last 500 rollouts)"
+    return [near(what, data, (highest, lowest), said)]
 
 
 def only_projected_recovers(data: Data) -> list[Finding]:
@@ -199,20 +220,14 @@ def only_projected_recovers(data: Data) -> list[Finding]:
     direct, projected = data.series.values()
     rises, fallen = (shapes.rise(direct), shapes.rise(projected)), (shapes.fallen(direct), shapes.fallen(projected))
     rose = [int((~np.isnan(rise)).sum()) for rise in rises]
-    said = f"{rose[0]} of {direct.trials} direct, {rose[1]} of {projected.trials} projected"
-    return [
-        Finding("both rise", min(rose) > direct.trials / 2, said),
-        Finding(
-            "direct learning falls and stays down",
-            bool(fallen[0].mean() > 0.5),
-            f"{int(fallen[0].sum())} of {direct.trials}",
-        ),
-        Finding(
-            "projected learning does not",
-            bool(fallen[1].mean() < 0.5),
-            f"{int(fallen[1].sum())} of {projected.trials} do",
-        ),
-    ]
+    learnt = any(series.learnt.any() for series in data.series.values())
+    parts = [
+        ("both rise", min(rose) > direct.trials / 2, f"{rose[0]} of {direct.trials} direct, {rose[1]} of "
+         f"{projected.trials} projected"),
+        ("direct learning falls and stays down", fallen[0].mean() > 0.5, f"{int(fallen[0].sum())} of {direct.trials}"),
+        ("projected learning does not", fallen[1].mean() < 0.5, f"{int(fallen[1].sum())} of {projected.trials} do"),
+    ]  # fmt: skip
+    return [Finding(part, bool(holds) if learnt else UNTESTABLE, said) for part, holds, said in parts]
 
 
 def scale_free(data: Data) -> list[Finding]:

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from benchmarks.thesis.series import Series
+from benchmarks.thesis.statistics import share
 from farm.arrays import FloatArray
-from learner.config import RunConfig
+from learner.run.config import RunConfig
 
 Panel = Literal["return", "mean policy", "success", "sigma", "mu_2", "sigma_2", "action"]
 """A quantity over the generations, one panel of a figure."""
@@ -71,13 +72,25 @@ class Data:
     """Configurations, by their label in the legend."""
 
 
+UNDECIDED: Final = "undecided"
+"""The trials do not show whether a part of a claim is true."""
+
+UNTESTABLE: Final = "cannot be tested"
+"""A part of a claim compares how set-ups learn, but none of them learns."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """One part of a claim, and its result."""
 
     part: str
-    holds: bool
+    holds: bool | Literal["undecided", "cannot be tested"]
     numbers: str
+
+    @property
+    def answer(self) -> str:
+        """Whether the part is true, in a word or two."""
+        return {True: "yes", False: "no"}.get(self.holds, str(self.holds))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +108,8 @@ class Experiment:
     figure: Figure = field(default_factory=Curves)
     find: Callable[[Data], list[Finding]] | None = None
     """Tests the claim on the recorded data."""
+    trials: int = 5
+    """Number of trials of each set-up that are shown; the thesis has three. More where five decide nothing."""
 
 
 def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunConfig:
@@ -104,7 +119,7 @@ def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunC
     return replace(setup, seed=number)
 
 
-Verdict = Literal["reproduced", "not reproduced", "in part", "open"]
+Verdict = Literal["reproduced", "not reproduced", "in part", "undecided", "cannot be tested", "open"]
 
 
 def judge(experiment: Experiment, data: Data) -> list[Finding]:
@@ -122,8 +137,14 @@ def verdict(findings: Sequence[Finding]) -> Verdict:
     """The verdict on all parts of a claim; open if there are no findings."""
     if not findings:
         return "open"
-    held = [finding.holds for finding in findings]
-    return "reproduced" if all(held) else "in part" if any(held) else "not reproduced"
+    held = {finding.holds for finding in findings}
+    if held == {True}:
+        return "reproduced"
+    if True in held:
+        return "in part"
+    if False in held:
+        return "not reproduced"
+    return UNDECIDED if UNDECIDED in held else UNTESTABLE
 
 
 def spread(values: FloatArray, digits: int = 2) -> str:
@@ -137,7 +158,14 @@ def spread(values: FloatArray, digits: int = 2) -> str:
 
 
 def counted(series: Series) -> str:
-    """Number of trials that learnt, and the generations from which every mean policy succeeds, as text."""
-    since = series.since[series.learnt]
-    when = f" (every mean policy succeeds from generation {', '.join(f'{g:.0f}' for g in sorted(since))} on)"
-    return f"{int(series.learnt.sum())} of {series.trials} learnt{when if len(since) else ''}"
+    """Number of trials that learnt, its interval, and the generations from which every mean policy succeeds."""
+    since = np.sort(series.since[series.learnt])
+    when = ", ".join(f"{g:.0f}" for g in since)
+    if len(since) > _LISTED:
+        when = f"{np.median(since):.0f} (median; {since[0]:.0f} to {since[-1]:.0f})"
+    low, high = share(int(series.learnt.sum()), series.trials)
+    said = f"{int(series.learnt.sum())} of {series.trials} learnt ({100 * low:.0f} to {100 * high:.0f} %)"
+    return f"{said}; every mean policy succeeds from generation {when} on" if len(since) else said
+
+
+_LISTED: Final = 5  # generations; of more trials the median and the range

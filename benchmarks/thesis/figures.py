@@ -15,8 +15,8 @@ from benchmarks.thesis.claims import features_for
 from benchmarks.thesis.experiment import Chain, Curves, Data, Experiment, Friction, KernelError, Panel, Transfer
 from benchmarks.thesis.series import known_mean
 from farm.arrays import FloatArray
-from learner.config import RunConfig
-from learner.config import flat as settings
+from learner.run.config import RunConfig
+from learner.run.config import flat as settings
 
 _STYLE: Final = {
     "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,

@@ -19,8 +19,8 @@ from benchmarks.thesis import catalogue, series
 from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import Data, Experiment, trial
 from farm.errors import ConfigError
-from learner.config import RunConfig
-from learner.run_folder import RunFolder
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
 
 _VERSION: Final = 1
 
@@ -32,7 +32,8 @@ class ExperimentFolder:
     path: Path
     experiments: tuple[str, ...]
     """Their names."""
-    trials: int
+    trials: int | None
+    """Number of trials of every set-up; None: that of its experiment."""
     generations: int | None
     """Number of generations of every run; None: that of its set-up."""
 
@@ -52,15 +53,17 @@ class ExperimentFolder:
         names = told.get("experiments") if isinstance(told, dict) and told.get("version") == _VERSION else None
         if not isinstance(names, list) or not names:
             raise ConfigError(f"{path / 'experiment.json'} is not of version {_VERSION}")
-        generations = told.get("generations")
+        trials, generations = told.get("trials"), told.get("generations")
         return cls(
             path=path, experiments=tuple(find(str(name)).name for name in names),
-            trials=_count("trials", told.get("trials")),
+            trials=None if trials is None else _count("trials", trials),
             generations=None if generations is None else _count("generations", generations),
         )  # fmt: skip
 
     @classmethod
-    def prepare(cls, path: Path, names: Sequence[str], trials: int, generations: int | None) -> "ExperimentFolder":
+    def prepare(
+        cls, path: Path, names: Sequence[str], trials: int | None, generations: int | None
+    ) -> "ExperimentFolder":
         """A new folder, or an existing one to continue, perhaps with more trials.
 
         Raises:
@@ -74,8 +77,9 @@ class ExperimentFolder:
             if there.generations != generations:
                 said = "all" if there.generations is None else there.generations
                 raise ConfigError(f"{path} was started with {said} generations: use the same, or a different --out")
-            if there.trials > trials:
-                raise ConfigError(f"{path} has {there.trials} trials: give as many or more, or a different --out")
+            most, wanted = (max(map(each.count, each.setups), default=0) for each in (there, folder))
+            if most > wanted:
+                raise ConfigError(f"{path} has {most} trials: give as many or more, or a different --out")
         try:
             if not (path / "experiment.json").exists() and path.exists() and any(path.iterdir()):
                 raise ConfigError(f"{path} holds something else and no experiment.json: give a different --out")
@@ -95,6 +99,16 @@ class ExperimentFolder:
         """The set-ups that its experiments show, each once."""
         return tuple(dict.fromkeys(name for e in self.experiments for name in EXPERIMENTS[e].curves.values()))
 
+    def shown(self, experiment: Experiment) -> int:
+        """Number of trials of each set-up that an experiment shows."""
+        return self.trials or experiment.trials
+
+    def count(self, setup: str) -> int:
+        """Number of trials of a set-up: as many as any of the experiments shows."""
+        return max(
+            self.shown(EXPERIMENTS[name]) for name in self.experiments if setup in EXPERIMENTS[name].curves.values()
+        )
+
     def config(self, setup: str, number: int) -> RunConfig:
         """Configuration of a trial."""
         return trial(catalogue.config(setup), number, self.generations)
@@ -106,7 +120,9 @@ class ExperimentFolder:
     @property
     def runs(self) -> dict[Path, RunConfig]:
         """Configurations by run folder, trial by trial, so that each set-up has an early result."""
-        pairs = [(setup, number) for number in range(self.trials) for setup in self.setups]
+        counts = {setup: self.count(setup) for setup in self.setups}
+        most = max(counts.values(), default=0)
+        pairs = [(setup, number) for number in range(most) for setup in self.setups if number < counts[setup]]
         return {self.run(*pair).path: self.config(*pair) for pair in pairs}
 
     def check_runs(self, *, go_on: bool = False) -> None:
@@ -118,7 +134,7 @@ class ExperimentFolder:
           ConfigError: a run has a different configuration, or is missing.
         """
         for setup in self.setups:
-            folders = [self.run(setup, number) for number in range(self.trials)]
+            folders = [self.run(setup, number) for number in range(self.count(setup))]
             there = [folder.path.exists() for folder in folders]
             for number, folder in enumerate(folders):
                 if there[number] and folder.read_config() != self.config(setup, number):
@@ -141,7 +157,7 @@ class ExperimentFolder:
         """
         self.check_runs()
         for setup in self.setups:
-            folders = [self.run(setup, number) for number in range(self.trials)]
+            folders = [self.run(setup, number) for number in range(self.count(setup))]
             file = self.path / "data" / f"{setup}.npz"
             if any(folder.path.exists() for folder in folders) or not file.exists():
                 series.save(file, series.read(folders, self.config(setup, 0)))

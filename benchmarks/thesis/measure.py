@@ -21,13 +21,14 @@ from farm.policies.fourier import FeaturesConfig, Projected
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskSpec
 from farm.tasks.finger_gait.hand import LOWER, UPPER
-from farm.tasks.finger_gait.task import SUCCESS_STEPS, FingerGait, Perturbation
+from farm.tasks.finger_gait.holding import SUCCESS_STEPS, Perturbation
+from farm.tasks.finger_gait.task import FingerGait
 from farm.tasks.loop import Seed
-from learner.chain import chain
-from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED
-from learner.replay import LoadedPolicy, loaded
-from learner.replay import load as load_policy
-from learner.run_folder import RunFolder
+from learner.again.chain import chain
+from learner.again.replay import LoadedPolicy, loaded
+from learner.again.replay import load as load_policy
+from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED
+from learner.run.folder import RunFolder
 
 _POINTS: Final = 40
 """Number of states; the kernel is compared for all pairs of them."""
@@ -45,10 +46,11 @@ def measure(folder: ExperimentFolder, experiment: Experiment) -> None:
     if measuring is None:
         return
     path = folder.measured(experiment)
+    count = folder.shown(experiment)
     known = {name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()}
     of = {"hashes": np.array([digest for series in known.values() for digest in series.hashes])}
     of["recorded"] = np.array([(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in known.values()])
-    of |= {"trials": np.array(folder.trials), "figure": np.array(repr(experiment.figure))}
+    of |= {"trials": np.array(count), "figure": np.array(repr(experiment.figure))}
     if path.exists():
         kept = read_arrays(path)
         if all(name in kept and np.array_equal(kept[name], value) for name, value in of.items()):
@@ -70,9 +72,9 @@ def _measuring(experiment: Experiment) -> Measuring | None:
     return {Transfer: _transfer, Friction: _friction, Chain: _chain, KernelError: _kernel_error}[type(figure)]
 
 
-def _trials(folder: ExperimentFolder, setup: str) -> list[RunFolder | None]:
-    """A set-up's runs; None for a run without a learnt policy."""
-    runs = [folder.run(setup, number) for number in range(folder.trials)]
+def _trials(folder: ExperimentFolder, experiment: Experiment, setup: str) -> list[RunFolder | None]:
+    """A set-up's runs that an experiment shows; None for a run without a learnt policy."""
+    runs = [folder.run(setup, number) for number in range(folder.shown(experiment))]
     return [run if run.checkpoint.exists() else None for run in runs]
 
 
@@ -85,13 +87,13 @@ def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyA
     """
     names = list(experiment.curves.values())
     longest = max(folder.config(name, 0).generations for name in names)
-    action = np.full((len(names), folder.trials, longest), np.nan)
+    action = np.full((len(names), folder.shown(experiment), longest), np.nan)
     saturated = action.copy()
     for i, name in enumerate(names):
-        for trial, run in enumerate(_trials(folder, name)):
+        for trial, run in enumerate(_trials(folder, experiment, name)):
             if run is None or not run.progress():
                 continue
-            rows = run.parameters()
+            rows = run.parameters.rows()
             rollouts = loaded(run).runner.rollouts(rows["mu"].astype(float), [None] * len(rows))
             at = rows["generation"] - 1
             with np.errstate(over="ignore"):
@@ -111,9 +113,9 @@ def _transfer(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
     """
     assert isinstance(experiment.figure, Transfer)
     objects = experiment.figure.objects
-    rate = np.full((len(experiment.curves), folder.trials, len(objects)), np.nan)
+    rate = np.full((len(experiment.curves), folder.shown(experiment), len(objects)), np.nan)
     for i, name in enumerate(experiment.curves.values()):
-        for trial, run in enumerate(_trials(folder, name)):
+        for trial, run in enumerate(_trials(folder, experiment, name)):
             for j, item in enumerate(objects if run else ()):
                 assert run
                 rate[i, trial, j] = _success(load_policy(run.path, object=item))
@@ -128,9 +130,9 @@ def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
     """
     assert isinstance(experiment.figure, Friction)
     factors = experiment.figure.factors
-    rate = np.full((len(experiment.curves), folder.trials, len(factors)), np.nan)
+    rate = np.full((len(experiment.curves), folder.shown(experiment), len(factors)), np.nan)
     for i, name in enumerate(experiment.curves.values()):
-        for trial, run in enumerate(_trials(folder, name)):
+        for trial, run in enumerate(_trials(folder, experiment, name)):
             if run is None:
                 continue
             for j, factor in enumerate(factors):
@@ -177,9 +179,10 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
     assert isinstance(experiment.figure, Chain)
     steps = experiment.figure.steps
     most = steps // SUCCESS_STEPS
-    reached = np.full((folder.trials, most + 1), np.nan)
+    reached = np.full((folder.shown(experiment), most + 1), np.nan)
     shown: dict[str, AnyArray] = {"acting": np.full(steps, -1), "force": np.zeros((steps, 3))}
-    for trial, runs in enumerate(zip(*(_trials(folder, name) for name in experiment.curves.values()), strict=True)):
+    known = (_trials(folder, experiment, name) for name in experiment.curves.values())
+    for trial, runs in enumerate(zip(*known, strict=True)):
         policies = [loaded(run) for run in runs if run is not None]
         if len(policies) == len(runs):
             chained = chain(policies, _drawn(), steps)
@@ -202,10 +205,10 @@ def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str,
         states = np.random.default_rng(0).uniform(size=(_POINTS, size))
         squares = ((states[:, None] - states) ** 2).sum(axis=-1)
         for j, count in enumerate(counts):
-            for trial in range(folder.trials):
+            for trial in range(folder.shown(experiment)):
                 config = FeaturesConfig(features=count)
                 spec = TaskSpec(observation=size, action=1, steps=1, period=1.0)
                 policy = Projected(config, spec, Projected.draw(config, spec, seeds.features(trial)))
                 mapped = np.stack([policy.features(state) for state in states])
-                error[i, j] += np.abs(mapped @ mapped.T - np.exp(-squares / 2)).max() / folder.trials
+                error[i, j] += np.abs(mapped @ mapped.T - np.exp(-squares / 2)).max() / folder.shown(experiment)
     return {"error": error, "sizes": np.array(SIZES), "features": np.array(counts)}

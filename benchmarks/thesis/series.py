@@ -14,8 +14,8 @@ import numpy as np
 
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError, RunError
-from learner.config import RunConfig
-from learner.run_folder import RunFolder
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
 
 COLUMNS: Final = (
     "return_mean", "mean_policy_return", "mean_policy_success", "success_rate", "sigma_mean", "mu_2", "sigma_2",
@@ -190,7 +190,7 @@ def _run(folder: RunFolder) -> tuple[dict[str, FloatArray], dict[str, Any], int]
     for name in ("mu_2", "sigma_2"):
         columns[name] = np.full(len(progress), np.nan)
     if progress and (folder.path / "parameters").exists():  # it comes right after the first line
-        rows = folder.parameters()
+        rows = folder.parameters.rows()
         rows = rows[rows["generation"] <= len(progress)]
         for name in ("mu", "sigma"):
             columns[f"{name}_2"][rows["generation"] - 1] = rows[name][:, min(_SECOND, rows[name].shape[1] - 1)]

@@ -106,8 +106,8 @@ def _add(command: CertificatesCommand) -> None:
     if not command.others:
         raise ConfigError("nothing to add: give --worker NAME or --viewer NAME")
     authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
-    known = {name for names in roster.values() for name in names}
-    if twice := sorted({name for _, name in command.others if name in known or _folder(command, name)}):
+    names = {name for names in roster.values() for name in names}
+    if twice := sorted({name for _, name in command.others if name in names}):
         raise ConfigError(f"{', '.join(twice)} has a certificate already: farm certificates renew replaces it")
     _issue(command, authority, command.others, roster)
     sys.stdout.write(f"copy {command.dir}/ca/roster.json to the learner's bundle (or the router's) and restart it\n")
@@ -133,7 +133,7 @@ def _issue(
 ) -> None:
     """Make bundles, all or none, update the list of admitted names, and print the new folders."""
     with ExitStack() as undo:
-        made = []
+        moves = []
         for role, name in wanted:
             folder = command.dir / (LEARNER if role == "learner" else f"{role}-{name}")
             aside = command.dir / f".{folder.name}.new"
@@ -141,37 +141,29 @@ def _issue(
             undo.callback(shutil.rmtree, aside, ignore_errors=True)
             own = () if role != "learner" else command.learner if hosts is None else hosts
             authority.issue(aside, role, name, command.days, own)
-            made.append((aside, folder))
+            moves.append((aside, folder))
             roster[f"{role}s"] = sorted({name, *roster.get(f"{role}s", [])})
-        for aside, folder in made:
+        for aside, folder in moves:
             shutil.rmtree(folder, ignore_errors=True)
             aside.rename(folder)
     text = json.dumps({part: roster.get(part, []) for part in _PARTS}, indent=2) + "\n"
     for folder in (command.dir / "ca", command.dir / LEARNER):
         if folder.is_dir():  # the learner's may have been moved to its machine
             (folder / "roster.json").write_text(text, "utf-8")
-    folders = "\n  ".join(str(folder) for _, folder in made)
+    folders = "\n  ".join(str(folder) for _, folder in moves)
     sys.stdout.write(f"made, one folder for each machine to copy there:\n  {folders}\n")
 
 
 def _roster(folder: Path) -> dict[str, list[str]]:
     """The admitted names by role: the authority's own list, wherever bundles were moved."""
-    for path in (folder / "ca" / "roster.json", folder / LEARNER / "roster.json"):
-        if path.exists():
-            try:
-                values = json.loads(path.read_text("utf-8"))
-                return {part: [keys.checked(part, name) for name in values[part]] for part in _PARTS}
-            except (ValueError, KeyError, TypeError, RecursionError, ConfigError):
-                raise ConfigError(f"{path} is damaged: expected lists of names: {', '.join(_PARTS)}") from None
-    found = {
-        f"{role}s": [path.parent.name.removeprefix(f"{role}-") for path in folder.glob(f"{role}-*/cert.pem")]
-        for role in ("worker", "viewer")
-    }
-    return {"learners": [LEARNER], **found}
-
-
-def _folder(command: CertificatesCommand, name: str) -> bool:
-    return any((command.dir / f"{role}-{name}").exists() for role in ("worker", "viewer"))
+    path = folder / "ca" / "roster.json"
+    try:
+        values = json.loads(path.read_text("utf-8"))
+        return {part: [keys.checked(part, name) for name in values[part]] for part in _PARTS}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, ConfigError):
+        raise ConfigError(
+            f"{path} is missing or damaged: expected lists of {', '.join(_PARTS)}; the learner's bundle has a copy"
+        ) from None
 
 
 def _hosts(folder: Path) -> tuple[str, ...]:

@@ -33,6 +33,9 @@ def set_up(level: str) -> None:
 
 
 def say(*lines: str) -> None:
-    """Write lines to standard output, at once even if it is a pipe."""
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    """Write lines to standard output, at once even if it is a pipe; control characters are escaped.
+
+    A name in them may come from a task, a folder or another machine.
+    """
+    sys.stdout.write("".join(printable(line, kept="\n") + "\n" for line in lines))
     sys.stdout.flush()

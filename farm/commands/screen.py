@@ -23,9 +23,15 @@ def display() -> bool:
 
 
 def draw_offscreen() -> None:
-    """Let MuJoCo draw without a window if there is no screen; the user's own MUJOCO_GL is kept."""
-    if not display():
-        os.environ.setdefault("MUJOCO_GL", "osmesa" if ctypes.util.find_library("OSMesa") else "egl")
+    """Let MuJoCo draw without a window if there is no screen; the user's own MUJOCO_GL is kept.
+
+    Nothing is chosen if neither library is installed: MuJoCo could not even be imported then.
+    """
+    if display():
+        return
+    for name in ("OSMesa", "EGL"):
+        if ctypes.util.find_library(name):
+            os.environ.setdefault("MUJOCO_GL", name.lower())
 
 
 def compact(title: str | None = None) -> Table:

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from rich.console import Group
 from rich.live import Live
@@ -16,47 +15,42 @@ from farm.commands import logs
 from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import stop_flag
 from farm.errors import FarmError, MessageError
+from farm.link import Joining
 from farm.net import codec, keys
-from farm.net.session import LISTEN, Session, connect
+from farm.net.session import Session, connect
 from farm.net.telemetry import RunStatus
-from farm.net.tls import Bundle, find
+from farm.net.tls import Bundle
+from farm.settings import setting
 
 _ANSWER = 1.0  # [s] that learners have to answer
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatusCommand:
+class StatusCommand(Joining):
     """Shows the runs and workers of a farm, and their state; on a terminal refreshed until Ctrl-C."""
 
-    connect: tuple[str, ...] = ()
-    """Where a learner or a router listens, repeatable; by default tcp/127.0.0.1:7447."""
-    farm: str = "farm"
-    """Name of the farm."""
-    tls: Path | None = None
-    """Folder with certificates: a viewer's bundle."""
-    name: str = ""
-    """Which viewer's certificate to use, if the folder holds several."""
     run: str = ""
     """Show only this run; exit status 1 if its learner does not answer."""
     worker: str = ""
     """Exit status 1 if there is no worker with this name."""
     json: bool = False
     """Print JSON once instead of a table."""
-    timeout: float = 5.0
+    timeout: float | None = setting(5.0, least=0.0, most=1e6)
     """Give up if nothing has answered after this time [s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for kind in ("run", "worker"):
+            if name := getattr(self, kind):
+                keys.checked(kind, name)
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(StatusCommand, words, "farm status")
-    keys.checked("farm", command.farm)
     logs.set_up("ERROR")
-    bundle = None if command.tls is None else find(command.tls, "viewer", command.name)
-    endpoints = command.connect or (LISTEN if bundle is None else LISTEN.replace("tcp/", "tls/"),)
-    if command.worker:
-        keys.checked("worker", command.worker)
-    run = keys.checked("run", command.run) if command.run else "*"
-    with stop_flag() as stop, connect(endpoints, command.timeout, stop.is_set, bundle) as session:
+    bundle, run = command.bundle, command.run or "*"
+    with stop_flag() as stop, connect(command.endpoints, command.timeout, stop.is_set, bundle) as session:
         runs = ask(session, command.farm, run)
         _check(command, session, runs)
         if command.json:
@@ -99,8 +93,8 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
     if not runs:
         return Group(*shown, "no runs: no learner answers")
     table = compact(time.strftime("runs at %H:%M:%S"))
-    for name in ("run", "generation", "return", "mean policy", "open", "reissued", "refused", "ignored"):
-        table.add_column(name, justify="left" if name in ("run", "ignored") else "right", overflow="fold")
+    for name in ("run", "generation", "return", "mean policy", "open", "reissued", "refused", "numbers", "ignored"):
+        table.add_column(name, justify="left" if name in ("run", "numbers", "ignored") else "right", overflow="fold")
     workers = compact("workers")
     for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "1/s", "seen", "ignored"):
         right = name in ("cores", "rollouts", "1/s", "seen")
@@ -109,7 +103,16 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
         ignored = _counts(run.ignored)
         figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
-        what = run.run, generation, *figures, str(run.open), str(run.reissued), str(run.refused), ignored
+        what = (
+            run.run,
+            generation,
+            *figures,
+            str(run.open),
+            str(run.reissued),
+            str(run.refused),
+            run.numbers[:8],
+            ignored,
+        )
         table.add_row(*map(plain, what))
         for worker in run.workers:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]

@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 5
+SCHEMA: Final = 7
 """Version of all messages; included in each of them."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -34,14 +34,6 @@ _TEXT: Final = 1000  # characters of a name or a line
 
 M = TypeVar("M")
 C = TypeVar("C", bound=Sized)
-
-
-def array(dtype: str, ndim: int, default: AnyArray | None = None) -> Any:  # noqa: ANN401  as dataclasses.field is typed
-    """A dataclass field for an array of that dtype and number of dimensions; floats must be finite."""
-    kind = {"dtype": np.dtype(dtype), "ndim": ndim}
-    if default is None:
-        return dataclasses.field(metadata=kind)
-    return dataclasses.field(metadata=kind, default_factory=lambda: default)
 
 
 def encode(message: object, schema: int | None = None) -> bytes:

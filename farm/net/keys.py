@@ -7,6 +7,7 @@
 <farm>/run/<run>/claim             queryable: when the run's learner started
 <farm>/run/<run>/spec              queryable: what is simulated
 <farm>/run/<run>/code/<digest>     queryable: the source of a class in a file; only with TLS
+<farm>/run/<run>/asset/<digest>    queryable: a file that the task's model reads, such as a mesh
 <farm>/run/<run>/generation        published and queryable: the current round
 <farm>/run/<run>/result/<worker>   results
 <farm>/run/<run>/status            queryable: state of the run
@@ -67,6 +68,11 @@ def spec(farm: str, run: str) -> str:
 def code(farm: str, run: str, digest: str) -> str:
     """Where the source with this SHA-256 can be queried; run and digest `*` for all."""
     return f"{farm}/run/{run}/code/{digest}"
+
+
+def asset(farm: str, run: str, digest: str) -> str:
+    """Where the task's file with this SHA-256 can be queried; run and digest `*` for all."""
+    return f"{farm}/run/{run}/asset/{digest}"
 
 
 def generation(farm: str, run: str) -> str:

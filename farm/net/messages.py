@@ -4,6 +4,7 @@ All messages are soft state: any of them may be lost, duplicated or late. Messag
 carry (run, incarnation, round): the run's name, an id of its learner's start, and the number of the batch of jobs.
 """
 
+import re
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ import numpy as np
 _SHORT: Final = 250  # characters; names have up to 100, a worker's has two of them
 _KINDS: Final = 20  # kinds of ignored messages
 _RUNS: Final = 1000  # runs that a worker serves
+_DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 
 
 def check_counts(ignored: dict[str, int]) -> None:
@@ -19,6 +21,13 @@ def check_counts(ignored: dict[str, int]) -> None:
     kinds = len(ignored) <= _KINDS and all(type(kind) is str for kind in ignored)
     if not kinds or any(len(kind) > _SHORT or type(n) is not int for kind, n in ignored.items()):
         raise ValueError("ignored messages that are not a few numbers by kind")
+
+
+def check_assets(assets: dict[str, str]) -> None:
+    """Check that files by path are SHA-256 in hexadecimal digits; raises ValueError otherwise."""
+    for name, digest in assets.items():
+        if type(name) is not str or type(digest) is not str or not _DIGEST.fullmatch(digest):
+            raise ValueError(f"a file {str(name)[:40]!r} without a SHA-256")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +46,6 @@ class WorkRequest:
     """Fingerprint of its machine's numbers; empty for a device, whose results are not reproducible."""
     host: str
     cores: int
-    """Number of processor cores of its machine."""
     ignored: dict[str, int] = field(default_factory=dict)
     """Number of ignored messages by kind."""
 
@@ -72,7 +80,9 @@ class Spec:
     task_release: str = ""
     """Of the package that simulates the task, as in its TaskSpec."""
     files: dict[str, str] = field(default_factory=dict)
-    """Files of the task by name: models, objects."""
+    """Texts of the task by path: models, objects."""
+    assets: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the other files of the task by path: meshes, textures."""
     constants: dict[str, Any] = field(default_factory=dict)
     """Constant arrays of the policy by name."""
 
@@ -80,6 +90,7 @@ class Spec:
         for table in (self.code, self.files):
             if any(type(name) is not str or type(text) is not str for name, text in table.items()):
                 raise ValueError("a text that is not a string")
+        check_assets(self.assets)
         for name, values in self.constants.items():
             if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f8") or not np.isfinite(values).all():
                 raise ValueError(f"constant {str(name)[:40]!r} that is not an array of finite float64")

@@ -9,17 +9,19 @@ too, but a thread that waits for one wakes up ten times per second.)
 import ipaddress
 import json
 import logging
-import resource
+import re
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, Final, TypeVar
 
 import zenoh
 
 from farm.errors import ConfigError, FarmError, Interrupted
+from farm.net import probe
 from farm.net.events import Event, Events
 from farm.net.tls import Bundle, access_control
 
@@ -29,6 +31,7 @@ _T = TypeVar("_T")
 _TOKENS: Final = 65_536  # most tokens in one query's answer; a router accepts 4096 sessions
 _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
 _DESCRIPTORS: Final = 65_536
+_PORT: Final = re.compile(r"[0-9]{1,5}")
 _FEWEST: Final = 64  # enough files and connections for a run with two workers
 _OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
@@ -48,6 +51,11 @@ _RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000,
 _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
 
+def is_port(text: str) -> bool:
+    """Whether a text is a port's number."""
+    return bool(_PORT.fullmatch(text)) and 0 < int(text) < 65536
+
+
 def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
     """Check an endpoint's form, and return its host (Zenoh silently accepts some malformed ones).
 
@@ -60,7 +68,7 @@ def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
     """
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
-    if protocol not in ("tcp", "tls") or not host or not port.isdigit() or not int(port) < 65536:
+    if protocol not in ("tcp", "tls") or not host or not (is_port(port) or port == "0"):
         raise ConfigError(f"endpoint {endpoint!r} is not of the form tcp/HOST:PORT, for example tcp/127.0.0.1:7447")
     if protocol == "tls" and not encrypted:
         raise ConfigError(f"endpoint {endpoint} needs certificates: give their folder with --tls")
@@ -113,12 +121,14 @@ class Session:
 
         Without `wake`, a thread that waits for events is not woken; it gets the event with the next one.
         """
-        self._declared.append(self._session.declare_subscriber(key, self._callback(self._put(topic, wake=wake))))
+        callback = self._callback(self._put(topic, wake=wake))
+        self._declared.append(_as_daemon(lambda: self._session.declare_subscriber(key, callback)))
 
     def watch(self, topic: str, key: str) -> None:
         """Put existing, new and disappearing liveliness tokens into `events`."""
         callback = self._callback(self._put(topic))
-        self._declared.append(self._session.liveliness().declare_subscriber(key, callback, history=True))
+        tokens = self._session.liveliness()
+        self._declared.append(_as_daemon(lambda: tokens.declare_subscriber(key, callback, history=True)))
 
     def token(self, key: str) -> None:
         """Declare our liveliness token until the session closes. Do this after all other declarations."""
@@ -139,7 +149,8 @@ class Session:
             with query, suppress(zenoh.ZError):
                 query.reply(key, reply(str(query.parameters)))
 
-        self._declared.append(self._session.declare_queryable(key, self._callback(serve)))
+        callback = self._callback(serve)
+        self._declared.append(_as_daemon(lambda: self._session.declare_queryable(key, callback)))
 
     def present(self, key: str, timeout: float) -> bool:
         """Whether a liveliness token of the key is found within the timeout [s]."""
@@ -184,6 +195,20 @@ class Session:
         over = threading.Event()
         self._over.append(over)
         return zenoh.handlers.Callback(call, over.set)
+
+
+def _as_daemon(declare: Callable[[], _T]) -> _T:
+    """Declare on a daemon thread: Zenoh's callback threads inherit this, and do not keep a program from ending."""
+    made: Future[_T] = Future()
+
+    def run() -> None:
+        try:
+            made.set_result(declare())
+        except BaseException as error:
+            made.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return made.result()
 
 
 class Outlet:
@@ -253,14 +278,21 @@ def listen(
 def _raise_descriptors() -> None:
     """Raise the limit of open files to the system's maximum: the usual 1024 suffice for 1000 workers only.
 
+    A system without such limits, or that does not let them be raised, is left as it is.
+
     Raises:
       FarmError: the maximum is so low that Zenoh would abort the process.
     """
+    try:
+        import resource
+    except ImportError:
+        return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
     if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-        soft = wanted
+        with suppress(ValueError):  # macOS has a smaller limit than its "infinite" one
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            soft = wanted
     if soft != resource.RLIM_INFINITY and soft < _FEWEST:
         raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
 
@@ -284,15 +316,17 @@ def connect(
     settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
     if bundle is not None:
         settings |= bundle.settings("connect")
-    return _closing(_try(settings, ", ".join(endpoints), timeout, stopped))
+    return _closing(_try(settings, endpoints, timeout, stopped, bundle))
 
 
 def _try(
-    settings: Mapping[str, object], where: str, timeout: float | None, stopped: Callable[[], bool]
+    settings: Mapping[str, object],
+    endpoints: tuple[str, ...],
+    timeout: float | None,
+    stopped: Callable[[], bool],
+    bundle: Bundle | None,
 ) -> zenoh.Session:
-    # A refused handshake looks like no answer: Zenoh gives no reason.
-    refused = "; the learner may refuse our certificate: same authority, still valid, on its roster?"
-    hint = refused if "tls/" in where else ""
+    where = ", ".join(endpoints)
     begun = told = time.monotonic()
     while True:
         try:
@@ -303,12 +337,18 @@ def _try(
                 raise Interrupted(f"stopped before {where} answered") from None
             if timeout is not None and now - begun > timeout:
                 raise FarmError(
-                    f"no answer from {where} after {timeout:g} s: start a learner there, or check --connect{hint}"
+                    f"no answer from {where} after {timeout:g} s: {_why(endpoints, bundle, error)}"
                 ) from None
             if now - told >= _REMIND or told == begun:
                 told = now
-                log.warning("no answer from %s yet, trying again (%s)%s", where, _first_line(error), hint)
+                log.warning("no answer from %s yet, trying again: %s", where, _why(endpoints, bundle, error))
             time.sleep(0.1)  # zenoh itself waits up to _OPEN_S for an address that does not refuse
+
+
+def _why(endpoints: tuple[str, ...], bundle: Bundle | None, error: Exception) -> str:
+    """Why none of the endpoints answers; if a probe finds nothing, in Zenoh's words."""
+    found = [probe.reason(endpoint, bundle) or f"no learner or router ({_first_line(error)})" for endpoint in endpoints]
+    return "; ".join(found if len(found) == 1 else map(": ".join, zip(endpoints, found, strict=True)))
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:

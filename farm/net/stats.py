@@ -1,7 +1,7 @@
 """Statistics of a finished generation: one line of progress.jsonl. Pure data."""
 
-from dataclasses import dataclass, fields
-from typing import Any, Final, cast
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, Final, cast, get_origin
 
 VERSION: Final = 2
 """Version of a line of progress.jsonl."""
@@ -9,22 +9,18 @@ VERSION: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class GenerationStats:
-    """One generation. Returns, rates and counts are over its 2N exploring rollouts."""
+    """One generation. Returns, rates and counts are over all its exploring rollouts; mu and sigma after the update."""
 
     generation: int
     """Number of updates so far including this one: 1, 2, ..."""
     rollouts: int
     """Exploring rollouts of the run so far."""
     return_mean: float
-    """Mean return."""
     return_min: float
-    """Lowest return."""
     return_max: float
-    """Highest return."""
     return_std: float
-    """Standard deviation of the returns."""
     best: float
-    """Best return of the run so far."""
+    """Best return of the run so far; with several episodes, the best mean over them."""
     baseline: float | None
     """Baseline after the update, None where the algorithm has none."""
     mean_policy_return: float
@@ -34,13 +30,10 @@ class GenerationStats:
     success_rate: float | None
     """Fraction of rollouts that succeeded, None if the task does not define success."""
     sigma_mean: float
-    """Mean of sigma after the update."""
     sigma_min: float
-    """Least sigma."""
     sigma_max: float
-    """Largest sigma."""
     mean_norm: float
-    """Euclidean norm of mu after the update."""
+    """Euclidean norm of mu."""
     ended: int
     """Rollouts that the task ended before their last step."""
     failed: int
@@ -50,13 +43,16 @@ class GenerationStats:
     reissued: int
     """Jobs reissued since the run's start (lost workers, stragglers, idle workers)."""
     workers: int
-    """Number of workers at the end of the generation."""
     seconds: float
     """Wall time of the run so far, including the time before it was resumed [s]."""
+    measures: dict[str, Any] = field(default_factory=dict)
+    """Means of the task's measures over the exploring rollouts that did not fail, by name; None if all failed."""
+    mean_policy_measures: dict[str, Any] = field(default_factory=dict)
+    """The same of the mean policy's rollout."""
 
     def to_dict(self) -> dict[str, Any]:
-        """As a record of progress.jsonl."""
-        return {"version": VERSION, **vars(self)}
+        """As a record of progress.jsonl; measures only where the task has some."""
+        return {"version": VERSION, **{name: value for name, value in vars(self).items() if value != {}}}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "GenerationStats":
@@ -68,10 +64,16 @@ class GenerationStats:
         version = values.get("version") if isinstance(values, dict) else None
         if type(version) is not int or version != VERSION:
             raise ValueError(f"not a line of progress.jsonl, version {VERSION}: {str(values)[:80]}")
-        missing = [f.name for f in fields(cls) if f.name not in values]
+        known = [f for f in fields(cls) if f.name in values]
+        missing = [f.name for f in fields(cls) if f not in known and f.default_factory is MISSING]
         if missing:
             raise ValueError(f"progress line without {', '.join(missing)}")
-        for f in fields(cls):
-            if not isinstance(values[f.name], cast("type", f.type)):
+        for f in known:
+            if not isinstance(values[f.name], dict if get_origin(f.type) is dict else cast("type", f.type)):
                 raise ValueError(f"progress line whose {f.name} is {str(values[f.name])[:40]!r}")
-        return cls(**{f.name: values[f.name] for f in fields(cls)})
+        given: dict[str, Any] = {f.name: values[f.name] for f in known}
+        found = cls(**given)
+        for each in (*found.measures.values(), *found.mean_policy_measures.values()):
+            if not isinstance(each, int | float | None):
+                raise ValueError(f"progress line with a measure that is {str(each)[:40]!r}")
+        return found

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from farm.arrays import AnyArray
-from farm.net.codec import array
-from farm.net.messages import check_counts
-from farm.net.work import WireTrajectory
+import numpy as np
+
+from farm.net.messages import check_assets, check_counts
+from farm.net.stats import GenerationStats
+from farm.sim.trajectory import Trajectory
 
 
 def _check_plain(values: Any) -> None:  # noqa: ANN401
@@ -30,13 +31,11 @@ class WorkerStatus:
     version: str
     canary: str
     rollouts: int
-    """Number of rollouts that it has returned."""
     rate: float
     """Rollouts per second over the last ten seconds."""
     seen: float
     """Time since its last message [s]."""
     ignored: dict[str, int] = field(default_factory=dict)
-    """Number of messages that it ignored, by kind."""
 
     def __post_init__(self) -> None:
         check_counts(self.ignored)
@@ -57,8 +56,9 @@ class RunStatus:
     refused: int
     """Refused workers with the reasons."""
     ignored: dict[str, int]
-    """Number of ignored messages by kind."""
     workers: tuple[WorkerStatus, ...]
+    numbers: str = ""
+    """The canary of the machines whose numbers the run accepts, or how it begins."""
 
     def __post_init__(self) -> None:
         check_counts(self.ignored)
@@ -74,44 +74,41 @@ class Line:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trace:
-    """Traces of some of a generation's rollouts."""
+class Report:
+    """A finished generation, learner to displays, recordings and recorders elsewhere."""
 
-    name: str
-    """`best` and `worst` hold one rollout, `all` holds all."""
-    values: AnyArray = array("<f4", 3)
-    """(R, T, N)"""
-
-    def __post_init__(self) -> None:
-        if self.name not in ("best", "worst", "all"):
-            raise ValueError(f"traces {self.name[:40]!r} of shape {self.values.shape}")
-        if self.name != "all" and len(self.values) != 1:
-            raise ValueError(f"traces {self.name!r} of {len(self.values)} rollouts")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunReport:
-    """Report of a finished generation, learner to recorders."""
-
-    run: str
-    incarnation: str
-    generation: int
-    progress: dict[str, Any]
+    progress: GenerationStats
     """Its line of progress.jsonl."""
     rate: float
-    """Exploring rollouts per second."""
-    lines: tuple[Line, ...] = ()
-    """Lines of the log since the previous report."""
-    traces: tuple[Trace, ...] = ()
-    sample: WireTrajectory | None = None
+    """Exploring rollouts per second in this generation."""
+    traces: dict[str, Any] = field(default_factory=dict)
+    """Traces, float32: `best` and `worst` (T, N), and `all` (S, T, N) if the run keeps them."""
+    sample: Trajectory | None = None
     """The mean policy's rollout at control rate."""
-    replay: WireTrajectory | None = None
+    replay: Trajectory | None = None
     """The best rollout so far at physics rate, if there is a new one."""
     replay_generation: int = 0
-    """The generation of the best rollout."""
+    incarnation: str = ""
+    """Of its learner; empty until it is sent, as are the lines."""
+    lines: tuple[Line, ...] = ()
+    """Lines of the log since the previous report."""
 
     def __post_init__(self) -> None:
-        _check_plain(self.progress)
+        for name, values in self.traces.items():
+            if name not in ("best", "worst", "all") or getattr(values, "dtype", None) != np.dtype("<f4"):
+                raise ValueError(f"traces {str(name)[:40]!r}, or not of float32")
+            if values.ndim != 2 + (name == "all"):
+                raise ValueError(f"traces {name!r} of shape {values.shape}")
+
+    @property
+    def generation(self) -> int:
+        """Its number."""
+        return self.progress.generation
+
+    @property
+    def nbytes(self) -> int:
+        """Size of rollouts and traces [bytes]."""
+        return sum(each.nbytes for each in (self.sample, self.replay, *self.traces.values()) if each is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,13 +117,12 @@ class RunEnd:
 
     summary: dict[str, Any]
     """As in summary.json."""
-    lines: tuple[Line, ...]
-    """Lines of the log since the previous report."""
-    best: WireTrajectory | None
+    lines: tuple[Line, ...] = ()
+    """Lines of the log since the previous report; without any until it is sent."""
+    best: Trajectory | None
     """The best rollout of the run at physics rate."""
     best_generation: int
-    """The generation of the best rollout."""
-    mean: WireTrajectory | None
+    mean: Trajectory | None
     """The final mean policy's rollout at physics rate; None where the run diverged."""
 
     def __post_init__(self) -> None:
@@ -144,13 +140,18 @@ class RunHistory:
     config: dict[str, Any]
     """As in config.json."""
     files: dict[str, str]
-    """Files of its task by name."""
+    """Texts of its task by path."""
     generation: int
     """Number of finished generations; if the last report is of an earlier one, query again from there."""
-    reports: tuple[RunReport, ...]
+    reports: tuple[Report, ...]
     """In order; older ones have no rollouts and traces."""
     end: RunEnd | None
+    assets: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the other files of its task by path."""
+    undone: int = 0
+    """Generations that were repeated because a host in them was expelled."""
 
     def __post_init__(self) -> None:
         _check_plain(self.config)
         _check_plain(self.files)
+        check_assets(self.assets)

@@ -11,10 +11,13 @@ accepts the connection enforces the access rights: a worker may publish only und
 of its certificate; a viewer may only read.
 """
 
+import base64
 import json
 import os
+import re
 import stat
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -23,6 +26,8 @@ from farm.net import keys
 
 Role = Literal["learner", "worker", "viewer"]
 
+_ADD: Final = "farm certificates add {0} --{role} NAME makes one, in {0}/{role}-NAME"
+_TIMES: Final = re.compile(rb"\x17\r(\d{12})Z|\x18\x0f(\d{14})Z")  # UTCTime, GeneralizedTime
 _FILES: Final = ("ca.pem", "cert.pem", "key.pem", "identity.json")
 
 
@@ -48,10 +53,11 @@ class Bundle:
 
     def settings(self, side: Literal["listen", "connect"]) -> dict[str, object]:
         """Zenoh's settings for a session that accepts connections, or for one that connects."""
+        folder = self.folder.absolute()  # a router's configuration may be read elsewhere
         return {
-            "transport/link/tls/root_ca_certificate": str(self.folder / "ca.pem"),
-            f"transport/link/tls/{side}_certificate": str(self.folder / "cert.pem"),
-            f"transport/link/tls/{side}_private_key": str(self.folder / "key.pem"),
+            "transport/link/tls/root_ca_certificate": str(folder / "ca.pem"),
+            f"transport/link/tls/{side}_certificate": str(folder / "cert.pem"),
+            f"transport/link/tls/{side}_private_key": str(folder / "key.pem"),
             "transport/link/tls/enable_mtls": True,
             "transport/link/tls/close_link_on_expiration": True,
         }
@@ -92,7 +98,9 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
     found = sorted(folder.glob(f"{role}-*/cert.pem"))
     if len(found) == 1 and not name:
         return _read(found[0].parent, role)
-    names = ", ".join(path.parent.name.removeprefix(f"{role}-") for path in found) or "none"
+    if not found:
+        raise ConfigError(f"{folder} holds no {role}'s certificate: {_ADD.format(folder, role=role)}")
+    names = ", ".join(path.parent.name.removeprefix(f"{role}-") for path in found)
     raise ConfigError(f"{folder} holds certificates for these {role}s: {names}; choose one with --name")
 
 
@@ -110,12 +118,30 @@ def _read(folder: Path, role: Role) -> Bundle:
     except (ValueError, KeyError, TypeError):
         raise ConfigError(f"{folder / 'identity.json'} is damaged") from None
     if bundle.role != role:
-        raise ConfigError(f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here")
+        remedy = "--tls CERTS/learner" if role == "learner" else _ADD.format("CERTS", role=role)
+        raise ConfigError(f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here: {remedy}")
     for name in _FILES[:3]:
         if b"-----BEGIN " not in (folder / name).read_bytes():
             raise ConfigError(f"{folder / name} is damaged: expected PEM; copy the bundle again")
     private(folder / "key.pem")
+    until = _expiry(folder / "cert.pem")
+    if until < datetime.now(UTC):
+        renewed = "" if role == "learner" else f" --{role} {bundle.name}"
+        raise ConfigError(
+            f"the certificate of {role} {bundle.name} in {folder} expired on {until:%Y-%m-%d}: "
+            f"farm certificates renew CERTS{renewed} replaces it"
+        )
     return bundle
+
+
+def _expiry(path: Path) -> datetime:
+    """When a certificate expires: the second time in it (RFC 5280, 4.1), with a year of two or four digits."""
+    try:
+        body = path.read_bytes().partition(b"-----BEGIN CERTIFICATE-----")[2].partition(b"-----END")[0]
+        short, long = _TIMES.findall(base64.b64decode(body))[1]
+        return datetime.strptime(f"{(long or b'20' + short).decode()}+0000", "%Y%m%d%H%M%S%z")
+    except (ValueError, IndexError):
+        raise ConfigError(f"{path} is damaged: expected a certificate; copy the bundle again") from None
 
 
 def private(key: Path) -> None:
@@ -161,7 +187,7 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
     """What a worker may send and receive."""
     own, told = f"{name}/**", keys.generation(farm, "*")
-    asked = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), told]
+    asked = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), keys.asset(farm, "*", "*"), told]
     sent = [keys.inbox(farm, own), keys.refused(farm, own), told]
     return [
         ("ingress", ["put"], [keys.want(farm, own), keys.result(farm, "*", own)]),
@@ -181,7 +207,8 @@ def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
 def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
     """A viewer may see learners, workers, the runs' descriptions and their reports."""
     told = [keys.generation(farm, "*"), keys.report(farm, "*"), keys.history(farm, "*")]
-    asked = [keys.spec(farm, "*"), keys.generation(farm, "*"), keys.status(farm, "*"), keys.history(farm, "*")]
+    names = (keys.spec, keys.generation, keys.status, keys.history)
+    asked = [*(name(farm, "*") for name in names), keys.asset(farm, "*", "*")]
     tokens = [keys.learner_token(farm, "*"), keys.worker_token(farm, "**")]
     return [
         ("ingress", ["declare_subscriber"], told),

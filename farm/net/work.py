@@ -1,14 +1,14 @@
 """Messages about work: rounds and jobs to workers, results back. Pure data in arrays, encoded by `farm.net.codec`."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 
-from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.net.codec import array
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, array
 from farm.sim.trajectory import Trajectory
 
 RATES: Final = ("none", "control", "physics")
@@ -26,7 +26,6 @@ NOT_NORMALISED: Final = np.empty((2, 2, 0))
 
 _LINE: Final = 1000  # characters of a line
 _LINES: Final = 40  # lines of a traceback
-_CHANNELS: Final = 100  # channels of a trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +45,8 @@ class RoundHeader:
     normaliser: FloatArray = array("<f8", 3, NOT_NORMALISED)
     """Mean and standard deviation (2, d) of observations, twice: of all jobs, and of a job at physics rate that is not
     around the mean, which is a rollout of an earlier generation. d is 0 if observations are not normalised."""
+    terms: bool = False
+    """Whether the results contain each reward term's part of the returns."""
 
     def __post_init__(self) -> None:
         """Check the name of the traces, and that the standard deviations are positive."""
@@ -197,41 +198,16 @@ class Chunk(Jobs):
         return chunk
 
 
-@dataclass(frozen=True)
-class Simulated:
-    """Results of jobs: S rollouts, in the jobs' order."""
-
-    returns: FloatArray
-    """(S,)"""
-    flags: BoolArray
-    """success, ended, failed, clamped, (S, 4)"""
-    steps: IntArray
-    """Control steps, (S,)"""
-    traces: AnyArray
-    """Of the K rollouts selected by `traced`, float32, (K, T, N)"""
-    trajectories: "tuple[WireTrajectory, ...]"
-    """The first rollout of each job that returns a trajectory, in the jobs' order"""
-    moments: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or return a trajectory.
-    (0, 0) if observations are not normalised"""
-
-
 @dataclass(frozen=True, kw_only=True)
-class Results:
-    """Results of a chunk, worker to learner: one array of each kind over the rollouts of all its jobs.
+class Simulated:
+    """Results of jobs: one array of each kind over all their S rollouts, in the jobs' order.
 
     The receiver derives each job's number of rollouts, and which of them have a trajectory or a trace, from the jobs
     that it issued (`traced`). One map per job would take the learner ten times as long to read.
     """
 
-    run: str
-    incarnation: str
-    round: int
-    worker: str
-    trajectories: "tuple[WireTrajectory, ...]"
-    """Of the jobs that return one, in their order."""
-    jobs: IntArray = array("<i8", 1)
-    """Indices, ascending (J,)"""
+    trajectories: tuple[Trajectory, ...]
+    """The first rollout of each job that returns a trajectory"""
     returns: FloatArray = array("<f8", 1)
     """(S,)"""
     flags: BoolArray = array("|b1", 2)
@@ -239,21 +215,24 @@ class Results:
     steps: IntArray = array("<i8", 1)
     """Control steps, (S,)"""
     traces: AnyArray = array("<f4", 3)
-    """The requested traces, (K, T, N)"""
+    """Of the K rollouts selected by `traced`, (K, T, N)"""
     moments: FloatArray = array("<f8", 2, np.empty((0, 0)))
-    """Of the observations (S, 1 + 2 d), or (0, 0)"""
+    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or return a trajectory.
+    (0, 0) if observations are not normalised"""
+    measures: FloatArray = array("<f8", 2, np.empty((0, 0)))
+    """Of the task's measures, (S, M); (0, 0) if it has none"""
+    terms: FloatArray = array("<f8", 2, np.empty((0, 0)))
+    """Each reward term's part of the return, (S, K); (0, 0) if the round does not ask for them"""
 
     def __post_init__(self) -> None:
-        """Check that all arrays have the same number of rollouts, at least one per job."""
-        if not 1 <= len(self.jobs) <= len(self.returns):
-            raise ValueError(f"{len(self.jobs)} jobs with {len(self.returns)} rollouts")
-        jobs = self.jobs.tolist()
-        if jobs != sorted(set(jobs)):
-            raise ValueError("job indices that are not ascending")
+        """Check that all arrays have the same number of rollouts."""
         if self.flags.shape != (len(self.returns), 4):
             raise ValueError(f"flags of shape {self.flags.shape} for {len(self.returns)} rollouts")
         if len(self.steps) != len(self.returns):
             raise ValueError(f"{len(self.steps)} step counts for {len(self.returns)} rollouts")
+        for values in (self.measures, self.terms):
+            if values.shape != (0, 0) and len(values) != len(self.returns):
+                raise ValueError(f"measures or terms of shape {values.shape} for {len(self.returns)} rollouts")
         if self.moments.shape != (0, 0):
             half = self.moments.shape[1] // 2 + 1
             if len(self.moments) != len(self.returns) or self.moments.shape[1] % 2 == 0:
@@ -261,12 +240,38 @@ class Results:
             if (self.moments[:, :1] < 0.0).any() or (self.moments[:, half:] < 0.0).any():
                 raise ValueError("moments that are negative")
 
+
+@dataclass(frozen=True, kw_only=True)
+class Results(Simulated):
+    """Results of a chunk, worker to learner."""
+
+    run: str
+    incarnation: str
+    round: int
+    worker: str
+    jobs: IntArray = array("<i8", 1)
+    """Indices, ascending (J,)"""
+    seconds: float = 0.0
+    """Time of their simulation, without waiting for it [s]; 0: not measured"""
+
+    def __post_init__(self) -> None:
+        """Check also that there is at least one rollout per job."""
+        super().__post_init__()
+        if not 0.0 <= self.seconds < math.inf:
+            raise ValueError(f"a simulation of {self.seconds} s")
+        if not 1 <= len(self.jobs) <= len(self.returns):
+            raise ValueError(f"{len(self.jobs)} jobs with {len(self.returns)} rollouts")
+        jobs = self.jobs.tolist()
+        if jobs != sorted(set(jobs)):
+            raise ValueError("job indices that are not ascending")
+
     @classmethod
     def carrying(
-        cls, given: Simulated, jobs: Jobs, *, run: str, incarnation: str, round: int, worker: str
+        cls, given: Simulated, jobs: Jobs, seconds: float, *, run: str, incarnation: str, round: int, worker: str
     ) -> "Results":
         """A message with the results of jobs, whose indices are ascending."""
-        own = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
+        own: dict[str, Any] = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
+        own["seconds"] = seconds
         return cls(**own, jobs=np.ascontiguousarray(jobs.indices), **vars(given))
 
 
@@ -309,66 +314,6 @@ class Failure:
         for line in (self.error, *self.traceback):
             if len(line) > _LINE or not line.isprintable():
                 raise ValueError(f"an error of more than {_LINE} characters a line, or unprintable ones")
-
-
-@dataclass(frozen=True, kw_only=True)
-class WireTrajectory:
-    """A Trajectory as it is sent: float32 except for times and scalars."""
-
-    value: float
-    success: bool | None
-    channels: dict[str, Any]
-    """Arrays (F, ...) by channel; F frames."""
-    times: FloatArray = array("<f8", 1)
-    bodies: AnyArray = array("<f4", 3)
-    actions: AnyArray = array("<f4", 2)
-    terms: AnyArray = array("<f4", 2)
-
-    def __post_init__(self) -> None:
-        """Check that all arrays have the same number of frames, at ascending times; their widths depend on the task."""
-        if not len(self.times) or self.times[0] != 0.0 or (np.diff(self.times) <= 0.0).any():
-            raise ValueError(f"{len(self.times)} frames whose times do not start at 0 and ascend")
-        if len(self.channels) > _CHANNELS:
-            raise ValueError(f"{len(self.channels)} channels")
-        for name, values in self._arrays().items():
-            if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f4"):
-                raise ValueError(f"{str(name)[:40]} that is not an array of float32")
-            if not values.ndim or values.shape[0] != len(self.times) or not np.isfinite(values).all():
-                raise ValueError(f"{str(name)[:40]} of shape {values.shape} in {len(self.times)} frames, or not finite")
-
-    def _arrays(self) -> dict[str, AnyArray]:
-        own = {"bodies": self.bodies, "actions": self.actions, "terms": self.terms}
-        return own | {f"channels/{name}": values for name, values in self.channels.items()}
-
-    def fits(self, shapes: Mapping[str, tuple[int, ...]]) -> bool:
-        """Whether it has exactly these arrays with these shapes per frame."""
-        return {name: values.shape[1:] for name, values in self._arrays().items()} == dict(shapes)
-
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> "WireTrajectory":
-        """Convert for sending."""
-        return cls(
-            value=trajectory.value, success=trajectory.success, times=trajectory.times,
-            bodies=_shrunk(trajectory.bodies), actions=_shrunk(trajectory.actions), terms=_shrunk(trajectory.terms),
-            channels={name: _shrunk(values) for name, values in trajectory.channels.items()},
-        )  # fmt: skip
-
-    def trajectory(self) -> Trajectory:
-        """Convert back, with float32's precision."""
-        return Trajectory(
-            times=self.times, bodies=self.bodies.astype(float), actions=self.actions.astype(float),
-            terms=self.terms.astype(float), value=self.value, success=self.success,
-            channels={name: values.astype(float) for name, values in self.channels.items()},
-        )  # fmt: skip
-
-    @property
-    def nbytes(self) -> int:
-        """Size of its arrays [bytes]."""
-        return self.times.nbytes + sum(values.nbytes for values in self._arrays().values())
-
-
-def _shrunk(values: FloatArray) -> AnyArray:
-    return np.clip(np.nan_to_num(values, nan=-1e30), -1e30, 1e30).astype("<f4")
 
 
 def _table(count: int, *, around: bool, explores: bool, rate: str, signs: tuple[int, ...]) -> IntArray:

@@ -1,13 +1,16 @@
 """Linear and neural network controllers, and a constant action for comparison. Pure, batched.
 
     constant  a = b
-    linear    a = W x + b
+    linear    a = W x + b; with --no-bias a = W x (ARS's own: Mania, Guy & Recht 2018)
     mlp       h_1 = tanh(W_1 x + b_1), ..., h_L = tanh(W_L h_(L-1) + b_L), a = W h_L + b
               (Rumelhart, Hinton & Williams 1986, Learning representations by back-propagating errors)
 
 Parameters are the layers one after another, each with one row (W_i, b_i) per unit. A unit's sum runs over its own row,
 in an order that depends only on the row's length; tanh is that of `farm/elementary.py`. So no result depends on the
 batch.
+
+The search of an mlp starts at random weights of variance 1/inputs (LeCun, Bottou, Orr & Müller 1998, Efficient
+BackProp), those of the output ten times as small, and biases 0. At zero all derivatives by the weights vanish.
 """
 
 from collections.abc import Iterator
@@ -24,6 +27,15 @@ from farm.policies.base import Policy, PolicyConfig
 
 _LAYERS: Final = 20
 _UNITS: Final = 10_000  # of a layer
+_OUTPUT: Final = 0.1  # scale of the output's weights at the start: little action, so that nothing saturates
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearConfig(PolicyConfig):
+    """Settings of the linear policy."""
+
+    bias: bool = True
+    """Whether an action has a constant part, b."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +57,17 @@ class MlpConfig(PolicyConfig):
 class Linear(Policy):
     """Affine map of the observation: a = W x + b."""
 
+    Config: ClassVar[type[PolicyConfig]] = LinearConfig
+
     @property
     def size(self) -> int:
-        """A (d + 1)."""
-        return sum(units * (inputs + 1) for inputs, units in pairwise(self._sizes))
+        """A (d + 1), without bias A d."""
+        return sum(units * (inputs + self._bias) for inputs, units in pairwise(self._sizes))
+
+    @property
+    def _bias(self) -> bool:
+        """Whether the units have a bias."""
+        return getattr(self.config, "bias", True)
 
     @property
     def _sizes(self) -> tuple[int, ...]:
@@ -60,24 +79,26 @@ class Linear(Policy):
         with np.errstate(over="ignore", invalid="ignore"):
             out, layers = x, len(self._sizes) - 1
             for layer, (weights, bias) in enumerate(self._matrices(prepared), 1):
-                out = (weights * np.ascontiguousarray(out)[:, None, :]).sum(axis=-1) + bias
+                out = affine(weights, bias, out)
                 if layer < layers:
                     out = elementary.tanh(out)
         return out
 
-    def _matrices(self, theta: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Weights (B, units, inputs) and biases (B, units) of each layer, from parameters (B, P)."""
+    def _matrices(self, theta: FloatArray) -> Iterator[tuple[FloatArray, FloatArray | None]]:
+        """Weights (B, units, inputs) and biases (B, units) or None of each layer, from parameters (B, P)."""
         first = 0
         for inputs, units in pairwise(self._sizes):
-            end = first + units * (inputs + 1)
-            rows = theta[:, first:end].reshape(len(theta), units, inputs + 1)
+            end = first + units * (inputs + self._bias)
+            rows = theta[:, first:end].reshape(len(theta), units, inputs + self._bias)
             # A different memory order would change the rounding of sums.
-            yield np.ascontiguousarray(rows[:, :, :-1]), rows[:, :, -1]
+            yield np.ascontiguousarray(rows[:, :, :inputs]), rows[:, :, -1] if self._bias else None
             first = end
 
 
 class Constant(Linear):
     """The same action for every observation: a baseline that a controller with feedback should beat."""
+
+    Config: ClassVar[type[PolicyConfig]] = PolicyConfig
 
     @property
     def _sizes(self) -> tuple[int, ...]:
@@ -96,3 +117,19 @@ class Mlp(Linear):
     @property
     def _sizes(self) -> tuple[int, ...]:
         return self.spec.observation, *self.config.layers, self.spec.action
+
+    def start(self, rng: np.random.Generator) -> FloatArray:
+        """Random weights, so that the units of a layer differ; biases 0."""
+        layers = []
+        for inputs, units in pairwise(self._sizes):
+            layer = np.zeros((units, inputs + 1))
+            layer[:, :-1] = rng.standard_normal((units, inputs)) / np.sqrt(inputs)
+            layers.append(layer)
+        layers[-1] *= _OUTPUT
+        return np.concatenate([layer.ravel() for layer in layers])
+
+
+def affine(weights: FloatArray, bias: FloatArray | None, x: FloatArray) -> FloatArray:
+    """W x + b of weights (B, units, inputs), biases (B, units) or None, and x (B, inputs), (B, units)."""
+    out = (weights * np.ascontiguousarray(x)[:, None, :]).sum(axis=-1)
+    return out if bias is None else out + bias

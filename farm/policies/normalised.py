@@ -20,11 +20,21 @@ class Normalised(Policy):
         """The size of the wrapped policy."""
         return self._policy.size
 
+    @property
+    def scale(self) -> FloatArray | None:
+        """The scale of the wrapped policy."""
+        return self._policy.scale
+
+    @property
+    def memory(self) -> FloatArray | None:
+        """The memory of the wrapped policy."""
+        return self._policy.memory
+
     def prepare(self, theta: FloatArray) -> FloatArray:
         """The result of the wrapped policy's `prepare`."""
         return self._policy.prepare(theta)
 
-    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
-        """The actions of the wrapped policy."""
+    def act(self, prepared: FloatArray, x: FloatArray, *memory: FloatArray) -> FloatArray:
+        """What the wrapped policy gives."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return self._policy.act(prepared, (x - self._mean) / self._deviation)
+            return self._policy.act(prepared, (x - self._mean) / self._deviation, *memory)

@@ -1,9 +1,11 @@
-"""Channels, the data that a rollout shows in addition to its bodies, and cameras. Pure data."""
+"""Channels, the data that a rollout shows in addition to its bodies, measures and cameras. Pure data."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
+
+import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
@@ -13,7 +15,20 @@ Kind = Literal["scalars", "flags", "images", "arrows", "points"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channel:
-    """Something that a rollout shows in addition to its bodies: n curves, pictures, arrows or points in each frame."""
+    """Something that a rollout shows in addition to its bodies: n curves, pictures, arrows or points in each frame.
+
+    Raises:
+      ConfigError: its shape does not fit its kind, or a text, colour or limit is invalid.
+
+    Example:
+      ```python
+      import farm
+
+      energy = farm.Channel(name="energy", kind="scalars", shape=(2,), labels=("kinetic", "potential"), unit="J")
+      force = farm.Channel(name="force", kind="arrows", shape=(1, 6), bodies=("tip",), unit="N", length=0.01)
+      assert force.names == ("1",)
+      ```
+    """
 
     name: str
     """Its path in recordings, for example `contacts/force`."""
@@ -93,6 +108,12 @@ class Channel:
             if not isinstance(colour, tuple | list) or len(colour) != 3 or not all(c in range(256) for c in colour):
                 raise ConfigError(f"channel {self.name}: colour {colour!r}; expected red, green, blue from 0 to 255")
 
+    def vectors(self, values: FloatArray) -> FloatArray:
+        """Arrows' vectors (..., n, 3) as they are drawn, from values (..., n, 6) [m]."""
+        drawn = values[..., 3:] * self.length
+        extent = np.linalg.norm(drawn, axis=-1, keepdims=True)
+        return drawn * np.minimum(1.0, self.longest / np.where(extent > 0, extent, 1.0))
+
     @property
     def names(self) -> tuple[str, ...]:
         """Labels, or numbers from 1."""
@@ -100,8 +121,53 @@ class Channel:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A number that describes a whole rollout beside its return: a height, a distance, a share of steps.
+
+    Quality diversity keeps the best rollout for each of its values; constraints bound it.
+
+    Raises:
+      ConfigError: a text or the bounds are invalid.
+
+    Example:
+      ```python
+      import farm
+
+      class Leap(farm.Task):
+          measures = (farm.Measure(name="height", low=0.0, high=2.0, unit="m"),)
+
+          def outcomes(self, record):  # the highest of qpos' third number after any step
+              return {"height": record.frames["qpos"][:, :, 2].max(axis=1).clip(0.0, 2.0)}
+      ```
+    """
+
+    name: str
+    low: float
+    """Smallest value; also that of a rollout whose simulation became unstable."""
+    high: float
+    """Largest value."""
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.isidentifier():
+            raise ConfigError(f"measure {self.name!r}: expected a name of letters, digits and _")
+        bounds: tuple[object, ...] = (self.low, self.high)
+        if not all(isinstance(each, int | float) for each in bounds) or not -math.inf < self.low < self.high < math.inf:
+            raise ConfigError(f"measure {self.name}: bounds {self.low!r} to {self.high!r}; expected rising numbers")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A point of view, in the parameters of MuJoCo's free camera."""
+    """A point of view, in the parameters of MuJoCo's free camera.
+
+    Example:
+      ```python
+      import farm
+
+      class Seen(farm.Task):
+          camera = farm.Camera(lookat=(0.0, 0.0, 0.3), distance=1.5, azimuth=90.0)
+      ```
+    """
 
     lookat: tuple[float, float, float]
     """[m]"""

@@ -1,5 +1,6 @@
 """MuJoCo on the CPU: many simulations in mujoco.batch, or one in an MjData."""
 
+import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -8,7 +9,8 @@ import mujoco.batch
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.sim.sim import Rebound, failed_rows, own_value
+from farm.sim.interfaces import Rebound
+from farm.sim.sim import failed_rows, own_value
 
 CAPACITY = 64
 """Number of rollouts that are stepped together."""
@@ -18,15 +20,32 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class BatchEngine:
-    """Simulations of one model in mujoco.batch, with the same numbers as a plain `mj_step` loop."""
+    """Simulations in mujoco.batch, with the same numbers as a plain `mj_step` loop; of one model, or of several whose
+    data have one layout (`takes`, `assign`)."""  # noqa: D205, D209
 
     def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
         """Make room for `size` rows; the physics runs on `threads`."""
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # unstable states stay unstable
+        _keep_unstable(model)
         self.model, self.size, self._threads = model, size, threads
         self._batch = mujoco.batch.Batch(model, size, threads)
         self._fields: dict[str, AnyArray] = {}
         self._data: mujoco.MjData | None = None
+        self._rows = _Rows(model, size)
+
+    def takes(self, model: mujoco.MjModel) -> bool:
+        """Whether rows can be of this model as well, as its data have the same layout; `assign` then says which are."""
+        try:
+            self._batch.set_models(model)
+            self._batch.set_models(None)
+        except mujoco.FatalError:
+            return False
+        _keep_unstable(model)
+        self._rows.models.append(model)
+        return True
+
+    def assign(self, which: IntArray) -> None:
+        """Say which of its models each of the first rows has, (n,)."""
+        self._batch.set_models(self._rows.assigned(which))
 
     def field(self, name: str) -> AnyArray:
         """A live array over all rows."""
@@ -83,20 +102,77 @@ class BatchEngine:
         out = np.empty((len(ids), self.model.nbody, 6))
         for row, sim in enumerate(ids.tolist()):
             self._batch.get_data(sim, self._data)
-            mujoco.mj_rnePostConstraint(self.model, self._data)
+            mujoco.mj_rnePostConstraint(self._rows.own[sim], self._data)
             out[row] = self._data.cfrc_ext
         return out
 
+    def ray(self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int) -> tuple[FloatArray, IntArray]:
+        """Distances and geometries that rays (n, R, 3) hit, (n, R) each."""
+        dist, geom = self._batch.ray(points, ways, bodyexclude=without, ids=ids)
+        return dist, geom.astype(int)
+
+    def jac(self, ids: IntArray, body: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Jacobians of points (n, 3) of a body, (n, 3, nv) each."""
+        return self._batch.jac(body, points, ids)
+
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row."""
-        return self._batch.expand(name)
+        return self._batch.expand(name) if len(self._rows.models) == 1 else self._rows.expand(name)
 
     def set_const(self, ids: IntArray) -> None:
         """Update derived constants."""
-        self._batch.set_const(ids)
+        if len(self._rows.models) == 1:
+            self._batch.set_const(ids)
+        else:
+            self._batch.set_models(self._rows.changed(ids))
 
     def close(self) -> None:
         """Hold nothing that Python does not give back."""
+
+
+class _Rows:
+    """Which model each row of a batch has: mujoco.batch expands no fields of several models, so each row whose fields
+    are its own has a copy of its model."""  # noqa: D205, D209
+
+    def __init__(self, model: mujoco.MjModel, size: int) -> None:
+        self.models = [model]
+        self.own = [model] * size
+        """The model of each row."""
+        self._which, self._nth = (np.zeros(size, dtype=int) for _ in range(2))
+        self._values: dict[str, AnyArray] = {}
+        self._copies: dict[tuple[int, int], mujoco.MjModel] = {}  # of a model, for the nth row that has it
+
+    def assigned(self, which: IntArray) -> list[mujoco.MjModel]:
+        """Models of all rows if those of the first rows are `which`, (n,)."""
+        self._which[: len(which)] = which
+        for model in range(len(self.models)):
+            rows = np.flatnonzero(self._which == model)
+            self._nth[rows] = np.arange(len(rows))
+        self.own = [self.models[model] for model in self._which.tolist()]
+        return self.own
+
+    def expand(self, name: str) -> AnyArray:
+        """A field with values for each row, (size, ...)."""
+        if name not in self._values:
+            self._values[name] = np.stack([np.asarray(own_value(model, name)) for model in self.own])
+        return self._values[name]
+
+    def changed(self, ids: IntArray) -> list[mujoco.MjModel]:
+        """Models of all rows, after rows got their own values and what follows from them."""
+        data = mujoco.MjData(self.models[0])
+        for row in ids.tolist():
+            model, nth = int(self._which[row]), int(self._nth[row])
+            if (model, nth) not in self._copies:
+                self._copies[model, nth] = copy.copy(self.models[model])
+            own = self.own[row] = self._copies[model, nth]
+            for name, values in self._values.items():
+                if values.ndim == 1:  # a number of the options
+                    setattr(own.opt, name.removeprefix("opt."), values[row])
+                else:
+                    own_value(own, name)[:] = values[row]
+            mujoco.mj_resetData(own, data)
+            mujoco.mj_setConst(own, data)
+        return self.own
 
 
 class DataEngine:
@@ -157,6 +233,29 @@ class DataEngine:
         mujoco.mj_rnePostConstraint(self.model, self.data)
         return self.data.cfrc_ext[None].copy()
 
+    def ray(self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int) -> tuple[FloatArray, IntArray]:  # noqa: ARG002
+        """Distances and geometries that rays (1, R, 3) hit, (1, R) each."""
+        data, geom = self._present(), np.zeros((1, 1), dtype=np.int32)
+        hits = []
+        for point, way in zip(points[0], ways[0], strict=True):
+            dist = mujoco.mj_ray(self.model, data, point, way, None, 1, without, geom[0])
+            hits.append((dist, int(geom[0, 0])))
+        return np.array([[dist for dist, _ in hits]]), np.array([[which for _, which in hits]])
+
+    def jac(self, ids: IntArray, body: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002
+        """Jacobians of a point (1, 3) of a body, (1, 3, nv) each."""
+        moves, turns = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
+        mujoco.mj_jac(self.model, self._present(), moves, turns, points[0], body)
+        return moves[None], turns[None]
+
+    def _present(self) -> mujoco.MjData:
+        """Where everything is now, beside the data, whose outputs stay."""
+        data = mujoco.MjData(self.model)
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = self.data.qpos, self.data.mocap_pos, self.data.mocap_quat
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        return data
+
     def expand(self, name: str) -> AnyArray:
         """A field of the model, as one row."""
         return np.asarray(own_value(self.model, name))[None]
@@ -167,6 +266,11 @@ class DataEngine:
 
     def close(self) -> None:
         """Hold nothing that Python does not give back."""
+
+
+def _keep_unstable(model: mujoco.MjModel) -> None:
+    """Let unstable states stay unstable."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
 
 def check_field(name: str) -> None:

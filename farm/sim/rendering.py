@@ -14,7 +14,8 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import RunError
 from farm.sim.channels import Camera, Channel
-from farm.sim.scene import AWAY, BESIDE, Scene
+from farm.sim.marks import Marks, glow
+from farm.sim.scene import AWAY, BESIDE, Scene, place
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
@@ -26,6 +27,7 @@ _DIFFUSE: Final = (0.55, 0.55, 0.55)
 _FOG: Final = (3.0, 6.0)  # where fog begins and is complete, in distances from the camera to its target
 _WALL: Final = 7.0  # distance of the background's wall: in complete fog
 _PAINT: Final = (213, 94, 0)  # for channels without colours
+_SLACK: Final = 0.4  # how far what moves may be from the middle before the camera follows, in radii of what moves
 _SMOOTH: Final = 2  # factor of the size drawn, for smooth edges
 
 
@@ -35,6 +37,7 @@ def pictures(
     size: tuple[int, int],
     *,
     camera: Camera | None,
+    mocap: FloatArray | None = None,
     channels: Sequence[Channel] = (),
     values: Mapping[str, FloatArray] | None = None,
 ) -> Iterator[Picture]:
@@ -42,11 +45,12 @@ def pictures(
 
     Args:
       model: of the physics; it is not changed.
-      qpos: (F, nq) positions.
+      qpos: (F, nq) positions; the first is the start.
       size: width and height [pixels].
-      camera: point of view; None: from the side of the moving bodies.
-      channels: of the task; geometries that scalars name in `geoms` are painted by their values.
-      values: of these channels, by name, (F, n).
+      camera: point of view; None: from the side of the moving bodies, which it follows.
+      mocap: (F, nmocap, 7) poses of the mocap bodies; None: the model's own.
+      channels: of the task: arrows and points are drawn, geometries that scalars name in `geoms` painted.
+      values: of these channels, by name, (F, ...).
 
     Yields:
       (height, width, 3), one per state.
@@ -54,19 +58,53 @@ def pictures(
     Raises:
       RunError: MuJoCo cannot draw on this machine.
     """
-    camera = camera or beside(Scene(model))
+    scene = Scene(model, qpos[0], None if mocap is None else mocap[0])
+    view, marks = View(scene, camera), Marks(scene, channels if values else ())
     painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
-    model = lit(model, camera.distance, size)
+    model = lit(model, view.camera.distance, size)
+    free = aimed(mujoco.MjvCamera(), view.camera)
     data = mujoco.MjData(model)
     with _renderer(model, size) as renderer:
         for frame, row in enumerate(qpos):
             for channel in painted:
                 _paint(model, channel, (values or {})[channel.name][frame])
-            data.qpos[:] = row
+            place(data, row, None if mocap is None else mocap[frame])
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, aimed(mujoco.MjvCamera(), camera))
+            if view.mover is not None:
+                free.lookat += view.moved(data.xpos[view.mover.index])
+            renderer.update_scene(data, free)
+            marks.put(renderer.scene, data, {name: each[frame] for name, each in (values or {}).items()})
             _backdrop(renderer.scene, model)
             yield _halved(renderer.render())
+
+
+class View:
+    """A point of view: a task's camera, which stays; or beside the moving bodies, which it follows.
+
+    It follows the first of them, and only as far as it leaves the middle: a swinging pendulum does not swing the scene.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera | None) -> None:
+        """Frame a scene, by the task's camera if there is one."""
+        self.camera = camera or beside(scene)
+        """At the start."""
+        self.mover = None if camera else scene.mover
+        """What it follows; None: nothing."""
+        self._shift = np.zeros(3)
+
+    def moved(self, there: FloatArray) -> FloatArray:
+        """How far the camera has to move if the body is at this place now, [m], (3,)."""
+        assert self.mover is not None
+        away = there - self.mover.place - self._shift
+        slack = _SLACK * self.mover.radius
+        step = away * (1.0 - slack / max(float(np.linalg.norm(away)), slack))
+        self._shift += step
+        return step
+
+    def back(self) -> FloatArray:
+        """How far it has to move to be at the start again [m], (3,)."""
+        step, self._shift = -self._shift, np.zeros(3)
+        return step
 
 
 def beside(scene: Scene) -> Camera:
@@ -135,13 +173,7 @@ def _paint(model: mujoco.MjModel, channel: Channel, values: FloatArray) -> None:
     for geom, value, colour in zip(channel.geoms, values.tolist(), colours, strict=True):
         index = model.geom(geom).id
         model.geom_matid[index] = -1
-        model.geom_rgba[index] = _glow(value / channel.top, colour)
-
-
-def _glow(share: float, colour: tuple[int, int, int]) -> list[float]:
-    """RGBA of a painted geometry, in [0, 1]: white at share 0, its colour from 1 on; any share above 0 is visible."""
-    mix = 0.45 + 0.55 * min(share, 1.0) if share > 0 else 0.0
-    return [*((1.0 - mix) * 0.95 + mix * value / 255 for value in colour), 1.0]
+        model.geom_rgba[index] = glow(value / channel.top, colour)
 
 
 def _halved(picture: Picture) -> Picture:

@@ -1,7 +1,8 @@
 """A compiled MuJoCo model, and the parts of it that are drawn."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -9,7 +10,10 @@ import mujoco
 import numpy as np
 
 from farm.arrays import BoolArray, FloatArray, IntArray
-from farm.errors import ConfigError, brief
+from farm.errors import ConfigError
+
+MODEL: Final = "model"
+"""Name of the channel that says which of several models a rollout has, by flags."""
 
 BESIDE: Final = (106.0, -25.0)
 """Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots walk along x."""
@@ -51,11 +55,19 @@ class Geometry:
     """Of a mesh, before it is turned and placed [m], (V, 3)."""
     faces: IntArray | None = None
     """Its triangles, rows of `vertices`, (F, 3)."""
+    models: tuple[int, ...] = ()
+    """Which of several models have it; empty: all."""
+
+    def same(self, other: "Geometry") -> bool:
+        """Whether another model's geometry looks the same."""
+        arrays = ((self.vertices, other.vertices), (self.faces, other.faces))
+        bare = [replace(each, vertices=None, faces=None, models=()) for each in (self, other)]
+        return bare[0] == bare[1] and all(np.array_equal(one, another) for one, another in arrays)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Mover:
-    """The moving part of a scene, in the model's initial pose."""
+    """The moving part of a scene, in the pose in which it is framed."""
 
     centre: tuple[float, float, float]
     """Middle of the box around all that moves [m]."""
@@ -63,13 +75,37 @@ class Mover:
     """Half the box's diagonal [m]."""
     body: str
     """Its first body: the others are mostly attached to it."""
+    index: int
+    """Number of this body in the model."""
+    place: tuple[float, float, float]
+    """Where this body is [m]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A compiled model, and its drawn parts."""
 
     model: mujoco.MjModel
+    start: FloatArray | None = None
+    """Positions (nq,) in which its moving part is framed; None: the model's own."""
+    mocap: FloatArray | None = None
+    """Poses of mocap bodies there, (nmocap, 7); None: the model's own."""
+    others: "tuple[Scene, ...]" = ()
+    """Those of further models, of which a rollout has one; their bodies are the same."""
+
+    @classmethod
+    def of(cls, models: Sequence[mujoco.MjModel]) -> "Scene":
+        """The scene of a task's models, at least one."""
+        return cls(models[0], others=tuple(map(cls, models[1:])))
+
+    @property
+    def each(self) -> "tuple[Scene, ...]":
+        """Itself and the others, in the order of the models."""
+        return (self, *self.others)
+
+    def said(self, which: int, frames: int) -> dict[str, FloatArray]:
+        """Which model a rollout of this number of frames has, as the channel MODEL; nothing if there is only one."""
+        return {MODEL: np.tile(np.eye(len(self.each))[which], (frames, 1))} if self.others else {}
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -86,15 +122,23 @@ class Scene:
     def mover(self) -> Mover | None:
         """The moving bodies; None if nothing moves."""
         model, data = self.model, mujoco.MjData(self.model)
+        place(data, model.qpos0 if self.start is None else self.start, self.mocap)
         mujoco.mj_kinematics(model, data)
         geoms = np.flatnonzero(self._moving[model.geom_bodyid])
         if not len(geoms):
             return None
         centres, reach = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
         least, most = (centres - reach).min(axis=0), (centres + reach).max(axis=0)
-        first = self.bodies[self._drawn.index(model.geom_bodyid[geoms[0]])]
-        x, y, z = (0.5 * (least + most)).tolist()
-        return Mover((x, y, z), 0.5 * float(np.linalg.norm(most - least)), first)
+        bodies = model.geom_bodyid[geoms]
+        jointed = bodies[model.body_mocapid[model.body_rootid[bodies]] < 0]  # a goal is seen, but a robot is followed
+        first = int((jointed if len(jointed) else bodies)[0])
+        return Mover(
+            centre=tuple((0.5 * (least + most)).tolist()),
+            radius=0.5 * float(np.linalg.norm(most - least)),
+            body=self.bodies[self._drawn.index(first)],
+            index=first,
+            place=tuple(data.xpos[first].tolist()),
+        )
 
     @property
     def radius(self) -> float:
@@ -120,25 +164,43 @@ class Scene:
             raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
         return self.bodies.index(name)
 
-    def poses(self, qpos: FloatArray) -> FloatArray:
+    def poses(self, qpos: FloatArray, mocap: FloatArray | None = None) -> FloatArray:
         """Poses of the drawn bodies.
 
         Args:
           qpos: (F, nq) positions, one row per frame.
+          mocap: (F, nmocap, 7) poses of the mocap bodies; None: the model's own.
 
         Returns:
           (F, B, 7): position [m] and quaternion wxyz of each of `bodies`, in the world.
         """
         data = mujoco.MjData(self.model)
         out = np.empty((len(qpos), len(self._drawn), 7))
-        for frame, row in zip(out, qpos, strict=True):
-            data.qpos[:] = row
+        for at, (frame, row) in enumerate(zip(out, qpos, strict=True)):
+            place(data, row, None if mocap is None else mocap[at])
             mujoco.mj_kinematics(self.model, data)
             frame[:, :3], frame[:, 3:] = data.xpos[self._drawn], data.xquat[self._drawn]
         return out
 
     def geometries(self) -> list[Geometry]:
-        """Everything to draw: primitives and meshes of the groups that MuJoCo's viewers show."""
+        """Everything to draw: primitives and meshes of the groups that MuJoCo's viewers show, of all models."""
+        found: list[tuple[Geometry, list[int]]] = []
+        for index, scene in enumerate(self.each):
+            for geometry in scene._own():
+                known = next((models for other, models in found if other.same(geometry)), None)
+                if known is None:
+                    found.append((geometry, [index]))
+                else:
+                    known.append(index)
+        return [
+            geometry
+            if len(set(models)) == len(self.each)
+            else replace(geometry, name=f"{geometry.name}-{models[0]}", models=tuple(models))
+            for geometry, models in found
+        ]
+
+    def _own(self) -> list[Geometry]:
+        """Those of this model."""
         bodies = dict(zip(self._drawn, self.bodies, strict=True))
         model = self.model
         known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
@@ -186,19 +248,11 @@ class Scene:
         return np.asarray(self.model.body_weldid != 0)
 
 
-def compiled(mjcf: str, name: str) -> mujoco.MjModel:
-    """Compile an MJCF text that needs no other file.
-
-    Raises:
-      ConfigError: MuJoCo refuses it; `name` names the model in the message.
-    """
-    try:
-        model = mujoco.MjModel.from_xml_string(mjcf)
-    except (ValueError, mujoco.FatalError) as error:
-        raise ConfigError(f"{name}: MuJoCo refuses the model: {brief(str(error))}") from None
-    # An unstable state is not reset, so that its rollout is reported as failed.
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    return model
+def place(data: mujoco.MjData, qpos: FloatArray, mocap: FloatArray | None) -> None:
+    """Set positions (nq,), and poses of mocap bodies (nmocap, 7); None: as they are."""
+    data.qpos[:] = qpos
+    if mocap is not None:
+        data.mocap_pos[:], data.mocap_quat[:] = mocap[:, :3], mocap[:, 3:]
 
 
 def quiet() -> None:

@@ -1,94 +1,64 @@
 """A batch of simulations as named live arrays: a task's only access to the simulator.
 
     sim.qpos          (B, nq), sim.sensordata, sim.xpos ... with MjData's names, of the active rollouts
+    sim.joint("hinge").qpos       (B, 1), of one object, with MuJoCo's names
     sim.own["goal"]   (B, ...), the task's own memory for each of them
     sim.t             control steps done
+    sim.which         (B,), which of the task's models each rollout has
     sim.expand("geom_friction")   a field of the model with separate values for each rollout
 
-While a rollout is prepared the arrays are writable views; afterwards they are read-only.
+While a rollout is prepared the arrays are writable views. Afterwards they are read-only, but for those of WRITABLE in
+`act`: what it writes there counts from the next physics step on.
 """
 
-from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, runtime_checkable
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
+from farm.sim.interfaces import Engine
+from farm.sim.named import Named
 
 LIMIT = 1e8
 """States beyond this count as unstable, finite or not."""
 
+WRITABLE: Final = (*("qpos", "qvel", "act", "eq_active", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied"),)
+"""Fields of MjData that a task's `act` may write, unless the engine's `writable` says otherwise."""
 
-class Rebound(Exception):  # noqa: N818  not an error
-    """An output of the simulator was requested for the first time: the batch is restarted, now with its values."""
-
-
-@runtime_checkable
-class Engine(Protocol):
-    """Simulates rows of states of one model. Made by a backend, or by the task itself."""
-
-    model: mujoco.MjModel
-    size: int
-    """Rows."""
-
-    def field(self, name: str) -> AnyArray:
-        """A live array over all rows, (size, ...), by its name in MjData; outputs are read-only.
-
-        Raises Rebound if its values exist only after the next call, AttributeError if there is no such array.
-        """
-
-    def reset(self, ids: IntArray) -> None:
-        """Reset rows to the model's initial state."""
-
-    def step(self, ids: IntArray, count: int) -> None:
-        """Advance rows by physics steps."""
-
-    def play(self, ids: IntArray, controls: FloatArray) -> None:
-        """Advance rows by one physics step for each of their controls, (n, steps, nu)."""
-
-    def forward(self, ids: IntArray) -> None:
-        """Compute the outputs of rows from their states."""
-
-    def copy(self, sources: IntArray) -> None:
-        """Give row i the state of row sources[i]; rows are never copied downwards onto later sources."""
-
-    def blown_up(self, ids: IntArray) -> BoolArray:
-        """Rows whose state is no longer a reasonable number, (n,)."""
-
-    def contact_forces(self, ids: IntArray) -> FloatArray:
-        """MuJoCo's cfrc_ext of rows after their last step, (n, nbody, 6); may raise Rebound like `field`."""
-
-    def expand(self, name: str) -> AnyArray:
-        """A field of the model with values for each row, live, (size, ...)."""
-
-    def set_const(self, ids: IntArray) -> None:
-        """Update derived constants after writes to expanded fields."""
-
-    def close(self) -> None:
-        """Release its resources."""
+_CAN: Final = f"act can write sim.own and, of sim, {', '.join(WRITABLE)}"
 
 
-class Backend(Protocol):
-    """Makes a worker's engines for models; constructed without arguments."""
-
-    capacity: ClassVar[int]
-    """Number of rollouts that are worth simulating at a time."""
-    exact: ClassVar[bool]
-    """Whether its numbers are those of the backend `cpu` to the last bit; true where a class does not say."""
-
-    def engine(self, model: mujoco.MjModel) -> Engine:
-        """Make an engine for this many simulations of a model."""
-
-
-_ATTRIBUTES = ("engine", "own", "t")
-
-MakeEngine = Callable[[mujoco.MjModel], Engine]
+_ATTRIBUTES = ("engine", "own", "t", "which")
 
 
 class Sim:
-    """A batch of rollouts in an engine."""
+    """A batch of rollouts in an engine.
+
+    A task gets it with each call. Arrays have MjData's names and units. A write to the attribute itself
+    (`sim.qpos = ...`), and not into its rows, is an AttributeError.
+
+    Example:
+      ```python
+      import mujoco
+      import numpy as np
+
+      import farm
+      from farm.sim.engines import BatchEngine
+
+      ball = "<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
+      sim = farm.Sim(BatchEngine(mujoco.MjModel.from_xml_string(ball), 3))
+      sim.begin(3)
+      sim.qpos[:, 2] = [1.0, 2.0, 3.0]  # heights [m]; (B, nq)
+      sim.start(np.arange(3))
+      sim.step(100)
+      assert (sim.qvel[:, 2] < -1.9).all()  # they fall for 0.2 s
+      ```
+    """
 
     def __init__(self, engine: Engine) -> None:
         """Use an engine; call `begin` next. A TaskError if it is none."""
@@ -101,17 +71,26 @@ class Sim:
         """The task's memory for each rollout, (B, ...); rows stay with their rollouts when other rollouts end."""
         self.t = 0
         """Control steps done."""
+        self.which: IntArray = np.arange(0)
+        """Which of `models` each rollout has, (B,)."""
         self._ids: IntArray = np.arange(0)
         self._source: IntArray | None = None  # rows that outputs are read from, until the first step
         self._expanded: dict[str, AnyArray] = {}
-        self._nominal: dict[str, AnyArray] = {}  # the model's own values of them
+        self._nominal: dict[str, AnyArray] = {}  # the models' own values of them, (M, ...)
         self._dirty = self._live = self._stepped = False
         self._now: dict[str, AnyArray] = {}
+        self._named: dict[tuple[str, str], Named] = {}
+        self._drafts: dict[str, AnyArray] | None = None  # what `act` reads and writes of WRITABLE
 
     @property
     def model(self) -> mujoco.MjModel:
-        """What is simulated; never changed."""
+        """What is simulated, the first if there are several; never changed."""
         return self.engine.model
+
+    @property
+    def models(self) -> tuple[mujoco.MjModel, ...]:
+        """All models, M of them; mostly one."""
+        return getattr(self.engine, "models", (self.engine.model,))
 
     def __len__(self) -> int:
         """B, the rollouts still going."""
@@ -120,6 +99,10 @@ class Sim:
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401  an array of MjData
         if name.startswith("_"):
             raise AttributeError(name)
+        if self._drafts is not None and name in getattr(self.engine, "writable", WRITABLE):
+            if name not in self._drafts:
+                self._drafts[name] = self.engine.field(name)[self._ids]  # a copy
+            return self._drafts[name]
         known = self._now.get(name)
         if known is not None:
             return known
@@ -146,13 +129,18 @@ class Sim:
         taken.flags.writeable = False
         return taken
 
-    def begin(self, count: int) -> None:
-        """Begin `count` rollouts at the model's own start; arrays can be written until `start`."""
-        self._ids, self._source = np.arange(count), None
+    def begin(self, count: int, which: IntArray | None = None) -> None:
+        """Begin `count` rollouts at the model's own start, with `which` model each (None: the first); arrays can be
+        written until `start`."""  # noqa: D205, D209
+        self._ids, self._source, several = np.arange(count), None, len(self.models) > 1
+        self.which = np.zeros(count, dtype=int) if which is None else which
+        if several:
+            self.engine.assign(self.which)  # type: ignore[attr-defined]  # it has several models
         self.own, self.t, self._now = {}, 0, {}
         self._live, self._stepped = True, False
-        for name, values in self._expanded.items():  # before the reset: what it takes from the model is nominal too
-            values[:count] = self._nominal[name]
+        for name in self._expanded:  # before the reset: what it takes from the model is nominal too
+            values = self._expanded[name] = self.engine.expand(name)  # which may have begun anew, see Rebound
+            values[:count] = self._nominal[name][self.which if several else 0]
         self.engine.reset(self._ids)
         self._dirty = bool(self._expanded)
 
@@ -183,12 +171,15 @@ class Sim:
             self.engine.set_const(self._ids)
             self._dirty = False
         self.own = {name: values[sources] for name, values in self.own.items()}
-        self._source = sources
+        self._source, self.which = sources, self.which[sources]
 
     def expand(self, name: str) -> AnyArray:
-        """A field of MjModel with a value for each rollout, (B, ...); read-only once they are prepared."""
+        """A field of MjModel with a value for each rollout, (B, ...); read-only once they are prepared.
+
+        Models with fewer geometries (or others) than the largest have nan, or 0 for integers, behind them.
+        """
         if name not in self._expanded:
-            self._nominal[name] = np.array(own_value(self.model, name))
+            self._nominal[name] = own_values(self.models, name)
             self._expanded[name] = self.engine.expand(name)
         if not self._live:
             values = self._expanded[name][self._ids]
@@ -204,10 +195,10 @@ class Sim:
         self.engine.step(self._ids, count)
 
     def play(self, controls: FloatArray) -> None:
-        """Advance all rollouts by one physics step for each of the controls, (steps, nu)."""
+        """Advance all rollouts by one physics step for each of the controls, (steps, nu) or (B, steps, nu)."""
         self._constants()
         self._moved()
-        self.engine.play(self._ids, np.broadcast_to(controls, (len(self), *controls.shape)))
+        self.engine.play(self._ids, np.broadcast_to(controls, (len(self), *controls.shape[-2:])))
 
     def contact_forces(self) -> FloatArray:
         """Contact forces on every body after the last physics step (MuJoCo's cfrc_ext), (B, nbody, 6)."""
@@ -217,15 +208,119 @@ class Sim:
         return known
 
     def forward(self) -> None:
-        """Compute outputs from the states as they were written."""
+        """Compute outputs from the present states, which do not change: after a step outputs are one step behind.
+
+        Raises:
+          TaskError: `act` calls it, where states may be about to change.
+        """
+        if self._drafts is not None:
+            raise TaskError("sim.forward() in act: call it in observe; act then sees the same outputs")
         self._constants()
-        self._moved()
+        self._now, self._source = {}, None
         self.engine.forward(self._ids)
+
+    def ray(self, points: FloatArray, ways: FloatArray, without: str = "") -> tuple[FloatArray, IntArray]:
+        """What rays hit in the present states, by MuJoCo's `mj_ray`.
+
+        Args:
+          points: where they begin in the world [m], (3,), (R, 3) or (B, R, 3).
+          ways: their directions, likewise.
+          without: a body whose geometries they do not hit.
+
+        Returns:
+          distances in lengths of the directions, and ids of geometries, (B, R) each; -1 where they hit nothing.
+
+        Raises:
+          TaskError: there is no such body, a direction is 0, or the backend has no rays.
+        """
+        rays = (np.atleast_2d(each) for each in np.broadcast_arrays(points, ways))
+        rays = tuple(np.array(np.broadcast_to(each, (len(self), *each.shape[-2:])), dtype=float) for each in rays)
+        if not np.any(rays[1], axis=-1).all():
+            raise TaskError("a ray's direction is 0")
+        self._constants()
+        return self._able("ray")(self._ids, *rays, self.body(without).id if without else -1)
+
+    def jac(self, body: str, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How points in the world, (3,) or (B, 3), that move with a body move and turn with qvel: MuJoCo's `mj_jac`.
+
+        Returns:
+          Jacobians of position and of rotation in the present states, (B, 3, nv) each.
+
+        Raises:
+          TaskError: there is no such body, or the backend has no Jacobians.
+        """
+        self._constants()
+        where = np.array(np.broadcast_to(points, (len(self), 3)), dtype=float)
+        return self._able("jac")(self._ids, self.body(body).id, where)
+
+    def _able(self, what: str) -> Any:  # noqa: ANN401  a method that not every engine has
+        found = getattr(self.engine, what, None)
+        if found is None:
+            raise TaskError(f"sim.{what} is not there on this backend: its {type(self.engine).__name__} has none")
+        return found
+
+    def joint(self, name: str) -> Named:
+        """A joint: qpos, qvel, qacc, xanchor, xaxis ... as MuJoCo's `data.joint(name)`, (B, ...) each."""
+        return self._find("joint", name)
+
+    def body(self, name: str) -> Named:
+        """A body: xpos, xquat, xmat, cvel, xfrc_applied ..."""
+        return self._find("body", name)
+
+    def geom(self, name: str) -> Named:
+        """A geometry: xpos, xmat."""
+        return self._find("geom", name)
+
+    def site(self, name: str) -> Named:
+        """A site: xpos, xmat."""
+        return self._find("site", name)
+
+    def sensor(self, name: str) -> Named:
+        """A sensor: data."""
+        return self._find("sensor", name)
+
+    def actuator(self, name: str) -> Named:
+        """An actuator: ctrl, force, length, velocity."""
+        return self._find("actuator", name)
+
+    def tendon(self, name: str) -> Named:
+        """A tendon: length, velocity."""
+        return self._find("tendon", name)
+
+    def _find(self, kind: str, name: str) -> Named:
+        if (kind, name) not in self._named:
+            first, *others = (Named(self.__getattr__, mujoco.MjData(model), kind, name) for model in self.models)
+            if any(not first.same(other) for other in others):
+                raise TaskError(
+                    f"{kind} {name!r} has other places in the arrays of other models: read them by sim.which"
+                )
+            self._named[kind, name] = first
+        return self._named[kind, name]
 
     def control(self, values: FloatArray) -> None:
         """Set the controls, (B, nu)."""
         self.engine.field("ctrl")[self._ids] = values
         self._now.pop("ctrl", None)
+
+    @contextmanager
+    def writing(self) -> Iterator[dict[str, AnyArray]]:
+        """Let a task write copies of WRITABLE in this block; yields them by name, (n, ...), for `write`.
+
+        They are copies whether or not some rollouts have ended, so that one kept for later never reaches the physics.
+        """
+        drafts = self._drafts = {}
+        try:
+            yield drafts
+        finally:
+            self._drafts = None
+            for values in drafts.values():
+                values.flags.writeable = False
+
+    def write(self, states: Mapping[str, AnyArray]) -> None:
+        """Write states (n, ...) by name; outputs follow in the next physics step."""
+        for name, values in states.items():
+            self.engine.field(name)[self._ids] = values
+            self._now.pop(name, None)
 
     def blown_up(self) -> BoolArray:
         """Which rollouts' states are no longer reasonable numbers, (B,)."""
@@ -233,7 +328,7 @@ class Sim:
 
     def keep(self, going: BoolArray) -> None:
         """Remove the finished rollouts, (B,)."""
-        self._ids, self._now = self._ids[going], {}
+        self._ids, self._now, self.which = self._ids[going], {}, self.which[going]
         self.own = {name: values[going] for name, values in self.own.items()}
 
     def _moved(self) -> None:
@@ -249,6 +344,30 @@ class Sim:
 def own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a number or an array
     """A field of the model, or (opt.NAME) of its options."""
     return getattr(model.opt, name.removeprefix("opt.")) if name.startswith("opt.") else getattr(model, name)
+
+
+def own_values(models: Sequence[mujoco.MjModel], name: str) -> AnyArray:
+    """That of each model, (M, ...); behind those of a smaller model, nan or 0 for integers."""
+    values = [np.asarray(own_value(model, name)) for model in models]
+    most = tuple(map(max, zip(*(each.shape for each in values), strict=True)))
+    out = np.full((len(values), *most), np.nan if values[0].dtype.kind == "f" else 0, values[0].dtype)
+    for row, each in zip(out, values, strict=True):
+        row[tuple(slice(n) for n in each.shape)] = each
+    return out
+
+
+def unwritable(line: str) -> str:
+    """Why a line of a task's code cannot write what it names of `sim`, and what can be written instead."""
+    found = re.search(r"\bsim(?:\.\w+\([^)]*\))?\.(\w+)", line)  # sim.qpos, or sim.joint("hinge").qpos
+    if not found:
+        return f"the array is read-only; {_CAN}"
+    if found[1] == "expand":
+        return "a field of the model can be written in reset and prepare only, before the rollout runs"
+    if found[1] == "ctrl":
+        return "act returns the controls"
+    if found[1] in WRITABLE:
+        return f"{found[0]} can be written in act, reset and prepare only, and in no environment of Gymnasium"
+    return f"{found[0]} is computed by MuJoCo; {_CAN}"
 
 
 def failed_rows(state: FloatArray) -> BoolArray:

@@ -10,9 +10,8 @@ import mujoco
 import mujoco.viewer
 
 from farm.errors import RunError
-from farm.sim.channels import Camera
 from farm.sim.engines import DataEngine
-from farm.sim.rendering import aimed
+from farm.sim.rendering import View, aimed
 from farm.sim.sim import Sim
 
 _CLOSING: Final = 10.0  # [s]
@@ -25,7 +24,7 @@ def watch(
     wait: Callable[[float], bool],
     say: Callable[[str], object],
     *,
-    camera: Camera | None,
+    view: View,
     speed: float,
     hold: float,
 ) -> int:
@@ -36,7 +35,7 @@ def watch(
       play: runs one rollout in a simulation that is shown, and returns the control steps it lasted.
       wait: sleeps this number of seconds; true when it is time to end.
       say: called with a message after the first rollout.
-      camera: point of view; by default MuJoCo's own.
+      view: point of view; the mouse moves it as well.
       speed: 1 is real time.
       hold: pause after a rollout [s].
 
@@ -52,12 +51,13 @@ def watch(
     engine = DataEngine(model)
     played = 0
     with mujoco.viewer.launch_passive(model, engine.data, show_left_ui=False, show_right_ui=False) as viewer:
-        if camera is not None:
-            with viewer.lock():
-                aimed(viewer.cam, camera)
-        clock = _Clock(viewer, engine.data, wait, float(model.opt.timestep) / speed)
+        with viewer.lock():
+            aimed(viewer.cam, view.camera)
+        clock = _Clock(viewer, engine.data, view, wait, float(model.opt.timestep) / speed)
         engine.pace = clock.step
         while clock.going:
+            with viewer.lock():
+                viewer.cam.lookat += view.back()
             steps = play(Sim(engine))
             if not played:
                 say(f"the first rollout ended after {steps} control steps, and is repeated")
@@ -74,9 +74,14 @@ class _Clock:
     """Steps the physics at the requested speed, with forces from the mouse."""
 
     def __init__(
-        self, viewer: mujoco.viewer.Handle, data: mujoco.MjData, wait: Callable[[float], bool], period: float
+        self,
+        viewer: mujoco.viewer.Handle,
+        data: mujoco.MjData,
+        view: View,
+        wait: Callable[[float], bool],
+        period: float,
     ) -> None:
-        self._viewer, self._data, self._wait, self._period = viewer, data, wait, period
+        self._viewer, self._data, self._view, self._wait, self._period = viewer, data, view, wait, period
         self._next = time.monotonic()
         self.going = True
 
@@ -84,9 +89,14 @@ class _Clock:
         """One physics step, shown; false when the viewer was closed or it is time to end."""
         viewer, data = self._viewer, self._data
         with viewer.lock():
+            own = data.xfrc_applied.copy()  # the task's
             data.xfrc_applied[:] = 0.0
             mujoco.mjv_applyPerturbForce(viewer.m, data, viewer.perturb)
+            data.xfrc_applied += own
             mujoco.mj_step(viewer.m, data)
+            data.xfrc_applied[:] = own
+            if self._view.mover is not None:
+                viewer.cam.lookat += self._view.moved(data.xpos[self._view.mover.index])
         viewer.sync()
         self._next = max(self._next + self._period, time.monotonic() - 10 * self._period)  # no race after a pause
         ended = self._wait(max(0.0, self._next - time.monotonic()))

@@ -1,8 +1,10 @@
 """The base class of tasks, and the specification that other code knows of a task."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
@@ -10,12 +12,14 @@ import numpy as np
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from farm.sim.channels import Camera, Channel
+from farm.sim.channels import Camera, Channel, Measure
 
 if TYPE_CHECKING:
     import mujoco
 
-    from farm.sim.sim import Engine, MakeEngine, Sim
+    from farm.sim.interfaces import Engine, MakeEngine
+    from farm.sim.model_files import Content, Files
+    from farm.sim.sim import Sim
 
 STEPS_LIMIT: Final = 10_000
 """Control steps of a rollout, at most."""
@@ -23,7 +27,23 @@ STEPS_LIMIT: Final = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig(Settings):
-    """Settings that every task has; a task's own `Config` adds to them."""
+    """Settings that every task has; a task's own `Config` adds to them.
+
+    Example:
+      ```python
+      from dataclasses import dataclass
+
+      import farm
+
+      class Hinge(farm.Task):
+          @dataclass(frozen=True, kw_only=True)
+          class Config(farm.TaskConfig):
+              torque: float = farm.setting(1.5, above=0.0, most=10.0)
+              '''Torque at full action [N m]; the flag is --torque.'''
+
+      assert Hinge(Hinge.Config(steps=20)).steps == 20
+      ```
+    """
 
     steps: int = setting(0, least=0, most=STEPS_LIMIT)
     """Control steps of a rollout; 0: the task's own number."""
@@ -37,7 +57,16 @@ class TaskConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TaskSpec:
-    """What learner and workers must know of a task before anything is simulated."""
+    """What learner and workers must know of a task before anything is simulated.
+
+    Example:
+      ```python
+      import farm
+
+      spec = farm.TaskSpec(observation=3, action=1, steps=100, period=0.05)
+      assert spec.shapes(bodies=2) == {"bodies": (2, 7), "actions": (1,), "terms": (1,)}
+      ```
+    """
 
     observation: int
     """Length d of the observation x."""
@@ -53,6 +82,8 @@ class TaskSpec:
     """Whether a rollout can succeed; otherwise there are only returns."""
     channels: tuple[Channel, ...] = ()
     """Channels that a rollout shows."""
+    measures: tuple[Measure, ...] = ()
+    """Numbers that describe a whole rollout."""
     release: str = ""
     """Release of the task's package; empty for the farm's own and for files."""
 
@@ -74,7 +105,18 @@ class TaskSpec:
 
 @dataclass(frozen=True)
 class Record:
-    """Whole rollouts, for tasks that score them at once: T control steps of B rollouts, zero after the end."""
+    """Whole rollouts, for tasks that score them at once: T control steps of B rollouts, zero after the end.
+
+    Example:
+      ```python
+      import farm
+
+      class Smooth(farm.Task):
+          def score(self, record):
+              change = record.actions[:, 1:] - record.actions[:, :-1]  # (B, T - 1, A)
+              print("most that an action changes:", abs(change).max(axis=(1, 2)))  # (B,)
+      ```
+    """
 
     frames: Mapping[str, FloatArray]
     """What `Task.measure` gave after each step, (B, T, ...)"""
@@ -86,11 +128,31 @@ class Record:
     """Control steps of each including its last, (B,)"""
     failed: BoolArray
     """Whether the simulation became unstable in the last of them, (B,)"""
+    which: IntArray
+    """Which of the task's models each has, (B,)"""
 
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of whole rollouts."""
+    """Scores of whole rollouts.
+
+    Example:
+      ```python
+      import numpy as np
+
+      import farm
+
+      class Far(farm.Task):
+          def score(self, record):  # one term, the effort; a success if the rollout does not end early
+              effort = (record.actions**2).sum(axis=2, keepdims=True)  # (B, T, 1)
+              return farm.Score(terms=-effort, success=record.steps == self.steps)
+
+      rollouts = {"steps": np.array([100, 7]), "failed": np.zeros(2, dtype=bool), "actions": np.ones((2, 100, 3))}
+      score = Far().score(farm.Record(frames={}, start={}, which=np.zeros(2, dtype=int), **rollouts))
+      assert score.terms.shape == (2, 100, 1)
+      assert score.success.tolist() == [True, False]
+      ```
+    """
 
     terms: FloatArray
     """Reward terms, zero after the end, (B, T, K)"""
@@ -105,18 +167,47 @@ class Task:
     depend on each other. `sim` is the batch as named live arrays (`farm.sim.sim.Sim`); a task sees nothing else of a
     simulator. The object holds no state of a rollout. What must be remembered is kept in `sim.own`, arrays (B, ...)
     whose rows stay with their rollouts when other rollouts end.
+
+    A method's result of a wrong shape, or that is not finite, ends the run with a TaskError that names it.
+
+    Example:
+      ```python
+      import numpy as np
+
+      import farm
+
+      class Hinge(farm.Task):
+          '''Stay upright.'''
+
+          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/></body>
+            </worldbody><actuator><motor joint="hinge" ctrlrange="-2 2"/></actuator></mujoco>'''
+          steps, substeps = 50, 10
+
+          def reset(self, sim, row, rng):  # rng is None for nominal conditions
+              sim.qpos[row] = 0.0 if rng is None else rng.uniform(-0.1, 0.1)
+
+          def reward(self, sim, action):  # (B,)
+              return np.cos(sim.qpos[:, 0])
+
+      assert Hinge().period == 0.02  # [s]: 10 physics steps of MuJoCo's default
+      ```
     """
 
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """The task's own settings: flags, help and config.json follow from its fields."""
-    xml: ClassVar[str] = ""
-    """MJCF of what is simulated; or override `files` or `compiled`."""
+    xml: str | Path = ""
+    """MJCF of what is simulated, or its file in the folder of the task's file; or override `files` or `compiled`.
+
+    What it includes and reads (meshes, textures, height fields) travels with a run. A worker does not look at it.
+    """
     steps: int = 100
     """Control steps of a rollout."""
     substeps: int = 1
     """Physics steps in each."""
     channels: tuple[Channel, ...] = ()
     """What a rollout shows in addition to bodies, actions and reward terms."""
+    measures: tuple[Measure, ...] = ()
+    """Numbers that `outcomes` gives of a whole rollout, beside its return."""
     camera: Camera | None = None
     """Point of view of pictures; by default from the side of the moving bodies."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"default": {}}
@@ -132,45 +223,82 @@ class Task:
     takes: ClassVar[str] = ""
     """What the part after the colon in the task's name means, for tasks with variants: `--task gym:NAME`."""
 
-    def __init__(
-        self, config: TaskConfig | None = None, variant: str = "", files: Mapping[str, str] | None = None
-    ) -> None:
-        """Take settings, the name after the colon, and the run's texts (by default this machine's)."""
+    def __init__(self, config: TaskConfig | None = None, variant: str = "", files: "Files | None" = None) -> None:
+        """Take settings, the name after the colon, and the run's files (by default this machine's)."""
         self.config: Any = self.Config() if config is None else config
         self.variant = variant
         if self.config.steps:
             self.steps = self.config.steps
-        self.sources: Mapping[str, str] = self.files() if files is None else files
-        self._model: mujoco.MjModel | None = None
+        self.sources: Files = self.files() if files is None else files
+        self._models: tuple[mujoco.MjModel, ...] = ()
 
     # Simulation
 
-    def files(self) -> dict[str, str]:
-        """Texts that decide numbers and are sent with a run, by name."""
-        return {"model.xml": self.xml} if self.xml else {}
+    def files(self) -> "Mapping[str, Content]":
+        """What decides numbers and is sent with a run, by path: texts, or bytes; the first .xml is the model."""
+        from farm.sim.model_files import read
+
+        return read(self.xml, self._folder) if self.xml else {}
+
+    @property
+    def _folder(self) -> Path | None:
+        """Of the file whose class says what `xml` is."""
+        module = next(kind.__module__ for kind in type(self).__mro__ if "xml" in vars(kind))
+        file = getattr(sys.modules.get(module), "__file__", None)
+        return Path(file).parent if file else None
 
     @property
     def model(self) -> "mujoco.MjModel":
-        """The compiled model; made once."""
-        if self._model is None:
-            self._model = self.compiled()
-        return self._model
+        """The compiled model, the first if there are several; made once."""
+        return self.simulated[0]
+
+    @property
+    def simulated(self) -> "tuple[mujoco.MjModel, ...]":
+        """All compiled models; made once."""
+        if not self._models:
+            from farm.sim.mixed import compiled_models
+            from farm.sim.model_files import TEXT
+
+            given, name = self.models(), type(self).__name__
+            known = self.sources, self.main or TEXT
+            self._models = compiled_models(given, name, *known) if given else (self.compiled(),)
+        return self._models
+
+    def models(self) -> "Sequence[str | mujoco.MjModel]":
+        """Several models, MJCF texts or compiled: each rollout has one, see `which`. Empty: the model alone."""
+        return ()
+
+    def which(self, rng: np.random.Generator) -> int:
+        """Index of a rollout's model, drawn from its generator before `prepare`; nominal rollouts have the first."""
+        return int(rng.integers(len(self.simulated)))
 
     def compiled(self) -> "mujoco.MjModel":
         """Compile the model."""
-        from farm.sim.scene import compiled
+        from farm.sim.model_files import TEXT, compiled
 
-        return compiled(self.mjcf(), type(self).__name__)
+        return compiled(self.mjcf(), type(self).__name__, self.sources, self.main or TEXT)
+
+    @property
+    def main(self) -> str:
+        """Path of the model among `sources`; empty if there is none."""
+        return next((path for path in self.sources if path.endswith(".xml")), "")
 
     def mjcf(self) -> str:
-        """The model as one MJCF text, from `sources`."""
-        if "model.xml" not in self.sources:
-            raise ConfigError(f"task {type(self).__name__} has no model: give it `xml`, an MJCF text")
-        return self.sources["model.xml"]
+        """The model's MJCF text, from `sources`."""
+        name, several = type(self).__name__, self.models()
+        text = several[0] if several else self.sources.get(self.main)
+        if isinstance(text, str):
+            return text
+        if several or type(self).compiled is not Task.compiled:
+            how = "models()" if several else "compiled()"
+            raise ConfigError(f"task {name} makes its model by {how}: without mjcf() there is no text to export")
+        raise ConfigError(f"task {name} has no model: give it `xml`, an MJCF text or its file")
 
     def engine(self, backend: "MakeEngine") -> "Engine":
-        """The simulation engine: the backend's for the model, unless the task has its own."""
-        return backend(self.model)
+        """The simulation engine: the backend's for the model, or models, unless the task has its own."""
+        from farm.sim.mixed import engine
+
+        return engine(self.simulated, backend)
 
     def setup(self, sim: "Sim") -> None:
         """Compute once, before the first rollout, what all rollouts need and none changes."""
@@ -190,7 +318,11 @@ class Task:
         return np.concatenate([sim.qpos, sim.qvel], axis=1)
 
     def act(self, sim: "Sim", action: FloatArray) -> FloatArray:  # noqa: ARG002
-        """Controls of raw actions (B, A); -1 to 1 rescaled to the actuators' ranges unless overridden."""
+        """Controls of raw actions (B, A); -1 to 1 rescaled to the actuators' ranges unless overridden.
+
+        It may also write qpos, qvel, mocap_pos, xfrc_applied and the others of `farm.sim.sim.WRITABLE`: pushes, moving
+        goals, jumps. They hold from this control step's first physics step on.
+        """
         low, high = self.limits
         return rescaled(action, low, high)
 
@@ -224,6 +356,10 @@ class Task:
         """Score whole rollouts at once instead of by `reward` and `success`; None: do not."""
         return None
 
+    def outcomes(self, record: Record) -> dict[str, FloatArray]:  # noqa: ARG002
+        """Values of `measures` of whole rollouts, (B,) each, by name; within their bounds."""
+        return {}
+
     def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Values of the channels from what was measured, any leading shape; those measured under their names."""
         return {channel.name: frames[channel.name] for channel in self.channels}
@@ -246,11 +382,9 @@ class Task:
         """A control step [s]."""
         return float(self.model.opt.timestep) * self.substeps
 
-    def spec(self) -> TaskSpec:
-        """The task's specification; found from one rollout's start unless overridden."""
-        from farm.tasks.loop import probe
-
-        return probe(self)
+    def spec(self) -> TaskSpec | None:
+        """The task's specification; None: it is found by one control step (`farm.tasks.probe`)."""
+        return None
 
 
 def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

@@ -7,10 +7,12 @@ batch by the backend, with the same numbers.
 
 import json
 import re
+import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import mujoco
@@ -18,8 +20,10 @@ import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
+from farm.sim.engines import STATE
+from farm.sim.interfaces import Engine, MakeEngine
 from farm.sim.scene import quiet
-from farm.sim.sim import Engine, MakeEngine, Sim
+from farm.sim.sim import Sim
 from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec, rescaled
 from farm.tasks.gymnasium_batched import batched
 
@@ -36,6 +40,7 @@ _REFUSED: Final[Mapping[str, str]] = {
     "max_episode_steps": "--steps shortens rollouts",
 }
 _LIMIT: Final = 100_000  # numbers of an observation
+_DIMENSIONS: Final = 2  # of a box of numbers; one of more is a picture
 _ROWS: Final = 16  # environments that are stepped in turn
 _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -88,9 +93,7 @@ class Environment(Task):
     takes = "NAME"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
-            "policy": "direct", "features": 50, "bandwidth": 3.0, "initial_mu": 0.0, "initial_sigma": 0.1,
-            "shaping": "ranks", "optimiser": "clipup", "learning_rate_mu": 0.1, "learning_rate_sigma": 0.1,
-            "sigma_rule": "capped", "max_speed": 0.2,
+            "policy": "linear", "normalise": True, "algorithm": "ars", "initial_sigma": 0.05, "learning_rate_mu": 0.05,
         },
     }  # fmt: skip
 
@@ -149,10 +152,9 @@ class Environment(Task):
         """The sizes of the environment's spaces."""
         import gymnasium
 
-        space: Any = self._first.observation_space
         return TaskSpec(
-            observation=space.shape[0], action=len(self.limits[0]), steps=self.steps, period=self.period,
-            release=f"gymnasium {gymnasium.__version__}",
+            observation=gymnasium.spaces.flatdim(self._first.observation_space), action=len(self.limits[0]),
+            steps=self.steps, period=self.period, release=f"gymnasium {gymnasium.__version__}",
         )  # fmt: skip
 
     def engine(self, backend: MakeEngine) -> Engine:
@@ -203,7 +205,6 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
     """
     try:
         import gymnasium
-        from gymnasium.envs.mujoco import MujocoEnv
     except ImportError:
         raise ConfigError(f"task gym:{name} needs gymnasium: pip install 'gymnasium[mujoco]'") from None
     quiet()
@@ -215,35 +216,68 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
                 env.reset(seed=NOMINAL)
                 env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
     except Exception as error:  # an environment may raise anything
-        raise ConfigError(f"task gym:{name}: {' '.join(str(error).split())}") from None
-    space, actions = env.observation_space, env.action_space
-    if not isinstance(env.unwrapped, MujocoEnv):
+        said = " ".join(str(error).split()) or _place(error)
+        raise ConfigError(f"task gym:{name}: {said}") from None
+    space, actions, inner, box = env.observation_space, env.action_space, env.unwrapped, gymnasium.spaces.Box
+    own = (("model", mujoco.MjModel), ("data", mujoco.MjData), ("dt", float))
+    if not all(isinstance(getattr(inner, what, None), kind) for what, kind in own):
         raise ConfigError(f"task gym:{name}: not an environment of MuJoCo")
-    box = gymnasium.spaces.Box
-    if not isinstance(space, box) or len(space.shape) != 1 or space.shape[0] > _LIMIT:
-        raise ConfigError(f"task gym:{name}: observations are {space}; expected a box of one dimension")
+    for where, part in _leaves(space):
+        if not isinstance(part, box) or len(part.shape) > _DIMENSIONS or part.dtype.kind == "u":
+            picture = ", a picture" if isinstance(part, box) else ""
+            raise ConfigError(
+                f"task gym:{name}: observation{where} is {part}{picture}; expected numbers: a box, or a dict of boxes"
+            )
+    size = gymnasium.spaces.flatdim(space)
+    if not 0 < size <= _LIMIT:
+        raise ConfigError(f"task gym:{name}: observations of {size} numbers; expected 1 to {_LIMIT}")
     if not isinstance(actions, box) or len(actions.shape) != 1 or not actions.is_bounded():
         raise ConfigError(f"task gym:{name}: actions are {actions}; expected a bounded box of one dimension")
     return env
 
 
+def _place(error: Exception) -> str:
+    """Where an error without words was raised, such as an assertion."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}: {last.line}"
+
+
+def _leaves(space: Any, where: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401  a space
+    """A space's parts that have no parts, each with where it is: "['goal']"."""
+    parts = getattr(space, "spaces", None)  # of a Dict, by name, or of a Tuple
+    if parts is None:
+        yield where, space
+        return
+    for key, part in parts.items() if isinstance(parts, Mapping) else enumerate(parts):
+        yield from _leaves(part, f"{where}[{key!r}]")
+
+
 class EnvironmentEngine:
     """One environment per row; each steps its own simulation."""
 
+    writable: ClassVar[tuple[str, ...]] = ()  # its arrays are copies of what an environment has
+
     def __init__(self, name: str, **arguments: Any) -> None:  # noqa: ANN401  whatever an environment takes
         """Make the first environment; more are made as they are needed."""
+        from gymnasium.spaces import flatdim, flatten
+
+        self._flatten = flatten
         self.size = _ROWS
         self._name, self._arguments = name, arguments
         self._envs = [make(name, **arguments)]
         first: Any = self._envs[0]
         self.model: mujoco.MjModel = first.unwrapped.model
-        self._kind = first.action_space.dtype
+        self._fresh = np.empty(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, first.unwrapped.data, self._fresh, STATE)
+        self._kind, self._space = first.action_space.dtype, first.observation_space
         self._seeds = [NOMINAL] * _ROWS
         self._bad = np.zeros(_ROWS, dtype=bool)
         self._fields: dict[str, AnyArray] = {
             "ctrl": np.zeros((_ROWS, first.action_space.shape[0])),
             "qpos": np.zeros((_ROWS, self.model.nq)),
-            "observation": np.zeros((_ROWS, first.observation_space.shape[0])),
+            "mocap_pos": np.zeros((_ROWS, self.model.nmocap, 3)),
+            "mocap_quat": np.zeros((_ROWS, self.model.nmocap, 4)),
+            "observation": np.zeros((_ROWS, flatdim(self._space))),
             "reward": np.zeros(_ROWS),
             "terminated": np.zeros(_ROWS, dtype=bool),
         }
@@ -262,6 +296,10 @@ class EnvironmentEngine:
     def seed(self, row: int, seed: int) -> None:
         """Reset an environment to the start that a seed gives."""
         self._seeds[row] = seed
+        env: Any = self._envs[row].unwrapped
+        mujoco.mj_setState(env.model, env.data, self._fresh, STATE)  # an environment's own reset may leave some of it
+        for kind in _UNSTABLE:
+            env.data.warning[kind].number = 0
         x, _ = self._envs[row].reset(seed=seed)
         self._take(row, x, 0.0)
 
@@ -272,10 +310,14 @@ class EnvironmentEngine:
                 x, reward, terminated, *_ = self._envs[row].step(self._fields["ctrl"][row].astype(self._kind))
                 self._take(row, x, float(reward), terminated=bool(terminated))
 
-    def _take(self, row: int, x: AnyArray, reward: float, *, terminated: bool = False) -> None:
+    def _take(self, row: int, seen: Any, reward: float, *, terminated: bool = False) -> None:  # noqa: ANN401
         env: Any = self._envs[row].unwrapped
+        plain = isinstance(seen, np.ndarray) and seen.ndim == 1  # not rounded to what the space says
+        x: Any = seen if plain else self._flatten(self._space, seen)
         self._bad[row] = not (np.isfinite(x).all() and np.isfinite(reward)) or blown_up(env)
-        self._fields["observation"][row], self._fields["qpos"][row] = x, env.data.qpos
+        self._fields["observation"][row] = x
+        for name in ("qpos", "mocap_pos", "mocap_quat"):
+            self._fields[name][row] = getattr(env.data, name)
         self._fields["reward"][row], self._fields["terminated"][row] = reward, terminated
 
     def play(self, ids: IntArray, controls: FloatArray) -> None:

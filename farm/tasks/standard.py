@@ -1,4 +1,4 @@
-"""Standardisation of a task's observations: the nominal start, and their spread."""
+"""The nominal start of a task: its positions, its observation, and the spread of observations from there."""
 
 from typing import Final
 
@@ -6,15 +6,20 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import TaskError
-from farm.sim.engines import BatchEngine
-from farm.sim.scene import quiet
 from farm.sim.sim import Sim
 from farm.tasks.base import Task
-from farm.tasks.loop import Batch, again
+from farm.tasks.loop import Batch
+from farm.tasks.probe import tried
 
 _ROLLOUTS: Final = 32
 _QUARTILES: Final = 1.349  # between those of a normal distribution, in standard deviations
 _FLOOR: Final = 1.0 / 3.0  # of a part's mean spread
+
+
+def start(task: Task) -> tuple[FloatArray, FloatArray | None]:
+    """Positions at the nominal start (nq,), and poses of the mocap bodies (nmocap, 7); None without any."""
+    found = tried(task, 1, lambda sim: Batch(task, sim, [None]).start)
+    return found["qpos"][0], found["mocap"][0] if "mocap" in found else None
 
 
 def nominal(task: Task) -> FloatArray:
@@ -24,7 +29,7 @@ def nominal(task: Task) -> FloatArray:
       ConfigError: the task cannot start.
       TaskError: the observation is not finite.
     """
-    return _observed(task, np.empty((0, task.model.nu)))[0]
+    return _observed(task, np.empty((0, len(task.limits[0]))))[0]
 
 
 def standard(task: Task, action: float) -> dict[str, FloatArray]:
@@ -39,7 +44,7 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
       ConfigError: the task cannot start.
       TaskError: an observation is not finite.
     """
-    seen = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, task.model.nu)))
+    seen = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, len(task.limits[0]))))
     low, high = np.quantile(seen, (0.25, 0.75), axis=0)
     spread, parts = (high - low) / _QUARTILES, task.parts or (seen.shape[1],)
     if sum(parts) != len(spread):
@@ -52,23 +57,19 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
 
 def _observed(task: Task, actions: FloatArray) -> FloatArray:
     """Observations of rollouts with constant actions (B, A) from the nominal start, which is the first, (N, d)."""
-    quiet()
-    sim = Sim(task.engine(lambda model: BatchEngine(model, max(1, len(actions)))))
 
-    def look() -> list[FloatArray]:
-        task.setup(sim)
-        batch = Batch(task, sim, [None] * max(1, len(actions)))
-        seen = [np.array(batch.observe(), dtype=float)]
-        while len(actions) and not batch.over:
-            batch.step(actions[batch.active])
-            if not batch.over:
-                seen.append(np.array(batch.observe(), dtype=float))
+    def look(sim: Sim) -> list[FloatArray]:
+        seen, size = [], sim.engine.size  # of a task's own engine, which may have fewer rows than there are actions
+        for some in np.split(actions, range(size, len(actions), size)):
+            batch = Batch(task, sim, [None] * max(1, len(some)))
+            seen.append(np.array(batch.observe(), dtype=float))
+            while len(some) and not batch.over:
+                batch.step(some[batch.active])
+                if not batch.over:
+                    seen.append(np.array(batch.observe(), dtype=float))
         return seen
 
-    try:
-        seen = np.concatenate(again(look))
-    finally:
-        sim.engine.close()
+    seen = np.concatenate(tried(task, max(1, len(actions)), look))
     if not np.isfinite(seen).all():
         raise TaskError("observe is not finite")
     return seen

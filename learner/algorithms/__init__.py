@@ -1,7 +1,7 @@
 """Learning algorithms: pure functions `ask` and `tell` on immutable states."""
 
 from collections.abc import Mapping
-from dataclasses import Field
+from dataclasses import Field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -21,6 +21,23 @@ class Algorithm(Protocol[State]):
     """An algorithm and its settings: a frozen, keyword-only dataclass; everything that changes is in the state.
 
     Its fields become flags and a table of config.json, so no other setting may have their names; `name` is reserved.
+
+    Example:
+      ```python
+      import numpy as np
+
+      import farm
+
+      algorithm, rng = farm.configure("finger-gait").algorithm_config, np.random.default_rng(0)
+      state = algorithm.init(5)  # P parameters
+      for _ in range(30):
+          eps = algorithm.ask(state, rng)  # (rows, P)
+          tried = [state.mu + sign * eps for sign in algorithm.signs()]
+          returns = np.stack([-((each - 1.0) ** 2).sum(axis=1) for each in tried], axis=1)  # (rows, signs)
+          state = algorithm.tell(state, eps, returns)
+      assert state.generation == 30
+      assert ((state.mu - 1.0) ** 2).sum() < 1.0  # it began with 5
+      ```
     """
 
     if TYPE_CHECKING:  # `dataclasses.replace` needs it; isinstance works only for protocols of methods alone
@@ -42,8 +59,8 @@ class Algorithm(Protocol[State]):
         """Return the state after one update, from returns (rows, signs); raises Diverged if it would not be finite."""
 
 
-def begin(algorithm: Algorithm[Any], size: int) -> SearchState:
-    """The algorithm's state before the first generation, of `size` parameters.
+def begin(algorithm: Algorithm[Any], size: int, start: FloatArray | None = None) -> SearchState:
+    """The algorithm's state before the first generation, of `size` parameters, with `start` (P,) added to its mean.
 
     Raises:
       TaskError: it, or the algorithm's signs, are invalid.
@@ -51,7 +68,8 @@ def begin(algorithm: Algorithm[Any], size: int) -> SearchState:
     signs: object = algorithm.signs()
     if not isinstance(signs, tuple) or signs not in ((1,), (1, -1)):
         raise TaskError(f"signs of {type(algorithm).__name__} gave {signs!r}; expected (1,) or (1, -1)")
-    return _checked(algorithm, "init", algorithm.init(size), size, 0)
+    state = _checked(algorithm, "init", algorithm.init(size), size, 0)
+    return state if start is None else replace(state, mu=state.mu + start)
 
 
 def ask(algorithm: Algorithm[Any], state: SearchState, rng: np.random.Generator) -> FloatArray:

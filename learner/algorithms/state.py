@@ -29,6 +29,19 @@ class SearchState:
 
     Learner, recorder and checkpoint need only these fields. An algorithm that stores more adds fields in a subclass:
     vectors (P,), or empty ones if they are not used.
+
+    Raises:
+      ValueError: an array is not a finite float64 vector of mu's size, or a sigma is not positive.
+
+    Example:
+      ```python
+      import numpy as np
+
+      import farm
+
+      state = farm.SearchState(mu=np.zeros(3), sigma=np.full(3, 0.5))
+      assert farm.SearchState.from_dict(state.to_dict()).sigma.tolist() == [0.5, 0.5, 0.5]
+      ```
     """
 
     mu: FloatArray

@@ -19,11 +19,11 @@ from farm.errors import ConfigError
 from farm.seeds import SEEDS
 from farm.settings import Settings, setting
 from learner.commands import recordings
-from learner.run_folder import RunFolder
+from learner.run.folder import RunFolder
 
 if TYPE_CHECKING:
-    from learner.chain import Chained
-    from learner.replay import LoadedPolicy
+    from learner.again.chain import Chained
+    from learner.again.replay import LoadedPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +55,8 @@ def main(words: Sequence[str]) -> int:
     draw_offscreen()  # before anything imports MuJoCo
     command = settings.parse(ChainCommand, words, "farm chain")
     from farm.sim import video
-    from learner.chain import chain, check
-    from learner.replay import loaded
+    from learner.again.chain import chain, check
+    from learner.again.replay import loaded
 
     logs.set_up("WARNING")
     policies = [loaded(RunFolder.open(path)) for path in command.runs]
@@ -68,7 +68,7 @@ def main(words: Sequence[str]) -> int:
     if command.json:
         say(json.dumps(figures(chain(policies, drawn, command.steps), len(policies)), indent=2))
         return 0
-    from learner.run import check_rerun
+    from learner.run.launch import check_rerun
 
     check_rerun()
     recordings.target(command.to)
@@ -112,7 +112,7 @@ def figures(chained: "Chained", policies: int) -> dict[str, Any]:
 def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     """The unperturbed chain, at physics rate."""
     from farm.tasks import loop
-    from learner.chain import chain
+    from learner.again.chain import chain
 
     first = policies[0].problem
     shown = chain(policies, [None], command.shown, every=1)
@@ -123,5 +123,5 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     recordings.record(command.to, "chain", first, name, trajectory)
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.video is not None:
-        qpos = loop.whole(shown.rollouts, 0)["qpos"]
-        recordings.film(shown.task, [(trajectory, qpos)], command.video, command.speed)
+        frames = loop.whole(shown.rollouts, 0)
+        recordings.film(shown.task, [(trajectory, frames)], command.video, command.speed)

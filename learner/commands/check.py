@@ -1,37 +1,53 @@
 """`farm check`: finds errors of a task in seconds."""
 
+import difflib
+import hashlib
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import tyro
 
-from farm import plugins, rollouts, seeds, settings
+from farm import plugins, seeds, settings
 from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError, TaskError
-from farm.rollouts import Runner
-from farm.tasks.base import TaskConfig
-from learner import config as configs
+from farm.settings import Settings
+from farm.tasks.base import Task, TaskConfig
+from learner import algorithms
 from learner.commands.replay import ReplayCommand
-from learner.commands.run import RunCommand
-from learner.config import RunConfig
+from learner.run import config as configs
+from learner.run.config import RunConfig
 
 if TYPE_CHECKING:
+    from farm.rollouts import Runner
     from farm.tasks.loop import Rollouts
-    from learner.setup import Problem
+    from learner.run.setup import Problem
 
 ROWS = 8
 """Number of rollouts that are compared."""
 
+_STILL: Final = 1e-6  # a change of an action that counts as none
+_VALUED: Final = ("--picture", "--backend", "--policy")
+_LIKE: Final = 0.8  # similarity of names, 1 if equal
+_AGAIN: Final = "import sys; from farm import plugins; plugins.load('learner.commands.check').again(sys.argv[1:])"
+
 
 @dataclass(frozen=True, kw_only=True)
-class CheckCommand:
-    """Checks a task: sizes, bounds, the same bits in any batch, rollouts per second, a picture."""
+class CheckCommand(Settings):
+    """Checks a task: sizes, bounds, the same bits in any batch or process, rollouts per second, a picture."""
 
     name: tyro.conf.Positional[str]
     """The task: a name, gym:NAME, or FILE.py:CLASS."""
@@ -39,6 +55,8 @@ class CheckCommand:
     """Where to write the picture of the start, NAME.png; by default the task's name."""
     backend: str = "cpu"
     """Backend that is compared with cpu, in returns and rollouts per second: a name, or FILE.py:CLASS."""
+    policy: str = ""
+    """Policy that acts: a name, or FILE.py:CLASS; by default that of a run of the task."""
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task."""
 
@@ -46,46 +64,63 @@ class CheckCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
-    name = _name(words)
-    own = None if name is None else configs.configure(plugins.find("tasks", name).name)
-    default = CheckCommand(name=tyro.MISSING, task=own.task_config if own else TaskConfig())
-    command = settings.parse(CheckCommand, words, "farm check", default)
-    assert own is not None
-    settings.distinct(RunCommand(run=own), "farm run")
-    settings.distinct(ReplayCommand(run=Path(), task=own.task_config), "farm replay")
-    for line in checked(replace(own, task_config=command.task), command.picture, command.backend):
+    command, config = _parsed(words)
+    for line in checked(config, command.picture, command.backend, words):
         say(line)
     return 0
 
 
+def _parsed(words: Sequence[str]) -> tuple[CheckCommand, RunConfig]:
+    """The command, and a run of its task."""
+    name = _name(words)
+    own = None if name is None else configs.configure(plugins.find("tasks", name).name)
+    default = CheckCommand(name=name, task=own.task_config) if name and own else None
+    command = settings.parse(CheckCommand, words, "farm check", default)
+    assert own is not None
+    from learner.commands.run import RunCommand  # imports MuJoCo
+
+    settings.distinct(RunCommand(run=own), "farm run")
+    settings.distinct(ReplayCommand(run=Path(), task=own.task_config), "farm replay")
+    if command.policy:
+        own = configs.configure(own.task, policy=command.policy)
+    return command, replace(own, task_config=command.task)
+
+
 def _name(words: Sequence[str]) -> str | None:
-    """The task among the words: the first that looks like one, else the first that is not a flag."""
-    loose = [word for word in words if not word.startswith("-")]
+    """The task among the words: the first that looks like one, else the first that is no flag or value of one."""
+    loose = [word for flag, word in pairwise(("", *words)) if word[:1] != "-" and flag not in _VALUED]
     named = [word for word in loose if ":" in word or word in plugins.names("tasks")]
     return next(iter(named or loose), None)
 
 
-def checked(config: RunConfig, picture: Path | None, backend: str = "cpu") -> Iterator[str]:
-    """Yield lines about a task; a TaskError if rollouts depend on their batch."""
-    from learner.setup import problem
+def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequence[str]) -> Iterator[str]:
+    """Yield lines about a task; a TaskError if rollouts depend on their batch or process.
+
+    Args:
+      config: a run of the task.
+      picture: where to write one.
+      backend: compared with cpu.
+      words: of the command, from which a second process makes the same run.
+    """
+    from farm import rollouts
+    from learner.run.setup import problem
 
     other = None if backend == "cpu" else rollouts.backend(backend)
     found = problem(config)
-    spec, model = found.spec, found.task.model
+    spec = found.spec
     low, high = found.task.limits
-    yield f"observation {spec.observation}, actions {spec.action}, controls {model.nu} from {low} to {high}"
+    yield f"observation {spec.observation}, actions {spec.action}, controls {len(low)} from {low} to {high}"
     yield f"{spec.steps} control steps of {spec.period:g} s; reward of {', '.join(spec.terms)}"
     channels = ", ".join(channel.name for channel in spec.channels)
     yield f"success: {'yes' if spec.success else 'none'}; channels: {channels or 'none'}"
     yield f"policy {config.policy} with {found.policy.size} parameters"
     runner = found.runner()
-    theta = np.random.default_rng(0).normal(0.0, 0.5, (ROWS, found.policy.size))
-    drawn = [None if i == 0 else seeds.trial(0, i // 2) for i in range(ROWS)]
+    theta, drawn = _tried(found)
     together = runner.rollouts(theta, drawn)
     least, most = together.returns.min(), together.returns.max()
     yield f"returns {least:.4g} to {most:.4g}, {int(together.ended.sum())} ended early"
-    if together.failed.any():
-        yield f"warning: the simulation of {int(together.failed.sum())} of {ROWS} rollouts became unstable"
+    odd = (*_odd(together), *_still(found, runner), *_unread(type(found.task)))
+    yield from (f"warning: {each}" for each in odd)
     order = np.random.default_rng(1).permutation(ROWS)
     permuted = runner.rollouts(theta[order], [drawn[i] for i in order])
     _same(_arrays(together), {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()}, "in another order")
@@ -93,19 +128,101 @@ def checked(config: RunConfig, picture: Path | None, backend: str = "cpu") -> It
         alone = runner.rollouts(theta[row : row + 1], [drawn[row]])
         _same({k: v[row] for k, v in _arrays(together).items()}, {k: v[0] for k, v in _arrays(alone).items()}, "alone")
     runner.trajectory(together, 0)
-    yield "same bits together, in another order, and one by one"
+    own, others = _digests(together), _elsewhere(words)
+    for name in (name for name, digest in own.items() if others.get(name) != digest):
+        raise TaskError(
+            f"{name} differs when the same rollouts run in another process: numbers must not depend on what a process "
+            "draws or reads for itself, such as random.random(), hash() or the time"
+        )
+    yield "same bits together, in another order, one by one, and in another process"
     yield f"{_speed(runner, theta, drawn):.0f} rollouts/s on one core"
     if other is not None:
-        compared = Runner(found.task, found.policy, other.engine, exact=rollouts.exact(other))
+        compared = rollouts.Runner(found.task, found.policy, other.engine, exact=rollouts.exact(other))
         most = np.abs(compared.rollouts(theta, drawn).returns - together.returns).max()
         if most and rollouts.exact(other):
             raise TaskError(f"returns on backend {backend} differ by up to {most:.3g}: its class needs exact = False")
         speed = _speed(compared, theta, drawn)
         yield f"backend {backend}: returns differ by at most {most:.3g}; {speed:.0f} rollouts/s"
-    yield _picture(found, together.start["qpos"][0], picture)
+    yield _picture(found, {name: values[:1] for name, values in together.start.items()}, picture)
 
 
-def _speed(runner: Runner, theta: FloatArray, drawn: list[tuple[int, ...] | None]) -> float:
+def again(words: Sequence[str]) -> None:
+    """Print digests of the rollouts that `farm check` with these words simulates, as JSON, for `_elsewhere`."""
+    with redirect_stdout(sys.stderr):  # the task's file may print
+        from learner.run.setup import problem
+
+        found = problem(_parsed(words)[1])
+        said = json.dumps(_digests(found.runner().rollouts(*_tried(found))))
+    say(said)
+
+
+def _elsewhere(words: Sequence[str]) -> dict[str, str]:
+    """Those digests from a new process, with its own random numbers and hashes."""
+    command = [sys.executable, "-P", "-c", _AGAIN, *words]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONHASHSEED"}
+    ended = subprocess.run(command, capture_output=True, env=environment, text=True, check=False)
+    if ended.returncode:
+        why = ended.stderr.strip().splitlines()[-1:]
+        raise TaskError(f"the same rollouts cannot be simulated in another process: {''.join(why)}")
+    digests: dict[str, str] = json.loads(ended.stdout.splitlines()[0])
+    return digests
+
+
+def _tried(found: "Problem") -> tuple[FloatArray, list[tuple[int, ...] | None]]:
+    """Parameters (ROWS, P) and seeds of the rollouts that are compared."""
+    theta = np.random.default_rng(0).normal(0.0, 0.5, (ROWS, found.policy.size))
+    return theta, [None if i == 0 else seeds.trial(0, i // 2) for i in range(ROWS)]
+
+
+def _odd(tried: "Rollouts") -> Iterator[str]:
+    """What rollouts of a finished task hardly ever do."""
+    count = int(tried.failed.sum())
+    if count:
+        yield f"the simulation of {count} of {ROWS} rollouts became unstable"
+    if (tried.ended & (tried.steps == 1)).all():
+        yield "every rollout ends in its first control step; is `ended` what you mean?"
+    elif not count and len(set(tried.returns.tolist())) == 1:
+        yield f"all {ROWS} rollouts have the same return, so that there is nothing to learn"
+
+
+def _still(found: "Problem", runner: "Runner") -> Iterator[str]:
+    """Whether none of the first perturbations that a run draws changes an action of its first mean policy."""
+    from farm.policies.fourier import Kernel, Projected
+
+    state, algorithm = found.begin(), found.config.algorithm_config
+    eps = algorithms.ask(algorithm, state, seeds.exploration(found.config.seed, 0))[:ROWS]
+    starts: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(len(eps))]
+    mean = runner.rollouts(np.repeat(state.mu[None], len(eps), axis=0), starts).actions
+    with np.errstate(invalid="ignore"):
+        moved = np.abs(runner.rollouts(state.mu + eps, starts).actions - mean)
+    if (moved <= _STILL).all():
+        fits = isinstance(found.policy, Kernel | Projected)
+        advice = "--start fitted" if fits else "a larger --initial-sigma, or another --policy, such as linear"
+        yield (
+            f"no perturbation changes any action: {len(eps)} of sigma {state.sigma.mean():.3g} change those of policy "
+            f"{found.config.policy} by at most {moved.max():.1g}, so that a run learns nothing; try {advice}"
+        )
+
+
+def _unread(task: type[Task]) -> Iterator[str]:
+    """Attributes of a task's own classes that nothing reads, with names like those that a task has."""
+    known = [name for name in dir(Task) if not name.startswith("_")]
+    for kind in task.__mro__[: task.__mro__.index(Task)]:
+        source = _source(kind)
+        for name in vars(kind):
+            like = [] if name in known else difflib.get_close_matches(name, known, 1, _LIKE)
+            if like and not re.search(rf"(?<!\bsim)\.{name}\b", source):
+                yield f"{kind.__name__}.{name} is not read by anything; is {like[0]} meant?"
+
+
+def _source(kind: type) -> str:
+    try:
+        return inspect.getsource(sys.modules[kind.__module__])
+    except (OSError, TypeError):  # it has none
+        return ""
+
+
+def _speed(runner: "Runner", theta: FloatArray, drawn: list[tuple[int, ...] | None]) -> float:
     """Rollouts per second of a batch four times as large."""
     begun, many = time.perf_counter(), np.tile(theta, (4, 1))
     runner.rollouts(many, drawn * 4)
@@ -119,6 +236,12 @@ def _arrays(of: "Rollouts") -> dict[str, FloatArray]:
     return out | {name: getattr(of, name) for name in ("terms", "returns", "success", "ended")}
 
 
+def _digests(of: "Rollouts") -> dict[str, str]:
+    """SHA-256 of each of these arrays."""
+    arrays = {name: np.ascontiguousarray(values) for name, values in _arrays(of).items()}
+    return {name: hashlib.sha256(values.tobytes()).hexdigest() for name, values in arrays.items()}
+
+
 def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str) -> None:
     """Compare arrays bit for bit."""
     for name, values in first.items():
@@ -130,7 +253,7 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
             )
 
 
-def _picture(found: "Problem", qpos: FloatArray, path: Path | None) -> str:
+def _picture(found: "Problem", start: Mapping[str, FloatArray], path: Path | None) -> str:
     """Draw the start; returns a line with the file's name."""
     from farm.sim import rendering
 
@@ -142,7 +265,9 @@ def _picture(found: "Problem", qpos: FloatArray, path: Path | None) -> str:
     except ImportError:
         return "no picture: it needs pillow (pip install pillow)"
     try:
-        [drawn] = rendering.pictures(found.task.model, qpos[None], (480, 360), camera=found.task.camera)
+        task, shown = found.task, {"channels": found.task.channels, "values": found.task.show(start)}
+        qpos, mocap = start["qpos"], start.get("mocap")
+        [drawn] = rendering.pictures(task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **shown)
         Image.fromarray(drawn).save(target)
     except (RunError, OSError) as error:
         return f"no picture: {error}"

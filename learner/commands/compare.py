@@ -11,15 +11,16 @@ from farm import settings as arguments
 from farm.commands.logs import say
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
+from farm.settings import Settings
+from learner.again.replay import loaded
 from learner.commands import recordings, view
-from learner.config import RunConfig, flat, preset_of
-from learner.replay import loaded
-from learner.run import check_rerun
-from learner.run_folder import RunFolder
+from learner.run.config import RunConfig, flat, preset_of
+from learner.run.folder import RunFolder
+from learner.run.launch import check_rerun
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareCommand:
+class CompareCommand(Settings):
     """Puts several runs into one recording: their curves together, final policies side by side, a table."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -39,7 +40,7 @@ def main(words: Sequence[str]) -> int:
     from learner.recording.drawing import Drawing
 
     if not 2 <= len(command.runs) <= len(PALETTE):
-        raise ConfigError(f"{len(command.runs)} runs to compare; expected 2 to {len(PALETTE)}")
+        raise ConfigError(f"farm compare takes 2 to {len(PALETTE)} runs, not {len(command.runs)}")
     recordings.target(command.to)
     folders = [RunFolder.open(path) for path in command.runs]
     runs = read(folders)
@@ -117,7 +118,8 @@ def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     yield "return of the final policy", *said("mean_policy_return", ".3f")
     yield "it succeeds", *(_succeeds(run.summary) for run in runs)
     yield "robust success", *said("robust_success_rate", ".0%")
-    yield "first success, generation", *(_first_success(run.progress) for run in runs)
+    firsts = (next((p.generation - 1 for p in run.progress if p.mean_policy_success), None) for run in runs)
+    yield "first success, generation", *("-" if first is None else str(first) for first in firsts)
     yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)
     yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)
 
@@ -125,8 +127,3 @@ def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
 def _succeeds(summary: Mapping[str, Any]) -> str:
     success = {True: "yes", False: "no", None: "-"}[summary.get("mean_policy_success")]
     return "cut short" if success == "no" and summary.get("state") != "finished" else success
-
-
-def _first_success(progress: Sequence[GenerationStats]) -> str:
-    """After how many updates the mean policy first succeeded."""
-    return next((str(p.generation - 1) for p in progress if p.mean_policy_success), "-")

@@ -14,10 +14,10 @@ from rich.text import Text
 
 from farm.commands.logs import Formatter, say
 from farm.commands.screen import plain
-from farm.net.telemetry import WorkerStatus
-from learner import config as configs
-from learner.run import Run
-from learner.telemetry.report import Report
+from farm.net.stats import GenerationStats
+from farm.net.telemetry import Report, WorkerStatus
+from learner.run import config as configs
+from learner.run.launch import Run
 
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
 _SPARK: Final = 80  # characters of a curve, at most
@@ -71,8 +71,14 @@ class PlainDisplay(Display):
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
             f"  return {p.return_mean:8.3f}  mean policy {p.mean_policy_return:8.3f}"
-            f"{success}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
+            f"{success}{_measured(p)}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
         )
+
+
+def _measured(p: GenerationStats) -> str:
+    """The mean policy's measures."""
+    known = ((name, value) for name, value in p.mean_policy_measures.items() if value is not None)
+    return "".join(f"  {plain(name)} {value:.3g}" for name, value in known)
 
 
 class JsonDisplay(Display):
@@ -152,11 +158,14 @@ class LiveDisplay(Display):
         else:
             lost = f"{p.ended} rollouts ended early, {p.failed} failed"
             table.add_row("success", f"{p.success_rate:.0%}", lost)
+        for name, value in p.mean_policy_measures.items():
+            both = ["-" if each is None else f"{each:.3g}" for each in (value, p.measures[name])]
+            table.add_row(plain(name), both[0], f"the mean policy's; {both[1]} of the exploring ones on average")
         table.add_row("sigma", f"{p.sigma_mean:.3f}", f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}")
         return table
 
     def _farm(self, report: Report) -> Table:
-        p, workers = report.progress, self._run.farm.census()
+        p, workers = report.progress, self._run.dispatcher.census()
         table = _grid()
         extra = f"; {p.reissued} jobs reissued" if p.reissued else ""
         rates = [round(worker.rate) for worker in workers]  # rounded first, so that the parts add up
@@ -166,7 +175,7 @@ class LiveDisplay(Display):
         if len(workers) > _WORKERS:
             table.add_row("", f"{sum(rates[_WORKERS:])}", f"{len(workers) - _WORKERS} more")
         if self._run.recording is not None:
-            dropped = self._run.recording.thread.dropped
+            dropped = self._run.recording.dropped
             left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
             table.add_row("recording", "", plain(f"farm view {self._run.learner.folder.path}{left_out}"))
         if self._run.live is not None:

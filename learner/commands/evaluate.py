@@ -6,17 +6,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from farm import settings
+from farm.arrays import IntArray
 from farm.commands.logs import say
-from farm.seeds import SEEDS
+from farm.commands.screen import plain
+from farm.net.work import Simulated
+from farm.seeds import SEEDS, trial
 from farm.settings import Settings, setting
-from learner.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
-from learner.replay import loaded
-from learner.run_folder import RunFolder
+from farm.sim.mixed import names
+from farm.tasks.base import TaskSpec
+from farm.tasks.loop import drawn
+from learner.again.replay import loaded
+from learner.run.config import MOST_GENERATIONS
+from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
+from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +37,7 @@ class EvaluateCommand(Settings):
     """Number of perturbed rollouts."""
     seed: int = setting(EVALUATION_SEED, least=0, most=SEEDS - 1)
     """Seed of the perturbations."""
-    average: int | None = setting(None, least=1)
+    average: int | None = setting(None, least=1, most=MOST_GENERATIONS)
     """Average the means after this number of last generations; by default the run's own setting."""
     json: bool = False
     """Print JSON instead of a table."""
@@ -42,14 +50,16 @@ def main(words: Sequence[str]) -> int:
     if command.json:
         say(json.dumps(figures, indent=2))
         return 0
-    table = Table(title=f"{figures['run']}, mean policy after generation {figures['generation']}")
-    for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "ended early"):
+    table = Table(title=plain(f"{figures['run']}, mean policy after generation {figures['generation']}"))
+    measures = figures["nominal"].get("measures", {})
+    for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "ended early", *measures):
         table.add_column(column, justify="left" if column == "conditions" else "right")
-    for name in ("nominal", "perturbed"):
-        row = figures[name]
+    of = {f"  {name}": row for name, row in figures.get("models", {}).items()}
+    for name, row in ({name: figures[name] for name in ("nominal", "perturbed")} | of).items():
         success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
         returns = [f"{row[key]:.3f}" for key in ("return_mean", "return_min", "return_max")]
-        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["ended"]))
+        own = ["-" if value is None else f"{value:.3g}" for value in row.get("measures", {}).values()]
+        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["ended"]), *own)
     Console().print(table)
     return 0
 
@@ -60,15 +70,33 @@ def evaluate(folder: RunFolder, rollouts: int, seed: int, average: int | None = 
     spec = policy.problem.spec
     given = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
     figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}
-    for name, rows in (("nominal", slice(rollouts, None)), ("perturbed", slice(rollouts))):
-        returns, flags = given.returns[rows], given.flags[rows]
-        figures[name] = {
-            "rollouts": len(returns),
-            "success_rate": float(flags[:, 0].mean()) if spec.success else None,
-            "return_mean": float(returns.mean()),
-            "return_min": float(returns.min()),
-            "return_max": float(returns.max()),
-            "ended": int(flags[:, 1].sum()),
-            "failed": int(flags[:, 2].sum()),
-        }
+    figures["nominal"] = _figures(spec, given, np.array([rollouts]))
+    figures["perturbed"] = _figures(spec, given, np.arange(rollouts))
+    task = policy.problem.task
+    if len(task.simulated) > 1:
+        which = drawn(task, [np.random.default_rng(trial(seed, i)) for i in range(rollouts)])
+        rows = {name: np.flatnonzero(which == i) for i, name in enumerate(names(task.simulated))}
+        figures["models"] = {name: _figures(spec, given, its) for name, its in rows.items() if len(its)}
     return figures
+
+
+def _figures(spec: TaskSpec, given: Simulated, rows: IntArray) -> dict[str, Any]:
+    """Figures of some rollouts, at least one."""
+    returns, flags = given.returns[rows], given.flags[rows]
+    return {
+        "rollouts": len(returns),
+        "success_rate": float(flags[:, 0].mean()) if spec.success else None,
+        "return_mean": float(returns.mean()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        **({"measures": _measures(spec, given, rows)} if spec.measures else {}),
+        "ended": int(flags[:, 1].sum()),
+        "failed": int(flags[:, 2].sum()),
+    }
+
+
+def _measures(spec: TaskSpec, given: Simulated, rows: IntArray) -> dict[str, float | None]:
+    """Means of the task's measures over rollouts that did not fail, by name."""
+    sound = ~given.flags[rows, 2]
+    values = given.measures[rows][sound]
+    return {each.name: float(values[:, at].mean()) if sound.any() else None for at, each in enumerate(spec.measures)}

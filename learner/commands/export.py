@@ -10,9 +10,11 @@ from farm import settings as arguments
 from farm.commands.logs import say
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from learner import export, onnx
-from learner.replay import loaded
-from learner.run_folder import RunFolder
+from learner.again.replay import loaded
+from learner.export import npz as export
+from learner.export import onnx
+from learner.run.config import MOST_GENERATIONS
+from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +25,7 @@ class ExportCommand(Settings):
     """Folder of the run."""
     to: tyro.conf.Positional[Path]
     """File to write: .npz (with the task, for MuJoCo and numpy) or .onnx (the policy alone)."""
-    generation: int | None = setting(None, least=0)
+    generation: int | None = setting(None, least=0, most=MOST_GENERATIONS)
     """Generation whose mean policy is written (0: before learning); by default the last."""
 
     def __post_init__(self) -> None:

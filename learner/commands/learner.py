@@ -3,25 +3,25 @@
 import gc
 import itertools
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 
 from farm.commands import logs
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, NameTakenError
-from farm.net.session import LISTEN
-from farm.net.tls import find
+from farm.settings import Settings
 from learner.commands import display, options, recordings
 from learner.commands.options import LearnerOptions, parse
-from learner.config import RunConfig
-from learner.run import Placement, Run, how_to_join, open_run
-from learner.run_folder import RunFolder
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+from learner.run.launch import Placement, Run, how_to_join, open_run
+from learner.run.setup import fitted
+from learner.run.states import RolledBack
 from learner.scheduler.scheduler import SchedulerConfig
-from learner.setup import fitted
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnerCommand:
+class LearnerCommand(Settings):
     """The learner without workers; they join it with `farm worker` from any machine."""
 
     learner: LearnerOptions = field(default_factory=LearnerOptions)
@@ -33,8 +33,7 @@ class LearnerCommand:
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, begin = parse(LearnerCommand, words, "farm learner")
-    place = Placement() if command.learner.tls is None else Placement(listen=LISTEN.replace("tcp/", "tls/"))
-    return learn(command.learner, command.run, place, resumed, begin)
+    return learn(command.learner, command.run, Placement(listen=command.learner.usual), resumed, begin)
 
 
 def learn(
@@ -45,8 +44,9 @@ def learn(
     place = replace(
         place, connect=chosen.connect, farm=chosen.farm, record=chosen.record, log=chosen.log,
         listen=chosen.listen or place.listen, trusted=chosen.trust_network, mixed=chosen.mixed,
+        numbers=chosen.numbers,
         scheduler=SchedulerConfig(audit=chosen.audit, straggler_seconds=chosen.patience),
-        tls=None if chosen.tls is None else find(chosen.tls, "learner"),
+        tls=chosen.bundle,
         serve=None if chosen.serve is None else options.address(chosen.serve),
     )  # fmt: skip
     if resumed is not None and chosen.name:
@@ -58,25 +58,30 @@ def learn(
     if resumed is not None:
         options.check_resume(begin, config, resumed)
     with stop_flag("saving and ending") as stop:
-        with ExitStack() as stack:
-            run, first = None, path.name
-            for number in itertools.count(2):
-                opened = open_run(config, path, place, resume=resumed is not None, stopped=stop.is_set)
-                try:
-                    run = stack.enter_context(opened)
-                    break
-                except NameTakenError:  # of a run of the same second
-                    if chosen.name or resumed is not None:
-                        raise
-                    path = path.with_name(f"{first}-{number}")
-            assert run is not None
-            shown = display.display(run, _announcement(run, place), chosen.style)
-            gc.freeze()  # existing objects stay: collecting garbage among them took 20 ms each time
-            with shown:
-                for report in run.learn():
-                    shown.show(report)
-        shown.conclude(_conclusion(run, place))
+        first, numbers, resume = path.name, itertools.count(2), resumed is not None
+        while True:
+            try:
+                run = _learnt(open_run(config, path, place, resume=resume, stopped=stop.is_set), place, chosen.style)
+                break
+            except RolledBack:
+                resume = True
+            except NameTakenError:  # of a run of the same second
+                if chosen.name or resume:
+                    raise
+                path = path.with_name(f"{first}-{next(numbers)}")
     return INTERRUPTED if run.summary["state"] == "interrupted" else 0
+
+
+def _learnt(opened: AbstractContextManager[Run], place: Placement, style: display.Style) -> Run:
+    """Learn until the end or an interruption, and say how it ended."""
+    with opened as run:
+        shown = display.display(run, _announcement(run, place), style)
+        gc.freeze()  # existing objects stay: collecting garbage among them took 20 ms each time
+        with shown:
+            for report in run.learn():
+                shown.show(report)
+    shown.conclude(_conclusion(run, place))
+    return run
 
 
 def _announcement(run: Run, place: Placement) -> list[str]:
@@ -92,7 +97,7 @@ def _announcement(run: Run, place: Placement) -> list[str]:
         width, sigma = config.policy_config.bandwidth, config.algorithm_config.initial_sigma  # type: ignore[attr-defined]
         lines.append(f"fitted to the observation: bandwidth {width:.4g}, initial sigma {sigma:.4g}")
     seen = run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
-    kept = folder.every(run.learner.state.mu.size, run.learner.config.generations, seen)
+    kept = folder.parameters.every(run.learner.state.mu.size, run.learner.config.generations, seen)
     if kept > 1:
         lines.append(f"parameters: one generation in {kept} is kept, to stay below 100 MB")
     return lines
@@ -109,7 +114,9 @@ def _conclusion(run: Run, place: Placement) -> list[str]:
             said = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
         lines.append(f"the mean policy returns {summary['mean_policy_return']:.3f}{said}")
     lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
-    if summary["state"] == "interrupted":
+    if not run.learner.folder.there:
+        lines.append(run.learner.folder.gone)
+    elif summary["state"] == "interrupted":
         lines.append(f"continue with: farm {'run' if place.workers else 'learner'} --resume {folder}")
     elif place.record:
         lines.append(f"look at it with: farm view {folder}")

@@ -10,13 +10,14 @@ import tyro
 from farm import settings
 from farm.commands.logs import say
 from farm.errors import ConfigError, writing
+from farm.settings import Settings
 
 TEMPLATE = "task_template.py.txt"
 """The template, in this package; `Pendulum` is replaced by the name."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class NewTaskCommand:
+class NewTaskCommand(Settings):
     """Writes NAME.py, a task of 31 lines that runs; change it into your own."""
 
     name: tyro.conf.Positional[str]

@@ -1,24 +1,29 @@
 """Options of a learner besides the run's configuration: none of them changes a number."""
 
 import itertools
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from farm import plugins, settings
 from farm.errors import ConfigError
+from farm.link import Listening
 from farm.net import keys
-from farm.net.session import check_endpoint
+from farm.net.session import is_port
 from farm.settings import setting
-from learner import config as configs
 from learner.commands.display import Style
-from learner.config import RunConfig
-from learner.run_folder import RunFolder
+from learner.run import config as configs
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+
+_NUMBERS: Final = re.compile("[0-9a-f]{8,64}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnerOptions:
+class LearnerOptions(Listening):
     """Where a run starts from, where it is saved, and its network addresses."""
 
     preset: str | None = None
@@ -41,20 +46,15 @@ class LearnerOptions:
     """Also stream the recording live, at [HOST:]PORT (host: 127.0.0.1)."""
     listen: str | None = None
     """Where the learner listens for workers; by default tcp/127.0.0.1:7447, with farm run any free port."""
-    connect: tuple[str, ...] = ()
-    """Connect to a router instead of listening, repeatable."""
-    tls: Path | None = None
-    """Folder with certificates (farm certificates makes it); needed to listen at tls/HOST:PORT."""
-    trust_network: bool = False
-    """Listen to other machines without certificates: everyone there can read everything and pose as a worker."""
     mixed: bool = False
     """Admit workers whose machines round differently, and resume with changed code: the run is not reproducible."""
+    numbers: str = ""
+    """A new run accepts machines whose numbers begin with these 8 to 64 hexadecimal digits, as farm status shows them;
+    by default machines that round like the learner's."""
     audit: float = setting(0.02, least=0.0, most=1.0)
     """Share of the jobs that a second host repeats as a check; hosts with wrong answers are expelled; 0: no checks."""
-    patience: float = setting(1.0, above=0.0)
+    patience: float = setting(1.0, above=0.0, most=1e6)
     """Least time before a job also goes to a second worker [s]; increase it for slow devices."""
-    farm: str = "farm"
-    """Name of the farm: learners and workers with the same name work together."""
     quiet: bool = False
     """Print only warnings and the final result."""
     json: bool = False
@@ -68,18 +68,17 @@ class LearnerOptions:
         return "json" if self.json else "quiet" if self.quiet else "auto"
 
     def __post_init__(self) -> None:
-        settings.check(self)
-        keys.checked("farm", self.farm)
+        super().__post_init__()
         if self.name:
             keys.checked("run", self.name)
         elif self.resume_existing:
             raise ConfigError("--resume-existing needs --name: the name of the run to begin or to continue")
+        if self.numbers and not _NUMBERS.fullmatch(self.numbers):
+            raise ConfigError(f"--numbers {self.numbers!r}: expected 8 to 64 hexadecimal digits, as farm status shows")
         if self.quiet and self.json:
             raise ConfigError("--quiet and --json exclude each other")
         if self.listen is not None and self.connect:
             raise ConfigError("--listen and --connect exclude each other: a learner listens, or connects to a router")
-        for endpoint in (*self.connect, *([self.listen] if self.listen else [])):
-            check_endpoint(endpoint, encrypted=self.tls is not None)
         if self.serve is not None:
             address(self.serve)
 
@@ -87,7 +86,7 @@ class LearnerOptions:
 def address(serve: str) -> tuple[str, int]:
     """Host and port of [HOST:]PORT; a ConfigError if it has a different form."""
     host, _, port = serve.rpartition(":")
-    if not port.isdigit() or not 0 < int(port) < 65536:
+    if not is_port(port):
         raise ConfigError(f"--serve {serve!r} is not of the form [HOST:]PORT, for example 9876")
     return host.strip("[]") or "127.0.0.1", int(port)
 
@@ -138,6 +137,7 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
     """The new run's name."""
     what = options.config.stem if options.config else options.preset or next(iter(configs.presets(config.task)))
     task = plugins.find("tasks", config.task).wire.replace(".py:", "-").replace(":", "-").replace("/", "-")
+    task = re.sub(r"[^A-Za-z0-9_.-]", "-", task)  # a file's name may have spaces and any letters
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     name = keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
     if options.name:
@@ -151,3 +151,11 @@ def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[s
     begin, resumed = origin(words)
     default = replace(kind(), run=begin)  # type: ignore[type-var]
     return settings.parse(kind, words, program, default), resumed, begin
+
+
+def flag(name: str, value: str) -> str:
+    """NAME and VALUE as one word of a command line, where the underscores of a setting's name may be kept."""
+    own = name.replace("_", "-")
+    if value.lower() in ("true", "false"):
+        return f"--{own}" if value.lower() == "true" else f"--no-{own}"
+    return f"--{own}={value}"

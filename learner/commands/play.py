@@ -15,12 +15,15 @@ from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
 from farm.sim.engines import DataEngine
+from farm.sim.scene import Scene
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskConfig
 from farm.tasks.loop import Batch
+from farm.tasks.standard import start
+from learner.again.replay import LoadedPolicy, loaded
 from learner.commands.replay import config_of
-from learner.replay import LoadedPolicy, loaded
-from learner.run_folder import RunFolder
+from learner.run.config import MOST_GENERATIONS
+from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +32,7 @@ class PlayCommand(Settings):
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
-    generation: int | None = setting(None, least=0)
+    generation: int | None = setting(None, least=0, most=MOST_GENERATIONS)
     """Generation whose mean policy is played, 0 for the first; by default the last."""
     speed: float = setting(1.0, least=0.01, most=10)
     """Speed: 1 is real time."""
@@ -49,30 +52,29 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(
             f"no display to open a window on: farm replay {command.run} --video rollout.gif draws without one"
         )
+    from farm.sim.rendering import View
     from farm.sim.viewer import watch
 
     logs.set_up("WARNING")
     say(f"mean policy after generation {policy.generation}; double-click a body, then push it by Ctrl and drag")
     task = policy.problem.task
+    view = View(Scene(task.model, *start(task)), task.camera)
     task.setup(Sim(DataEngine(task.model)))
     with stop_flag("ending") as stop:
         played = watch(
-            copy.copy(task.model), rollout(policy), stop.wait, say, camera=task.camera, speed=command.speed,
-            hold=command.hold,
-        )  # fmt: skip
+            copy.copy(task.model), rollout(policy), stop.wait, say, view=view, speed=command.speed, hold=command.hold
+        )
     say(f"{played} control steps played")
     return INTERRUPTED if stop.is_set() else 0
 
 
 def rollout(policy: LoadedPolicy) -> Callable[[Sim], int]:
     """Show one nominal rollout; returns its number of control steps."""
-    found = policy.problem
-    prepared = found.policy.prepare(policy.mu[None])
 
     def play(sim: Sim) -> int:
-        batch = Batch(found.task, sim, [None])
+        batch, acting = Batch(policy.problem.task, sim, [None]), policy.acting()
         while not batch.over and not sim.engine.over:  # type: ignore[attr-defined]  # a DataEngine
-            batch.step(found.policy.act(prepared, batch.observe()))
+            batch.step(acting.act(batch.observe()))
         return sim.t
 
     return play

@@ -1,7 +1,7 @@
 """Shared by commands for recordings: how to watch a run live, which files to open, where one may be written."""
 
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from farm.sim.rendering import Picture
     from farm.sim.trajectory import Trajectory
     from farm.tasks.base import Task
-    from learner.setup import Problem
+    from learner.run.setup import Problem
 
 _MAGIC: Final = b"RRF"  # first bytes of a recording of any release of Rerun
 
@@ -78,24 +78,31 @@ def record(path: Path, run: str, problem: "Problem", name: str, rollout: "Trajec
         )
 
 
-def film(task: "Task", shown: "Sequence[tuple[Trajectory, FloatArray]]", path: Path, speed: float) -> None:
-    """Write a video of rollouts side by side, each with positions qpos (F, nq); one that ended early stands still."""
+def film(
+    task: "Task", shown: "Sequence[tuple[Trajectory, Mapping[str, FloatArray]]]", path: Path, speed: float
+) -> None:
+    """Write a video of rollouts side by side, each with its measured frames; one that ended early stands still."""
     from farm.sim import video
 
     longest = max((rollout for rollout, _ in shown), key=lambda each: len(each.times))
     chosen = video.moments(longest.times.tolist(), speed, rest=1.0)
-    drawn = [_pictures(task, rollout, qpos, chosen) for rollout, qpos in shown]
+    drawn = [_pictures(task, rollout, frames, chosen) for rollout, frames in shown]
     video.write(path, [video.tiled(together) for together in zip(*drawn, strict=True)])
     say(f"video: {path}")
 
 
-def _pictures(task: "Task", rollout: "Trajectory", qpos: FloatArray, moments: Sequence[int]) -> "list[Picture]":
+def _pictures(
+    task: "Task", rollout: "Trajectory", frames: "Mapping[str, FloatArray]", moments: Sequence[int]
+) -> "list[Picture]":
     from farm.sim import rendering, video
+    from farm.sim.scene import MODEL
 
-    last = len(rollout.times) - 1
+    last, which = len(rollout.times) - 1, rollout.channels.get(MODEL)
+    model = task.model if which is None else task.simulated[int(which[0].argmax())]
     unique = sorted({min(moment, last) for moment in moments})
     pictures = rendering.pictures(
-        task.model, qpos[unique], video.SIZE, camera=task.camera, channels=task.channels,
+        model, frames["qpos"][unique], video.SIZE, camera=task.camera, channels=task.channels,
+        mocap=frames["mocap"][unique] if "mocap" in frames else None,
         values={name: each[unique] for name, each in rollout.channels.items()},
     )  # fmt: skip
     drawn = dict(zip(unique, pictures, strict=True))

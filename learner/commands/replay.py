@@ -15,12 +15,12 @@ from farm.errors import ConfigError, RunError, writing
 from farm.settings import Settings, setting
 from farm.tasks.base import Task, TaskConfig
 from learner.commands import recordings
-from learner.config import RunConfig
-from learner.run_folder import RunFolder
+from learner.run.config import MOST_GENERATIONS, RunConfig
+from learner.run.folder import RunFolder
 
 if TYPE_CHECKING:
-    from learner.replay import LoadedPolicy, Replay
-    from learner.rewind import Rewound
+    from learner.again.replay import LoadedPolicy, Replay
+    from learner.again.rewind import Rewound
 
 MOST: Final = 12
 """Largest number of rollouts side by side: more would be too small to see."""
@@ -34,7 +34,7 @@ class ReplayCommand(Settings):
     """Folder of the run."""
     to: Path | None = None
     """Recording to write; by default rollout.rrd in the run's folder."""
-    generation: int | None = setting(None, least=0)
+    generation: int | None = setting(None, least=0, most=MOST_GENERATIONS)
     """Generation whose mean policy (0: before learning) or whose rollouts are shown; by default the last."""
     rollout: tuple[int, ...] = ()
     """Show this exploring rollout of the generation, counted from 0; repeatable."""
@@ -51,11 +51,6 @@ class ReplayCommand(Settings):
     ended: int | None = None
     """Show this number of rollouts that the task ended; the flag's name is the task's word for it, see `_command`."""
 
-    @property
-    def rewinds(self) -> bool:
-        """Whether exploring rollouts are shown, not the mean policy."""
-        return bool(self.rollout) or any((self.best, self.worst, self.ended))
-
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
@@ -67,21 +62,22 @@ def main(words: Sequence[str]) -> int:
     command = settings.parse(settings_class, words, "farm replay", default)
     logs.set_up("WARNING")
     from farm.sim import video
-    from learner.run import check_rerun
+    from learner.run.launch import check_rerun
 
     check_rerun()
     if command.video is not None:
         video.check(command.video)
     folder = RunFolder.open(command.run)
     path = recordings.target(command.to or folder.path / "rollout.rrd")
-    changed = differing(own, command.task)
-    if command.rewinds:
+    names = [each.name for each in fields(own) if getattr(own, each.name) != getattr(command.task, each.name)]
+    changed = ", ".join(f"{name.replace('_', ' ')} {getattr(command.task, name)}" for name in names)
+    if any((command.rollout, command.best, command.worst, command.ended)):
         policy, shown = _rollouts(command, folder, path, kind.ending, changed)
     else:
         policy, shown = _mean(command, folder, path, changed)
     say(f"written to {path}; look at it with: farm view {path}")
     if command.video is not None:
-        frames = [(each.trajectory, each.frames["qpos"]) for each in shown]
+        frames = [(each.trajectory, each.frames) for each in shown]
         recordings.film(policy.problem.task, frames, command.video, command.speed)
     return 0
 
@@ -102,7 +98,7 @@ def _were(ending: str) -> str:
 
 def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show a mean policy."""
-    from learner.replay import loaded
+    from learner.again.replay import loaded
 
     policy = loaded(folder, command.generation, command.task)
     shown = policy.rollout()
@@ -120,9 +116,9 @@ def _rollouts(
     command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
 ) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show exploring rollouts of a generation: one by itself, several side by side."""
+    from learner.again.rewind import rewind, under
     from learner.recording.comparison import Shown, record_comparison
     from learner.recording.drawing import Drawing
-    from learner.rewind import rewind, under
 
     found = rewind(folder.path, command.generation)
     policy = under(folder, found, command.task) if changed else found.policy  # chosen by the run's own results
@@ -178,9 +174,3 @@ def config_of(words: Sequence[str]) -> RunConfig | None:
     if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
         RunFolder.open(Path(words[0]))  # raises first: otherwise its task's flags would be reported as unknown
     return None
-
-
-def differing(own: TaskConfig, chosen: TaskConfig) -> str:
-    """Changed settings, for a caption."""
-    names = [f.name for f in fields(own) if getattr(own, f.name) != getattr(chosen, f.name)]
-    return ", ".join(f"{name.replace('_', ' ')} {getattr(chosen, name)}" for name in names)

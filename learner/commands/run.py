@@ -9,8 +9,8 @@ from farm.net.session import free_endpoint
 from farm.settings import Settings, setting
 from learner.commands.learner import learn
 from learner.commands.options import LearnerOptions, parse
-from learner.config import RunConfig
-from learner.run import Placement
+from learner.run.config import RunConfig
+from learner.run.launch import Placement
 
 
 @dataclass(frozen=True, kw_only=True)

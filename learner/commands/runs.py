@@ -14,11 +14,12 @@ from farm import settings as arguments
 from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
 from farm.errors import ConfigError
-from learner.run_folder import RunFolder
+from farm.settings import Settings
+from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunsCommand:
+class RunsCommand(Settings):
     """Prints a table of the runs in a folder."""
 
     dir: tyro.conf.Positional[Path] = Path("runs")
@@ -77,7 +78,7 @@ def _succeeds(row: dict[str, Any]) -> str:
 
 
 def _row(folder: RunFolder) -> dict[str, Any]:
-    """A run's summary; of one that has none yet, what its progress says."""
+    """A run's summary; what it lacks, because the run was cut short or has not ended, is taken from the progress."""
     summary = folder.read_summary()
     progress = folder.progress()
     last = progress[-1] if progress else None
@@ -92,4 +93,6 @@ def _row(folder: RunFolder) -> dict[str, Any]:
         "robust_success_rate": None,
         "parameters_sha256": None,
     }
-    return row | summary if summary and (not last or summary.get("generations") == last.generation) else row
+    if not summary or (last and summary.get("generations") != last.generation):
+        return row
+    return row | {name: value for name, value in summary.items() if value is not None or name not in row}

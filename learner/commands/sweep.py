@@ -1,6 +1,6 @@
 """`farm sweep`: settings x seeds on one set of workers; a table and a figure."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,21 +10,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from farm.commands import logs
 from farm.commands.logs import say
-from farm.commands.screen import compact, wide
+from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
-from farm.net.tls import find
-from learner import config as configs
-from learner import figure, grid, outcomes, sweep
-from learner.commands.options import parse
-from learner.config import RunConfig
-from learner.grid import Setting, Sweep
-from learner.run import check_rerun
-from learner.setup import problem
+from farm.settings import Settings
+from learner.commands.options import flag, parse
+from learner.run import config as configs
+from learner.run.config import RunConfig
+from learner.run.launch import check_rerun
+from learner.run.setup import problem
+from learner.sweep import figure, grid, outcomes
+from learner.sweep import runs as sweep
+from learner.sweep.grid import Setting, Sweep
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepCommand:
+class SweepCommand(Settings):
     """Learns settings x seeds on one set of workers; makes table and figure. Run it again to continue."""
 
     vary: tuple[str, ...] = ()
@@ -80,7 +81,7 @@ def _given(words: Sequence[str]) -> list[str]:
 
 def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
     """One combination of values, as `farm run` would take it from these flags."""
-    own = [_word(name, value) for name, value in values.items()]
+    own = [flag(name, value) for name, value in values.items()]
     try:
         known = configs.flat(parse(SweepCommand, [*words, *_parts(values)], "farm sweep")[2])
         for name in values:
@@ -95,14 +96,7 @@ def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
 
 def _parts(values: dict[str, str]) -> list[str]:
     """The flags that choose task, policy and algorithm, because the other flags depend on them."""
-    return [_word(name, value) for name, value in values.items() if name in configs.PARTS]
-
-
-def _word(name: str, value: str) -> str:
-    flag = name.replace("_", "-")
-    if value.lower() in ("true", "false"):
-        return f"--{flag}" if value.lower() == "true" else f"--no-{flag}"
-    return f"--{flag}={value}"
+    return [flag(name, value) for name, value in values.items() if name in configs.PARTS]
 
 
 def _check_begins(chosen: Sweep) -> None:
@@ -123,13 +117,15 @@ def _print(chosen: Sweep, table: Sequence[dict[str, Any]]) -> None:
     shown = compact()
     judged = any(row["robust_success_rate"] is not None for row in table)
     robust = ("robust success", "robust_success_rate") if judged else ("robust return", "robust_return")
-    for name in (*chosen.vary, "runs", "untrained", "return", robust[0], "minutes"):
+    measured = outcomes.measures(table)
+    names = [column.removeprefix(outcomes.MEASURE) for column in measured]
+    for name in (*chosen.vary, "runs", "untrained", "return", robust[0], *names, "minutes"):
         shown.add_column(name, justify="left" if name in chosen.vary else "right", no_wrap=True)
     count = len(chosen.seeds)
     for i, setting in enumerate(chosen.settings):
         mine = table[i * count : (i + 1) * count]
         finished = sum(row["state"] == "finished" for row in mine)
-        columns = ("first_mean_policy_return", "mean_policy_return", robust[1])
+        columns = ("first_mean_policy_return", "mean_policy_return", robust[1], *measured)
         cells = [_spread(outcomes.spread(mine, column), percent=column == "robust_success_rate") for column in columns]
         minutes = sum(row["seconds"] or 0.0 for row in mine) / 60
         shown.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")
@@ -161,16 +157,14 @@ def check_sharing(sharing: sweep.Sharing) -> None:
     """Check what the runs need: Rerun for recordings, and certificates."""
     if sharing.record:
         check_rerun()
-    if sharing.tls is not None:
-        find(sharing.tls, "learner")
+    _ = sharing.bundle
 
 
 class Runs:
     """Shows runs side by side: bars on a terminal, else one line per run."""
 
-    def __init__(self, paths: Iterable[Path], where: Path) -> None:
-        paths = list(paths)
-        self._left, self._all = len(sweep.todo(paths)), len(paths)
+    def __init__(self, runs: Mapping[Path, RunConfig], where: Path) -> None:
+        self._left, self._all = len(sweep.todo(runs)), len(runs)
         console = Console()
         columns = TextColumn("{task.description}"), BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
         self._bars = Progress(*columns, TextColumn("{task.fields[said]}"), console=console, expand=True)
@@ -212,6 +206,6 @@ class Runs:
 
     def _print(self, line: str) -> None:
         if self._live:
-            self._bars.console.print(line, highlight=False, markup=False)
+            self._bars.console.print(plain(line), highlight=False)
         else:
             say(line)

@@ -10,11 +10,12 @@ from typing import Any
 import tyro
 
 from farm import plugins, settings
-from farm.commands.screen import compact, wide
-from farm.errors import ConfigError
+from farm.commands.screen import compact, plain, wide
+from farm.errors import ConfigError, printable
 from farm.policies.base import Policy
+from farm.settings import Settings
 from farm.tasks.base import Task
-from learner import config as configs
+from learner.run import config as configs
 
 _KINDS = {
     "tasks": "--task",
@@ -26,7 +27,7 @@ _KINDS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class TasksCommand:
+class TasksCommand(Settings):
     """Lists tasks, policies, algorithms, backends and loggers; with a name, its settings and presets."""
 
     name: tyro.conf.Positional[str] = ""
@@ -37,14 +38,14 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(TasksCommand, words, "farm tasks")
     if command.name:
-        sys.stdout.write(described(command.name))
+        sys.stdout.write(printable(described(command.name), kept="\n"))
         return 0
     table = compact()
     for column in ("kind", "name", "from", "what"):
         table.add_column(column, overflow="fold")
     for kind, flag in _KINDS.items():
         for name, origin in plugins.names(kind).items():
-            table.add_row(flag, name, origin, _about(kind, name))
+            table.add_row(*map(plain, (flag, name, origin, _about(kind, name))))
     wide().print(table)
     sys.stdout.write("\nfarm tasks NAME shows its settings; farm new-task writes a task of your own, FILE.py:CLASS\n")
     return 0

@@ -3,8 +3,12 @@
 import os
 import socket
 import subprocess
+import webbrowser
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from urllib.parse import quote, urlsplit
 
 import tyro
@@ -16,8 +20,9 @@ from farm.commands.screen import display
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, Interrupted, RunError
 from farm.processes import end
+from farm.settings import Settings
 from learner.commands import recordings
-from learner.run import check_rerun
+from learner.run.launch import check_rerun
 
 _PAGE = 9090  # port for a browser, if it is free
 _LOOK = 0.1  # [s] between two checks of the viewer
@@ -25,7 +30,7 @@ _CLOSING = 5.0  # [s] for it to end
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewCommand:
+class ViewCommand(Settings):
     """Opens recordings of runs in the Rerun viewer; several runs together, with a table of them."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
@@ -62,14 +67,18 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
       RunError: the viewer failed.
       Interrupted: Ctrl-C or SIGTERM, which end the viewer as well.
     """
-    from learner.recording.files import program
+    from learner.recording.files import program, quiet
     from learner.recording.viewing import free_port, listens, once_loaded, show_newest, show_table
 
     port, page = free_port(), free_port(_PAGE)
     command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
-    command += ["--web-viewer", "--web-viewer-port", str(page)] if web else []
-    quiet = {"RUST_LOG": "warn"} | os.environ  # its own messages name an address that ssh does not forward
-    with stop_flag("closing the viewer") as stop, subprocess.Popen(command, env=quiet) as viewer:
+    command += ["--serve-web", "--web-viewer-port", str(page)] if web else []
+    with stop_flag("closing the viewer") as stop, ExitStack() as stack:
+        # Its own messages name an address that ssh does not forward. A server has no settings of the user's to keep.
+        home = Path(stack.enter_context(TemporaryDirectory()))
+        viewer = stack.enter_context(
+            subprocess.Popen(command, env=quiet(home) if web else {"RUST_LOG": "warn"} | os.environ)
+        )
         try:
 
             def gone() -> bool:
@@ -79,7 +88,10 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
                 once_loaded(port, gone, show_table if table else show_newest)
             elif listens(page, gone):
                 live = [source for source in sources if "://" in source]  # a browser can open these
-                say(_address(page, live or [f"rerun+http://127.0.0.1:{port}/proxy"]))
+                address, tunnel = _address(page, live or [f"rerun+http://127.0.0.1:{port}/proxy"])
+                say(f"open {address}   {tunnel}")
+                if display():
+                    webbrowser.open(address)  # not by Rerun: its home here is not the user's
             while viewer.poll() is None and not stop.wait(_LOOK):
                 pass
         finally:
@@ -92,9 +104,9 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
     return 0
 
 
-def _address(page: int, streams: Sequence[str]) -> str:
-    """The viewer's address with these streams for a browser, here and from another machine."""
+def _address(page: int, streams: Sequence[str]) -> tuple[str, str]:
+    """The viewer's address with these streams for a browser, and how to reach it from another machine."""
     ports = [page, *(urlsplit(stream).port for stream in streams)]
     tunnels = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
     asked = "&".join(f"url={quote(stream, safe='')}" for stream in streams)
-    return f"open http://127.0.0.1:{page}/?{asked}   (from elsewhere: ssh {tunnels} {socket.gethostname()} first)"
+    return f"http://127.0.0.1:{page}/?{asked}", f"(from elsewhere: ssh {tunnels} {socket.gethostname()} first)"

@@ -51,7 +51,10 @@ class Loggers:
 
     def generation(self, stats: GenerationStats) -> None:
         """Log a generation, without unknown values."""
-        figures = {name: float(value) for name, value in asdict(stats).items() if value is not None}
+        values = asdict(stats)
+        for kind in ("measures", "mean_policy_measures"):
+            values |= {f"{kind}_{name}": value for name, value in values.pop(kind).items()}
+        figures = {name: float(value) for name, value in values.items() if value is not None}
         for name in list(self._open):
             self._call(name, "generation", figures)
 

@@ -15,6 +15,9 @@ from farm.sim.scene import Scene
 from farm.tasks.base import TaskSpec
 from learner.recording.channels import entities, path, title
 
+FOLLOWED: Final = "/world/view"
+"""Entity that the eye follows, an invisible point: a body without a geometry of its own cannot be followed."""
+
 _BACKGROUND: Final = [74, 80, 88, 255]
 _DARK: Final = [24, 25, 28, 255]
 _NEARER: Final = 0.88  # Rerun's eye sees a wider field than MuJoCo's camera
@@ -44,17 +47,20 @@ class Eye:
         view = camera or beside(scene)
         a, e = np.deg2rad([view.azimuth, view.elevation])
         ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        tracked = None if camera or scene.mover is None else f"/world/{scene.mover.body}"
+        tracked = None if camera or scene.mover is None else FOLLOWED
         return cls(np.array(view.lookat), -_NEARER * view.distance * ahead, tracked)
 
 
 def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
     """Layout of a run while it learns: the newest generation is in view."""
-    return _blueprint(_run(spec, eye), rrb.TimePanel(timeline="generation", play_state="following"))
+    return _blueprint(_run(spec, eye, "Learning"), rrb.TimePanel(timeline="generation", play_state="following"))
 
 
 def finished(spec: TaskSpec, eye: Eye, generations: int) -> rrb.Blueprint:
-    """Layout of a finished run with this number of generations: its last policy's rollout plays repeatedly."""
+    """Layout of a finished run with this number of generations: its last policy's rollout plays repeatedly.
+
+    All views are drawn on the timeline that plays, which is not that of generations; the tab of the curves says so.
+    """
     horizon = spec.steps * spec.period
     begin, end = (round(1e9 * number * horizon) for number in (generations, generations + 1))
     panel = rrb.TimePanel(
@@ -63,17 +69,18 @@ def finished(spec: TaskSpec, eye: Eye, generations: int) -> rrb.Blueprint:
         loop_mode="selection",
         time_selection=rrb.components.AbsoluteTimeRange(min=begin, max=end - _SEAM),
     )
-    return _blueprint(_run(spec, eye), panel)
+    return _blueprint(_run(spec, eye, f"Learning (sim_time: {horizon:g} s per generation)"), panel)
 
 
-def _run(spec: TaskSpec, eye: Eye) -> rrb.Container:
+def _run(spec: TaskSpec, eye: Eye, curves: str) -> rrb.Container:
+    """`curves` is the name of the tab of the learning curves."""
     pictures = rrb.Horizontal(*_images(spec), name="Images")
     traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
     parts = [part for part, there in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if there]
     left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
     horizon = spec.steps * spec.period
-    tabs = rrb.Tabs(_learning(success=spec.success), _rollout(spec, horizon), _farm(), again, _config())
+    tabs = rrb.Tabs(_learning(spec, curves), _rollout(spec, horizon), _farm(), again, _config())
     return _beside(left, _PICTURES, tabs, 0.45)
 
 
@@ -175,22 +182,28 @@ def _config() -> rrb.View:
     return rrb.TextDocumentView(origin="/config", name="Config")
 
 
-def _learning(*, success: bool) -> rrb.Container:
+def _learning(spec: TaskSpec, name: str) -> rrb.Container:
     """Learning curves with legends where curves seldom are: returns rise, sigma falls."""
     bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
     log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
     returns = ("/learning/return", "/learning/return_std", "/learning/mean_policy/return")
     rates = ("/learning/success", "/learning/mean_policy/success")
+    measures = [
+        _plot(f"{each.name} [{each.unit}]" if each.unit else each.name,
+              f"/learning/measures/{each.name}", f"/learning/mean_policy/measures/{each.name}", legend=bottom)
+        for each in spec.measures
+    ]  # fmt: skip
     return rrb.Vertical(
         _plot("Return", *returns, legend=bottom),
+        *([rrb.Horizontal(*measures)] if measures else []),
         rrb.Horizontal(
-            *([_plot("Success", *rates, legend=bottom)] if success else []),
+            *([_plot("Success", *rates, legend=bottom)] if spec.success else []),
             _plot("Sigma", "/learning/sigma", legend=top),
             _plot("Norm of mu", "/learning/mean_norm", legend=None),
         ),
         rrb.TextLogView(origin="/log", name="Log", columns=log),
-        row_shares=[2.2, 1.4, 1],
-        name="Learning",
+        row_shares=[2.2, *([1.4] if measures else []), 1.4, 1],
+        name=name,
     )
 
 

@@ -15,6 +15,7 @@ import rerun as rr
 
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.sim.channels import Channel
+from farm.sim.marks import ARROW_RADIUS, POINT_RADIUS
 from farm.sim.scene import Scene
 from farm.tasks.base import TaskSpec
 from learner.recording.curves import lighter, lines, pack, palette, ramp
@@ -27,8 +28,6 @@ _TEXT: Final = (230, 230, 230)
 _SHADES: Final = 32  # of a scale
 _OFF: Final = (52, 54, 58)
 _ARROW: Final = (255, 255, 255)  # of arrows without colours
-_POINT_RADIUS: Final = 0.0085  # in radii of the scene
-_ARROW_RADIUS: Final = 0.012
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class ChannelDrawing:
                 yield entity, style
                 yield from scale(entity, width, height, channel.top, channel.unit)
             for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
-                yield entity, rr.Points3D.from_fields(positions=places, radii=_POINT_RADIUS * self._size)
+                yield entity, rr.Points3D.from_fields(positions=places, radii=POINT_RADIUS * self._size)
 
     def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:
         """A rollout's frames, or those of several that are joined.
@@ -104,9 +103,7 @@ class ChannelDrawing:
           values: (F, n, 6) starts [m] and vectors [unit] in the frames of the channel's bodies.
           bodies: (F, B, 7) poses of the drawn bodies [m], quaternions wxyz.
         """
-        vectors = values[..., 3:] * self._channel.length
-        extent = np.linalg.norm(vectors, axis=-1, keepdims=True)
-        vectors = vectors * np.minimum(1.0, self._channel.longest / np.where(extent > 0, extent, 1.0))
+        vectors = self._channel.vectors(values)
         if self._bodies:
             vectors = rotate(bodies[:, self._bodies, 3:], vectors)
         return self._in_world(values[..., :3], bodies), vectors
@@ -140,7 +137,7 @@ class ChannelDrawing:
             origins=origins[drawn],
             vectors=vectors[drawn],
             colors=np.broadcast_to(np.array(colours, np.uint32), drawn.shape)[drawn],
-            radii=np.full(int(drawn.sum()), _ARROW_RADIUS * self._size),
+            radii=np.full(int(drawn.sum()), ARROW_RADIUS * self._size),
         )
         return columns.partition(drawn.sum(axis=1))
 
@@ -149,7 +146,7 @@ class ChannelDrawing:
         columns = rr.Points3D.columns(
             positions=self._in_world(values[..., :3], bodies).reshape(-1, 3),
             colors=ramp(values[..., 3].reshape(-1), self._channel.top),
-            radii=np.full(frames * count, 2 * _POINT_RADIUS * self._size),
+            radii=np.full(frames * count, 2 * POINT_RADIUS * self._size),
         )
         return columns.partition(np.full(frames, count))
 

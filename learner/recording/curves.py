@@ -1,7 +1,8 @@
 """Colours, and the curves of a run: their names, and a generation's values as Rerun entities."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import cycle, islice
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -9,6 +10,7 @@ import rerun as rr
 
 from farm.arrays import FloatArray, IntArray
 from farm.net.stats import GenerationStats
+from farm.sim.channels import Measure
 
 Colour = tuple[int, int, int]
 
@@ -83,12 +85,15 @@ _CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, fl
 """Curves of every run: entity, names and colours, and a generation's values, of its statistics and rate [1/s]."""
 
 
-def static(*, success: bool) -> list[tuple[str, Any]]:
-    """Names and colours of the learning curves; with success if the task defines it."""
+def static(*, success: bool, measures: Sequence[Measure] = ()) -> list[tuple[str, Any]]:
+    """Names and colours of the learning curves; with success if the task defines it, and with its measures."""
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
     own: list[tuple[str, Any]] = [("/learning/return_std", band), ("/learning/mean_policy/return", _MEAN_POLICY)]
     if success:
         own += [("/learning/success", lines(("exploring",), (SKY,))), ("/learning/mean_policy/success", _MEAN_POLICY)]
+    for each in measures:
+        own += [(f"/learning/measures/{each.name}", lines(("exploring",), (SKY,)))]
+        own += [(f"/learning/mean_policy/measures/{each.name}", _MEAN_POLICY)]
     return own + [(entity, names) for entity, names, _ in _CURVES]
 
 
@@ -98,10 +103,19 @@ def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
     own: list[tuple[str, Any]] = [("/learning/return_std", band)]
     if stats.success_rate is not None:
         own.append(("/learning/success", rr.Scalars([stats.success_rate])))
+    own += _measures("/learning/measures", stats.measures)
     return own + [(entity, rr.Scalars(values(stats, rate))) for entity, _, values in _CURVES]
 
 
-def mean_policy(value: float, success: bool | None) -> list[tuple[str, Any]]:
-    """The return of a mean policy, and whether it succeeds (None if the task does not define success)."""
+def _measures(entity: str, values: Mapping[str, float | None]) -> list[tuple[str, Any]]:
+    """Curves of measures; a gap where all rollouts failed."""
+    return [(f"{entity}/{name}", rr.Scalars([value])) for name, value in values.items() if value is not None]
+
+
+def mean_policy(
+    value: float, success: bool | None, measures: Mapping[str, float | None] = MappingProxyType({})
+) -> list[tuple[str, Any]]:
+    """The return of a mean policy, its measures, and whether it succeeds (None if the task does not define success)."""
     succeeds = [] if success is None else [("/learning/mean_policy/success", rr.Scalars([float(success)]))]
-    return [("/learning/mean_policy/return", rr.Scalars([value])), *succeeds]
+    found = _measures("/learning/mean_policy/measures", measures)
+    return [("/learning/mean_policy/return", rr.Scalars([value])), *succeeds, *found]

@@ -4,6 +4,7 @@ All bodies are directly below /world: /world/<body>, with its geometries as chil
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -11,14 +12,16 @@ import rerun as rr
 
 from farm.arrays import FloatArray
 from farm.sim.channels import Camera
-from farm.sim.scene import Scene
+from farm.sim.rendering import View
+from farm.sim.scene import MODEL, Geometry, Scene
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
-from learner.recording.blueprint import Eye
-from learner.recording.channels import ChannelDrawing, Columns, scalars
+from farm.tasks.standard import start
+from learner.recording.blueprint import FOLLOWED, Eye
+from learner.recording.channels import ChannelDrawing, Columns, path, scalars
 from learner.recording.curves import lines
 from learner.recording.solids import solid, xyzw
-from learner.setup import Problem
+from learner.run.setup import Problem
 
 CAPTION: Final = "/world/caption"
 """Entity of the text in the scene."""
@@ -37,20 +40,26 @@ class Drawing:
 
     @classmethod
     def of(cls, problem: Problem) -> "Drawing":
-        """How a run's task is drawn."""
-        return cls(problem.scene, problem.spec, problem.task.camera)
+        """How a run's task is drawn; without a camera of its own it is framed at its start."""
+        task, scene = problem.task, problem.scene
+        if task.camera:
+            return cls(scene, problem.spec, task.camera)
+        qpos, mocap = start(task)
+        return cls(replace(scene, start=qpos, mocap=mocap), problem.spec)
 
     def static(self) -> Iterator[tuple[str, Any]]:
         """Entities and archetypes that are logged once."""
         yield "/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
         for geometry in self.scene.geometries():
-            yield f"/world/{geometry.body}/{geometry.name}", solid(geometry)
+            yield _entity(geometry), solid(geometry)
         rest = self.scene.poses(self.scene.model.qpos0[None])[0]
         for name, pose in zip(self.scene.bodies, rest, strict=True):
             if name in self.scene.fixed:
                 turned = rr.Quaternion(xyzw=xyzw(pose[3:]))
                 yield f"/world/{name}", rr.Transform3D(translation=pose[:3], quaternion=turned)
         yield CAPTION, rr.Points3D.from_fields(colors=[_WHITE], radii=[0.0], show_labels=True)
+        if self.camera is None:
+            yield FOLLOWED, rr.Points3D.from_fields(radii=[0.0])
         yield "/reward/terms", lines(self.spec.terms)
         yield "/actions", lines([str(i + 1) for i in range(self.spec.action)])
         for channel in self._channels.values():
@@ -64,25 +73,27 @@ class Drawing:
             if found != (count, *shape):
                 raise ValueError(f"{name} of shape {found}, expected {(count, *shape)}: another scene or task?")
 
-    def captions(self, rollouts: Sequence[tuple[str, Trajectory]]) -> Columns:
-        """Texts in the scene for the frames of named rollouts, one rollout after the other.
+    def captions(self, rollouts: Sequence[tuple[str, Trajectory]]) -> Iterator[Columns]:
+        """Texts in the scene for the frames of named rollouts, one rollout after the other; and what the eye follows.
 
         Each has the rollout's name, return and success, and how far the first free body has moved since its start.
         """
         eye = Eye.of(self.scene, self.camera)
-        place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
-        followed = self.scene.mover.body if eye.tracked and self.scene.mover else None
-        places = [place + self._moved(rollout, followed) for _, rollout in rollouts]
+        shifts = np.concatenate([self._shifts(rollout) for _, rollout in rollouts])
         texts = [text for name, rollout in rollouts for text in self._texts(name, rollout)]
-        values = rr.Points3D.columns(positions=np.concatenate(places), labels=texts)
-        return Columns(CAPTION, values.partition(np.ones(len(texts), dtype=int)))
+        place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
+        values, one = rr.Points3D.columns(positions=place + shifts, labels=texts), np.ones(len(texts), dtype=int)
+        yield Columns(CAPTION, values.partition(one))
+        if eye.tracked:
+            yield Columns(eye.tracked, rr.Points3D.columns(positions=eye.target + shifts).partition(one))
 
-    def _moved(self, rollout: Trajectory, body: str | None) -> FloatArray:
-        """Displacement of a body since the start [m], (F, 3); zero without a body."""
-        if body is None:
+    def _shifts(self, rollout: Trajectory) -> FloatArray:
+        """How far the eye has moved since the start [m], (F, 3)."""
+        view = View(self.scene, self.camera)
+        if view.mover is None:
             return np.zeros((len(rollout.times), 3))
-        places = rollout.bodies[:, self.scene.bodies.index(body), :3]
-        return places - places[0]
+        places = rollout.bodies[:, self.scene.bodies.index(view.mover.body), :3]
+        return np.cumsum([view.moved(place) for place in places], axis=0)
 
     def _texts(self, name: str, rollout: Trajectory) -> list[str]:
         success = {True: "success", False: "no success", None: ""}[rollout.success]
@@ -90,7 +101,8 @@ class Drawing:
         head = "\n".join(filter(None, (name, ", ".join(filter(None, (value, success))))))
         if self.scene.free is None:
             return [head] * len(rollout.times)
-        moved = np.linalg.norm(self._moved(rollout, self.scene.free), axis=1)
+        places = rollout.bodies[:, self.scene.bodies.index(self.scene.free), :3]
+        moved = np.linalg.norm(places - places[0], axis=1)
         return [f"{head}\n{self.scene.free} moved {_length(each)}" for each in moved.tolist()]
 
     def columns(self, rollout: Trajectory) -> Iterator[Columns]:
@@ -100,11 +112,28 @@ class Drawing:
             if name not in self.scene.fixed:
                 moved = rr.Transform3D.columns(translation=poses[:, :3], quaternion=xyzw(poses[:, 3:]))
                 yield Columns(f"/world/{name}", moved)
+        for geometry in (each for each in self.scene.geometries() if each.models):  # a scale of 0 hides it
+            there = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)
+            yield Columns(_entity(geometry), rr.Transform3D.columns(scale=np.repeat(there[:, None], 3, axis=1)))
         yield Columns("/reward/terms", scalars(rollout.terms))
         yield Columns("/actions", scalars(rollout.actions))
         begins = np.cumsum(rollout.times == 0.0)
         for name, channel in self._channels.items():
             yield from channel.columns(rollout.channels[name], rollout.bodies, begins)
+
+    def gaps(self, count: int) -> Iterator[Columns]:
+        """Rows that break the curves: without them the viewer draws a line from each rollout to the next one."""
+        widths = {"/reward/terms": len(self.spec.terms), "/actions": self.spec.action}
+        for channel in (channel for channel in self.spec.channels if channel.kind == "scalars"):
+            widths[path(channel.name)] = channel.shape[0]
+            if channel.limits:
+                widths[f"{path(channel.name)}/limits"] = 2 * len(channel.limits)
+        for entity, width in widths.items():
+            yield Columns(entity, scalars(np.full((count, width), np.nan)))
+
+
+def _entity(geometry: Geometry) -> str:
+    return f"/world/{geometry.body}/{geometry.name}"
 
 
 def _length(metres: float) -> str:

@@ -15,10 +15,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from farm.errors import ConfigError
+
 log = logging.getLogger(__name__)
 
 COMPACTING: Final = 600.0
 """How long merging may take [s]; 30 MiB take about one."""
+
+_EACH_GENERATION: Final = "/learning/return"  # an entity with one row per generation
 
 _ENDS_WITH_PARENT: Final = """
 import ctypes, os, signal, sys
@@ -39,6 +43,35 @@ def parts(path: Path) -> list[Path]:
     return [path, *further] if path.exists() else further
 
 
+def set_aside(path: Path) -> None:
+    """Rename the files of a recording to undone.rrd, undone.part2.rrd, ..., in place of older ones of these names."""
+    if files := parts(path):
+        aside = path.with_name(f"undone{path.suffix}")
+        for each in parts(aside):
+            each.unlink()
+        for each in files:
+            each.rename(each.with_name(aside.stem + each.name.removeprefix(path.stem)))
+
+
+def last_generation(path: Path) -> int:
+    """The last generation in a recording's files, 0 if there are none; truncated files are repaired first.
+
+    Raises:
+      ConfigError: they cannot be read.
+    """
+    from rerun.chunk import RrdReader
+
+    if parts(path):
+        compact(path)
+    try:
+        chunks = (chunk for part in parts(path) for chunk in RrdReader(part).stream())
+        batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == _EACH_GENERATION]
+    except Exception as error:  # Rerun's reader raises many types
+        raise ConfigError(f"cannot read {path}: {error}; move it away, or choose a different --out") from None
+    columns = [batch.column("generation") for batch in batches if "generation" in batch.schema.names]
+    return max((number for column in columns for number in column.cast("int64").to_pylist()), default=0)
+
+
 def program() -> str:
     """Path of Rerun's program itself: `python -m rerun` would only be its parent, and end without it."""
     import rerun_cli  # an extra
@@ -52,13 +85,11 @@ def compact(path: Path) -> bool:
     Returns:
       whether it worked; if not, every part is unchanged.
     """
-    found = parts(path)
-    merged, home = _left_behind(path)
+    files = parts(path)
     try:
         tidy(path)
-        _call([program(), "rrd", "optimize", *map(str, found), "-o", str(merged)], _quiet(home.absolute()))
-        merged.replace(path)
-        for old in found:
+        _replace(path, "optimize", *files)
+        for old in files:
             if old != path:
                 old.unlink()
     except (OSError, subprocess.SubprocessError) as error:
@@ -77,27 +108,28 @@ def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
     """
     from rerun.chunk import RrdReader
 
-    merged, home = _left_behind(path)
+    _, home = _left_behind(path)
     try:
-        environment = _quiet(home.absolute())
-        bare, own = home / "bare.rrd", home / "layout.rbl"
+        home.mkdir()
+        bare, layouts = home / "bare.rrd", home / "layout.rbl"
         reader = RrdReader(path)
         [store] = reader.recordings()
         reader.stream(store=store).write_rrd(bare, application_id=store.application_id, recording_id=store.recording_id)
-        layout(own)
-        merge = [program(), "rrd", "merge", str(bare), str(own), "-o", str(merged)]
-        _call(merge, environment)
-        merged.replace(path)
+        layout(layouts)
+        _replace(path, "merge", bare, layouts)
     except (RuntimeError, ValueError, subprocess.SubprocessError) as error:
         raise OSError(f"no layout in {path}: {error}") from error
     finally:
         tidy(path)
 
 
-def _call(command: list[str], environment: dict[str, str]) -> None:
-    """Run a command of Rerun that ends with this process."""
+def _replace(path: Path, action: str, *files: Path) -> None:
+    """Replace a recording by what Rerun's command makes of files; the command ends with this process."""
+    merged, home = _left_behind(path)
+    command = [program(), "rrd", action, *map(str, files), "-o", str(merged)]
     bound = [sys.executable, "-ISc", _ENDS_WITH_PARENT, str(os.getpid()), *command]
-    subprocess.run(bound, env=environment, check=True, capture_output=True, timeout=COMPACTING)
+    subprocess.run(bound, env=quiet(home.absolute()), check=True, capture_output=True, timeout=COMPACTING)
+    merged.replace(path)
 
 
 def tidy(path: Path) -> None:
@@ -130,10 +162,11 @@ def _number(path: Path, part: Path) -> int:
     return int(digits) if digits.isdecimal() else 0
 
 
-def _quiet(home: Path) -> dict[str, str]:
+def quiet(home: Path) -> dict[str, str]:
     """An environment in which Rerun's command sends no usage data and writes no settings."""
-    settings = home / "rerun"
-    settings.mkdir(parents=True)
-    values = {"analytics_enabled": False, "analytics_id": "none"}
-    (settings / "analytics.json").write_text(json.dumps(values), encoding="utf-8")
+    settings = home / "rerun" / "analytics.json"
+    settings.parent.mkdir(parents=True)
+    values = {"analytics_enabled": False, "analytics_id": "none", "metadata": {}}  # with a field missing it is ignored
+    places = {"config_file_path": str(settings), "data_dir_path": str(home / "data")}
+    settings.write_text(json.dumps(values | places), encoding="utf-8")
     return {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": str(home), "RUST_LOG": "warn"}

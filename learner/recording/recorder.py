@@ -31,6 +31,7 @@ import rerun.blueprint as rrb
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
+from farm.net.telemetry import Report
 from farm.sim.trajectory import Trajectory, joined
 from learner.recording import blueprint, curves
 from learner.recording.blueprint import Eye
@@ -47,6 +48,7 @@ from learner.recording.rows import (
     markdown,
     row,
     send,
+    send_gaps,
     send_properties,
     times,
 )
@@ -118,37 +120,37 @@ class Recorder:
         self._eye = Eye.of(scene, drawing.camera)
         self._stream = begin(run, sinks, blueprint.learning(spec, self._eye))
         send_properties(self._stream, "run", properties or {})
-        static = [*self._drawing.static(), *curves.static(success=spec.success), ("/config", markdown(config))]
+        static = [
+            *self._drawing.static(),
+            *curves.static(success=spec.success, measures=spec.measures),
+            ("/config", markdown(config)),
+        ]
         if spec.traced:
             static += [each for entity in ("/traces/best", "/traces/worst") for each in axes(entity, spec)]
         log_static(self._stream, static)
 
-    def generation(
-        self, stats: GenerationStats, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
-    ) -> None:
+    def generation(self, report: Report) -> None:
         """Record a finished generation; its rollout may be held back for HOLD, or until `settle` or `close`.
 
-        Args:
-          stats: its statistics.
-          sample: a rollout at control rate, usually the mean policy's.
-          traces: `best` and `worst` (T, K) are drawn as pictures; `all` (2N, T, K) float32 is kept bit by bit. K are
-            the traced channels' values side by side, see `farm.tasks.base.flat`.
-          rate: exploring rollouts per second.
+        The traces `best` and `worst` (T, K) are drawn as pictures; `all` (S, T, K) is kept bit by bit. K are the
+        traced channels' values side by side, see `farm.tasks.base.flat`.
 
         Raises:
           ValueError: the sample or a trace has another shape.
           OSError: the file cannot be written (a full disk); what it has stays.
         """
         self._check_space()
+        stats, sample = report.progress, report.sample
         if sample is not None:
             self._drawing.check(sample)
         self._generation, before, now = stats.generation, stats.generation - 1, time.time()
         at = self._at(now)
-        self._send(at, curves.statistics(stats, rate))
-        self._send(self._at(now, before), curves.mean_policy(stats.mean_policy_return, stats.mean_policy_success))
+        self._send(at, curves.statistics(stats, report.rate))
+        learnt = (stats.mean_policy_return, stats.mean_policy_success, stats.mean_policy_measures)
+        self._send(self._at(now, before), curves.mean_policy(*learnt))
         if self._again is not None:
             self._stream.send_columns("/again", at, row(markdown(self._again(stats))))
-        for name, values in traces.items():
+        for name, values in report.traces.items():
             self._stream.send_columns(f"/traces/{name}", at, row(self._trace(name, values)))
         if sample is not None:
             self._hold(sample, before, now)
@@ -207,7 +209,7 @@ class Recorder:
     def _trace(self, name: str, values: AnyArray) -> Any:  # noqa: ANN401  (archetypes have no public base)
         """A trace as an archetype; see `generation`."""
         spec = self._drawing.spec
-        if values.ndim != 2 + (name == "all") or values.shape[-2:] != spec.trace:
+        if values.shape[-2:] != spec.trace:
             raise ValueError(f"trace {name} of shape {values.shape}, expected {spec.trace} for each rollout")
         if name != "all":
             return trace(values, spec.traced[0].top)
@@ -222,8 +224,11 @@ class Recorder:
         numbers = np.repeat([one.generation for one in held], lengths)
         sim, wall = np.concatenate([one.sim for one in held]), np.concatenate([one.wall for one in held])
         captions = self._drawing.captions([(f"generation {one.generation}", one.rollout) for one in held])
-        columns = [*self._drawing.columns(joined([one.rollout for one in held])), captions]
+        columns = [*self._drawing.columns(joined([one.rollout for one in held])), *captions]
         send(self._stream, columns, "generation", numbers, sim, wall)
+        whole = self._horizon - 0.5 * self._drawing.spec.period
+        if early := [one.sim[-1] + SEAM for one in held if one.rollout.times[-1] < whole]:
+            send_gaps(self._stream, self._drawing.gaps(len(early)), np.array(early))
 
     def _flush(self) -> None:
         """Wait until every row is in the file: a kill loses only what is held back or waits to be recorded."""

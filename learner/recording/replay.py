@@ -12,7 +12,7 @@ from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.drawing import Drawing
 from learner.recording.files import compact
-from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, times
+from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, send_gaps, times
 
 PAUSE: Final = 0.1
 """Pause between two rollouts of a replay [s]."""
@@ -40,9 +40,11 @@ def record_replay(
         at = times("rollout", np.array([number]), np.array([start]))
         stream.send_columns("/rollout", at, row(_caption(name, rollout)))
         numbers = np.full(len(rollout.times), number)
-        columns = [*drawing.columns(rollout), drawing.captions([(name, rollout)])]
+        columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)])]
         send(stream, columns, "rollout", numbers, start + rollout.times)
         start += float(rollout.times[-1]) + PAUSE
+        if number < len(rollouts):
+            send_gaps(stream, drawing.gaps(1), np.array([start - 0.5 * PAUSE]))
     flush(stream)
     stream.disconnect()
     compact(aside)

@@ -114,3 +114,9 @@ def send(
         if some is not None:
             at = times(counter, numbers[some], sim[some], None if wall is None else wall[some])
         stream.send_columns(part.entity, at, part.columns)
+
+
+def send_gaps(stream: rr.RecordingStream, gaps: Iterable[Columns], sim: FloatArray) -> None:
+    """Break curves at these times in the simulation (n,) [s]; the other timelines have no time between rollouts."""
+    for part in gaps:
+        stream.send_columns(part.entity, times("", np.zeros(len(sim), dtype=int), sim)[1:], part.columns)

@@ -1,4 +1,4 @@
-"""A run's recordings: the live one, written by a separate thread, and the replays at physics rate."""
+"""A run's recording, made from its reports by a thread of its own, here or on another machine."""
 
 import contextlib
 import json
@@ -6,22 +6,22 @@ import logging
 import queue
 import shlex
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from farm import plugins
-from farm.arrays import AnyArray
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
+from farm.net.telemetry import Report, RunEnd
 from farm.sim.trajectory import Trajectory
-from learner import config as configs
-from learner.config import RunConfig
 from learner.recording.drawing import Drawing
 from learner.recording.files import COMPACTING
 from learner.recording.recorder import Recorder
-from learner.telemetry.report import Report
+from learner.run import config as configs
+from learner.run.config import RunConfig
 
 log = logging.getLogger(__name__)
 
@@ -34,69 +34,123 @@ QUIET: Final = 0.5
 _CLOSE: Final = 60.0  # [s] for writing the queue at the end
 
 
-class RecorderThread:
-    """Calls a recorder in a separate thread: learning never waits for it and never fails because of it.
+class RunRecording(logging.Handler):
+    """Records a run's reports and its end, and this process's log, in a separate thread.
 
-    If more than `waiting` messages are queued, rollouts and traces are dropped and counted, but never statistics and
-    log messages. A recorder that fails (a full disk) ends the recording with one message in the log.
+    Learning never waits for it and never fails by it. If more than `waiting` messages are queued, rollouts and traces
+    are dropped and counted, but never statistics and lines of the log. A recorder that fails (a full disk) ends the
+    recording with one message in the log.
     """
 
-    def __init__(self, recorder: Recorder, waiting: int = WAITING) -> None:
-        self._recorder, self._waiting = recorder, waiting
-        self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+    def __init__(self, recorder: Recorder, done: int = 0, replay: Path | None = None, waiting: int = WAITING) -> None:
+        """Start the thread.
+
+        Args:
+          recorder: what writes; from now on it belongs to the thread.
+          done: generations that it has.
+          replay: file for rollouts at physics rate, None for none.
+          waiting: length of the queue.
+        """
+        super().__init__(logging.INFO)
+        self._recorder, self._replay, self._waiting = recorder, replay, waiting
+        self.uri = recorder.uri
+        """Address for viewers; None without a server."""
+        self.done = done
+        """The last generation that is recorded or queued."""
+        self.end: RunEnd | None = None
+        """How the run ended, once it has."""
         self.failed = False
         """Whether the recording ended too early."""
-        self._merge = True
         self.dropped = 0
         """Number of generations recorded without their rollout and traces, because the queue was full."""
+        self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
+        logging.getLogger().addHandler(self)
 
-    def put(self, call: Callable[[], None]) -> None:
-        """Queue a call of one of the recorder's methods."""
-        if not self.failed:
-            self._queue.put(call)
+    def emit(self, record: logging.LogRecord) -> None:
+        """Record a message of this process's log."""
+        self._line(record.levelname, record.getMessage())
 
-    def generation(
-        self, stats: GenerationStats, sample: Trajectory | None, traces: Mapping[str, AnyArray], rate: float
-    ) -> None:
-        """Queue a generation; see `Recorder.generation`."""
-        if self._queue.qsize() >= self._waiting and (sample is not None or traces):
-            sample, traces = None, {}
+    def put(self, message: Report | RunEnd) -> None:
+        """Record a generation, or the end; a new best rollout at physics rate is written to the replay."""
+        for line in message.lines:  # of the learner's log, if that is another process
+            self._line(line.level, line.text)
+        if isinstance(message, RunEnd):
+            self._put_end(message)
+            return
+        self.done = message.generation
+        best, stats = message.replay, message.progress
+        if self._queue.qsize() >= self._waiting and message.nbytes:
+            message = replace(message, sample=None, traces={})
             self.dropped += 1
-        self.put(lambda: self._recorder.generation(stats, sample, traces, rate))
+        self._call(partial(self._recorder.generation, message))
+        if stats.return_max >= stats.best:
+            self._line("INFO", f"new best rollout: return {stats.best:.3f}")
+        if best is not None:
+            self._write_replay([(f"best rollout, generation {message.replay_generation}", best)])
 
     def settled(self) -> bool:
         """Wait until the queue is recorded; return false if the recording ended too early."""
         reached = threading.Event()
-        self.put(self._recorder.settle)
-        self.put(reached.set)
+        self._call(self._recorder.settle)
+        self._call(reached.set)
         while not (reached.wait(0.1) or self.failed):
             pass
         return not self.failed
 
-    def close(self, timeout: float | None = None, *, merge: bool = True) -> bool:
-        """Record the queue within a timeout [s], compact the file if requested; return whether all is recorded."""
-        self._merge = merge
+    def finish(self, timeout: float | None = None) -> bool:
+        """Record the queue, and close; an interrupted run's parts are merged when it continues.
+
+        Args:
+          timeout: for all this [s]; by default what it needs.
+
+        Returns:
+          whether everything is recorded.
+        """
+        logging.getLogger().removeHandler(self)
         self._queue.put(None)
-        self._thread.join(timeout)
+        self._thread.join(_CLOSE + (COMPACTING if self.end else 0.0) if timeout is None else timeout)
         if self._thread.is_alive():
-            log.warning("the recording is not complete after %g s: left as it is", timeout)
+            log.warning("the recording is not complete in time: left as it is")
             return False
         return not self.failed
+
+    def _put_end(self, end: RunEnd) -> None:
+        self.end = end
+        rollouts = [] if end.best is None else [(f"best rollout, generation {end.best_generation}", end.best)]
+        if end.mean is not None:
+            result = {"generations": self.done, "return": end.mean.value, "success": end.mean.success}
+            self._call(partial(self._recorder.result, result))
+            self._call(partial(self._recorder.final, end.mean))
+            rollouts.append((f"mean policy after generation {self.done}", end.mean))
+        if rollouts:
+            self._write_replay(rollouts)
+
+    def _write_replay(self, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
+        if self._replay is not None:
+            self._call(partial(self._recorder.replay, self._replay, rollouts=rollouts))
+
+    def _line(self, level: str, text: str) -> None:
+        self._call(partial(self._recorder.log, text, level))
+
+    def _call(self, call: Callable[[], None]) -> None:
+        """Queue a call of one of the recorder's methods."""
+        if not self.failed:
+            self._queue.put(call)
 
     def _work(self) -> None:
         try:
             while (call := self._next()) is not None:
                 call()
-            self._recorder.close(merge=self._merge)
+            self._recorder.close(merge=self.end is not None)
         except Exception as error:
             self.failed = True
             log.error("the recording ends here, learning continues: %s", error)
             while not self._queue.empty():
                 self._queue.get()
             with contextlib.suppress(Exception):  # save what is recorded as far as possible
-                self._recorder.close(merge=self._merge)
+                self._recorder.close(merge=self.end is not None)
 
     def _next(self) -> Callable[[], None] | None:
         """Return the next call; if there is none for a while, the one that writes held back rollouts."""
@@ -106,85 +160,35 @@ class RecorderThread:
             return self._recorder.settle
 
 
-class RunRecording(logging.Handler):
-    """A run's recordings, from its reports and log messages; errors here never affect learning."""
+@contextlib.contextmanager
+def open_recording(
+    path: Path | None,
+    *,
+    run: str,
+    config: RunConfig,
+    drawing: Drawing,
+    done: int,
+    serve: tuple[str, int] | None,
+    folder: Path | None = None,
+) -> Iterator[RunRecording]:
+    """Open the file, with replay.rrd beside it, and the server, if requested; see `Recorder`.
 
-    def __init__(
-        self,
-        path: Path | None,
-        *,
-        replay: Path | None,
-        run: str,
-        config: RunConfig,
-        drawing: Drawing,
-        done: int,
-        serve: tuple[str, int] | None,
-        folder: Path | None = None,
-    ) -> None:
-        """Open the file and, if requested, the server; see `Recorder`. `replay` is the recording at physics rate.
+    `folder` is the run's own, for commands in the recording's text; None if it is on another machine.
 
-        `folder` is the run's own, for commands in the recording's text; None if it is on another machine.
-
-        Raises:
-          ConfigError: the address is in use, or the file cannot be written.
-        """
-        super().__init__(logging.INFO)
-        self._replay, ending = replay, plugins.find("tasks", config.task).target.ending
-        with writing(path, ConfigError):
-            self._recorder = Recorder(
-                path, run=run, drawing=drawing, config=markdown(config), serve=serve, done=done,
-                properties=configs.properties(config),
-                again=partial(again, shlex.quote(str(folder or "RUN")), ending),
-            )  # fmt: skip
-        self.uri = self._recorder.uri
-        self.thread = RecorderThread(self._recorder)
-        self._best: tuple[str, Trajectory] | None = None
-        self._ended = False
-        logging.getLogger().addHandler(self)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Record a message of the log."""
-        self.line(record.levelname, record.getMessage())
-
-    def line(self, level: str, text: str) -> None:
-        """Record a log message; levels are those of the standard library."""
-        self.thread.put(lambda: self._recorder.log(text, level))
-
-    def generation(self, report: Report) -> None:
-        """Record a generation; a new best rollout at physics rate is written to replay.rrd."""
-        self.thread.generation(report.progress, report.sample, report.traces, report.rate)
-        if report.progress.return_max >= report.progress.best:
-            self.line("INFO", f"new best rollout: return {report.progress.best:.3f}")
-        if report.replay is not None:
-            self._best = (f"best rollout, generation {report.replay_generation}", report.replay)
-            self._write_replay([self._best])
-
-    def end(self, generation: int, mean: Trajectory | None, best: Trajectory | None, best_generation: int) -> None:
-        """Record a run's end after this number of updates, and write replay.rrd again; `best` is None if already there.
-
-        The rollouts are those of the final mean policy, and the best one with its generation.
-        """
-        self._ended = True
-        if best is not None:
-            self._best = (f"best rollout, generation {best_generation}", best)
-        rollouts = [] if self._best is None else [self._best]
-        if mean is not None:
-            result = {"generations": generation, "return": mean.value, "success": mean.success}
-            self.thread.put(lambda: self._recorder.result(result))
-            self.thread.put(lambda: self._recorder.final(mean))
-            rollouts.append((f"mean policy after generation {generation}", mean))
-        if rollouts:
-            self._write_replay(rollouts)
-
-    def finish(self) -> None:
-        """Write the queue, and close; an interrupted run's parts are merged when it continues."""
-        logging.getLogger().removeHandler(self)
-        self.thread.close(_CLOSE + (COMPACTING if self._ended else 0.0), merge=self._ended)
-
-    def _write_replay(self, rollouts: Sequence[tuple[str, Trajectory]]) -> None:
-        path = self._replay
-        if path is not None:
-            self.thread.put(lambda: self._recorder.replay(path, rollouts=rollouts))
+    Raises:
+      ConfigError: the address is in use, or the file cannot be written.
+    """
+    ending = plugins.find("tasks", config.task).target.ending
+    with writing(path, ConfigError):
+        recorder = Recorder(
+            path, run=run, drawing=drawing, config=markdown(config), serve=serve, done=done,
+            properties=configs.properties(config), again=partial(again, shlex.quote(str(folder or "RUN")), ending),
+        )  # fmt: skip
+    recording = RunRecording(recorder, done, None if path is None else path.with_name("replay.rrd"))
+    try:
+        yield recording
+    finally:
+        recording.finish()
 
 
 def markdown(config: RunConfig) -> str:

@@ -24,7 +24,7 @@ def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (archetypes without a com
     }
     centre, size = np.array(geometry.position), geometry.size
     if geometry.vertices is not None and geometry.faces is not None:
-        return _mesh(geometry.vertices @ _turned(quaternion) + centre, geometry.faces, style["colors"][0])
+        return _mesh(rotate(quaternion, geometry.vertices) + centre, geometry.faces, style["colors"][0])
     if geometry.shape == "box":
         return rr.Boxes3D(half_sizes=[size[:3]], centers=[centre], **style)
     if geometry.shape == "plane":  # Rerun has none: a thin box below it
@@ -54,11 +54,6 @@ def _mesh(vertices: FloatArray, faces: IntArray, colour: list[int]) -> rr.Mesh3D
         vertex_normals=normals / np.where(length > 0, length, 1.0),
         albedo_factor=colour,
     )
-
-
-def _turned(quaternion: FloatArray) -> FloatArray:
-    """The matrix that turns rows from its right, (3, 3)."""
-    return rotate(np.tile(quaternion, (3, 1)), np.eye(3))
 
 
 def rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:

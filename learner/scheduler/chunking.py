@@ -1,4 +1,4 @@
-"""The running median of the time per job, and the chunk sizes and deadlines that follow from it."""
+"""What a chunk costs, by the last answers, and the chunk sizes and deadlines that follow from it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from statistics import median
 from farm.settings import Settings, setting
 
 _SAMPLES = 64
+_APART = 1.5  # ratio of chunk sizes from which the overhead can be told
 _MESSAGES = 300.0  # chunks that a learner sends and receives per second: this takes a third of a core
 
 
@@ -20,7 +21,9 @@ class SchedulerConfig(Settings):
     chunk_seconds: float = setting(0.2, above=0.0)
     """Work sent to a worker in one message [s], by the running median; more if there are more than 60 workers."""
     least_seconds: float = setting(0.015, above=0.0)
-    """Towards the end of a round chunks shrink down to this [s]: rollouts in small batches are slower."""
+    """Towards the end of a round chunks shrink down to this [s], or to `least_overheads`."""
+    least_overheads: float = setting(3.0, least=0.0)
+    """Chunks do not shrink below this many times the part of their time that does not depend on their size."""
     short_seconds: float = setting(0.06, least=0.0)
     """If a worker's whole share of a round takes at most this [s], it is sent in one message."""
     straggler_factor: float = setting(4.0, least=1.0)
@@ -36,39 +39,73 @@ class SchedulerConfig(Settings):
 
 
 class Chunking:
-    """The running median of seconds per job, over the last answers of all workers."""
+    """The running medians of seconds per job and of seconds until an answer, over the last answers of all workers.
+
+    Seconds per job are the workers' own, because a worker that other learners use too works on their chunks between two
+    of this one's. A chunk of n jobs takes about overhead + n x seconds: each control step of a batch has a part that
+    does not grow with the batch, and in small models it is most of the time.
+    """
 
     def __init__(self, config: SchedulerConfig) -> None:
         self._config = config
-        self._samples: deque[float] = deque(maxlen=_SAMPLES)
+        self._samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES)
+        self._waits: deque[float] = deque(maxlen=_SAMPLES)
         self._median: float | None = None  # computed when it is needed
+        self._overhead = 0.0
         self._seconds = 0.0  # duration of the round's longest chunk
 
-    def learn(self, seconds: float) -> None:
-        """Take in one answer's time per job [s]."""
-        self._samples.append(max(seconds, 0.0))
+    def learn(self, jobs: int, wait: float, seconds: float = 0.0) -> None:
+        """Take in one answer.
+
+        Args:
+          jobs: number of its jobs.
+          wait: time since the worker could begin with them [s].
+          seconds: how long it worked on them, by its own account [s]; 0: not measured.
+        """
+        self._waits.append(max(wait, 0.0))
+        self._samples.append((jobs, min(seconds, self._waits[-1]) or self._waits[-1]))
         self._median = None
 
     @property
     def median(self) -> float | None:
-        """Running median [s], None before the first answer."""
+        """Running median of the time per job [s], None before the first answer."""
         if self._median is None and self._samples:
-            self._median = median(self._samples)
+            self._median = median(seconds / jobs for jobs, seconds in self._samples)
+            self._overhead = self._fitted()
         return self._median
+
+    def _fitted(self) -> float:
+        """The overhead of a chunk [s]: a line through the medians of the smaller and the larger third of the answers.
+
+        (Tukey's resistant line, so that single late answers do not count.) As before, if their sizes hardly differ.
+        """
+        ordered = sorted(self._samples)
+        third = len(ordered) // 3
+        if not third:
+            return self._overhead
+        small, large = (
+            [median(values) for values in zip(*part, strict=True)] for part in (ordered[:third], ordered[-third:])
+        )
+        if large[0] < _APART * small[0]:
+            return self._overhead
+        slope = (large[1] - small[1]) / (large[0] - small[0])
+        return max(0.0, small[1] - max(slope, 0.0) * small[0])
 
     @property
     def patience(self) -> float:
         """Time after which an unanswered job is overdue [s]; allows for a wait behind another chunk."""
         factor = self._config.straggler_factor
-        return max(self._config.straggler_seconds, factor * max(self.median or 0.0, self._seconds))
+        waits = median(self._waits) if self._waits else 0.0
+        return max(self._config.straggler_seconds, factor * max(waits, self._seconds))
 
     def chunk(self, jobs: int, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.
 
         About `chunk_seconds` of work, or more if there are so many workers that the learner could not serve them in
         that time. At most half a worker's share of the pending jobs, so that chunks shrink towards the end and all
-        workers finish together. At least `least_seconds`, unless a worker's whole share is less. In a short round
-        each worker gets its whole share at once, because splitting it would cost more time than uneven finishing.
+        workers finish together. At least `least_seconds` and `least_overheads`, unless a worker's share is less. In a
+        short round each worker gets its whole share at once, because splitting it would cost more time than uneven
+        finishing.
         One job until the first duration is known.
 
         Args:
@@ -83,7 +120,8 @@ class Chunking:
         whole = -(-jobs // max(workers, 1)) * seconds
         if whole <= self._config.short_seconds:
             return max(1, share)
-        least = min(share, math.floor(self._config.least_seconds / seconds))
+        shortest = max(self._config.least_seconds, self._config.least_overheads * self._overhead)
+        least = min(share, math.floor(shortest / seconds))
         most = max(self._config.chunk_seconds, workers / _MESSAGES)
         self._seconds = min(most, 0.5 * whole)
         return max(1, least, min(half, math.floor(most / seconds + 0.5)))

@@ -102,10 +102,10 @@ class JobTable:
     def finish(self, worker: str, indices: Sequence[int]) -> list[bool]:
         """Note results of jobs of this round; return for each whether it was not done before."""
         held: dict[int, float] = {}
-        known = self.workers.get(worker)
-        if known is not None:
-            held, known.benched = known.held, False
-            known.proven |= bool(indices)
+        state = self.workers.get(worker)
+        if state is not None:
+            held, state.benched = state.held, False
+            state.proven |= bool(indices)
         done: list[bool] = []
         for index in indices:
             held.pop(index, None)
@@ -115,11 +115,11 @@ class JobTable:
 
     def fail(self, worker: str, index: int, now: float) -> tuple[bool, bool]:
         """Note an error; return whether it counts, and whether no worker holds the job any more."""
-        known = self.workers.get(worker)
-        if known is None or index not in self.given[worker]:
+        state = self.workers.get(worker)
+        if state is None or index not in self.given[worker]:
             return False, False
-        known.benched = True
-        held = known.held.pop(index, None) is not None
+        state.benched = True
+        held = state.held.pop(index, None) is not None
         if index not in self.open or (not held and worker in self.errors[index]):
             return False, False  # done in the meantime, or a duplicate message
         self.errors[index][worker] += 1
@@ -151,11 +151,11 @@ class JobTable:
 
         Benched workers are left out, unless all are benched.
         """
-        all_benched = all(known.benched for known in self.workers.values())
+        all_benched = all(state.benched for state in self.workers.values())
         free = [
-            (len(known.held), name)
-            for name, known in self.workers.items()
-            if len(known.held) < min(known.credits, most) and (all_benched or not known.benched)
+            (len(state.held), name)
+            for name, state in self.workers.items()
+            if len(state.held) < min(state.credits, most) and (all_benched or not state.benched)
         ]
         heapq.heapify(free)
         return free
@@ -180,7 +180,7 @@ class JobTable:
         """Whether a job has failed on `most` hosts with proven workers, or as often and no worker is left to try."""
         errors = self.errors[index]
         hosts = {name.partition("/")[0] for name in errors if name in self.workers and self.workers[name].proven}
-        none_left = all(name in errors or known.benched for name, known in self.workers.items())
+        none_left = all(name in errors or state.benched for name, state in self.workers.items())
         return len(hosts) >= most or (none_left and errors.total() >= most)
 
     def _leave(self, worker: str, index: int, now: float) -> bool:

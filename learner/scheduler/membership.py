@@ -1,53 +1,58 @@
-"""Which workers may join a run, which are connected, and their statistics. Pure: time is an argument [s]."""
+"""Which workers may join a run, and which are connected. Pure: time is an argument [s]."""
 
-from collections import Counter, deque
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Mapping
 from itertools import islice
 from typing import Final
 
 from farm.errors import MessageError
 from farm.net.messages import WorkRequest
-from farm.net.telemetry import WorkerStatus
+from learner.scheduler.audit import host
 
 _MOST: Final = 10_000  # tokens; more workers than one learner can serve
 _MOST_OF_ONE: Final = 1000  # tokens per host name, so that one host cannot use up the limit for all
 _ASKING: Final = 1000  # workers whose request arrived before their token
+_SHOWN: Final = 8  # characters of a canary, as `farm status` shows them
 _SOON: Final = 3.0  # [s] within which the token must follow: token and request travel separately
-_WINDOW: Final = 10.0  # [s] over which a worker's rate is measured
+
+
+NOBODY: Final[Mapping[str, str]] = {}
+"""No expelled hosts."""
 
 
 class Admission:
     """Admits or refuses workers by the properties in their requests for work."""
 
-    def __init__(self, canary: str | None, *, mixed: bool = False) -> None:
+    def __init__(self, canary: str, expelled: Mapping[str, str] = NOBODY, *, mixed: bool = False) -> None:
         """Set the rules of a run.
 
         Args:
-          canary: digest of how the run's machines round; None until the first result is accepted.
+          canary: digest of how the run's machines round, or how it begins. The learner's side says it, and no worker:
+            the first to answer could shut out all others.
+          expelled: hosts that have returned wrong numbers to this run, and the reasons.
           mixed: also admit machines that round differently: the run is then not reproducible.
         """
         self.mixed, self.canary = mixed, canary
+        self.expelled: dict[str, str] = dict(expelled)
+        """Hosts with wrong numbers, and why."""
 
     def refusal(self, want: WorkRequest) -> str | None:
         """Why this worker may not take part, None if it may."""
+        if reason := self.expelled.get(host(want.worker)):
+            return reason
         if not want.canary and not self.mixed:
             return (
                 "it is a device, whose results cannot be repeated: start the learner with --mixed; "
                 "the run is then not reproducible"
             )
-        if self.canary in (None, want.canary) or self.mixed:
+        if want.canary.startswith(self.canary) or self.mixed:
             return None
         return (
-            "its machine rounds differently from those the run began with (another processor or library): "
-            "use a machine like them, or start the learner with --mixed; the run is then not reproducible"
+            f"its machine rounds differently (numbers {want.canary[:_SHOWN]}, the run's are {self.canary[:_SHOWN]}: "
+            "another processor or library): use a machine like the learner's, begin a run with --numbers "
+            f"{want.canary[:_SHOWN]} for machines like this one, or start the learner with --mixed; the run is then "
+            "not reproducible"
         )
-
-    def counted(self, canary: str) -> bool:
-        """Note an accepted result from a machine with this canary; return whether it was the first of the run."""
-        if self.canary is not None or not canary:
-            return False
-        self.canary = canary
-        return True
 
 
 class Attendance:
@@ -105,68 +110,3 @@ class Attendance:
         for worker in gone:
             del self._early[worker]
         return gone
-
-
-@dataclass
-class _Known:
-    want: WorkRequest
-    since: float
-    seen: float
-    rollouts: int = 0
-    recent: deque[tuple[float, int]] = field(default_factory=deque)
-
-
-class Census:
-    """Workers by name, with their recent work."""
-
-    def __init__(self) -> None:
-        self._known: dict[str, _Known] = {}
-
-    def asked(self, want: WorkRequest, now: float) -> None:
-        """A worker asked for work."""
-        known = self._known.setdefault(want.worker, _Known(want, now, now))
-        known.want, known.seen = want, now
-
-    def did(self, worker: str, rollouts: int, now: float) -> None:
-        """A worker sent results."""
-        known = self._known.get(worker)
-        if known is not None:
-            known.seen, known.rollouts = now, known.rollouts + rollouts
-            known.recent.append((now, rollouts))
-            while known.recent[0][0] < now - _WINDOW:
-                known.recent.popleft()
-
-    def canary(self, worker: str) -> str:
-        """The digest of how a worker rounds; empty if it is a device or has left."""
-        known = self._known.get(worker)
-        return "" if known is None else known.want.canary
-
-    def requests(self) -> list[WorkRequest]:
-        """The last request of each worker."""
-        return [known.want for known in self._known.values()]
-
-    def left(self, worker: str) -> None:
-        """A worker has left."""
-        self._known.pop(worker, None)
-
-    def status(self, now: float) -> tuple[WorkerStatus, ...]:
-        """The connected workers, by name."""
-        return tuple(
-            WorkerStatus(
-                worker=name,
-                host=known.want.host,
-                cores=known.want.cores,
-                version=known.want.version,
-                canary=known.want.canary,
-                rollouts=known.rollouts,
-                rate=sum(count for at, count in known.recent if at >= now - _WINDOW) / _over(now - known.since),
-                seen=now - known.seen,
-                ignored=known.want.ignored,
-            )
-            for name, known in sorted(self._known.items())
-        )
-
-
-def _over(seconds: float) -> float:
-    """Time over which a rate is measured: since the worker joined, but 1 s at least and the window at most."""
-    return min(_WINDOW, max(1.0, seconds))

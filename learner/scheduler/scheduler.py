@@ -71,8 +71,8 @@ class Scheduler:
     @property
     def willing(self) -> list[str]:
         """Names of the workers that take jobs, those with the fewest jobs first, then by name."""
-        found = sorted((len(known.held), name) for name, known in self._table.workers.items() if known.credits)
-        return [name for _, name in found]
+        loads = sorted((len(state.held), name) for name, state in self._table.workers.items() if state.credits)
+        return [name for _, name in loads]
 
     @property
     def reissued(self) -> int:
@@ -100,10 +100,10 @@ class Scheduler:
         if credits < 0:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
         self._tick(now)
-        known = self._table.workers.setdefault(worker, Worker(credits))
-        known.credits, known.benched = credits, False
+        state = self._table.workers.setdefault(worker, Worker(credits))
+        state.credits, state.benched = credits, False
         if idle:
-            known.answered = self._now
+            state.answered = self._now
             self._reissued += self._table.release(worker, self._now)
 
     def lost(self, worker: str) -> int:
@@ -116,15 +116,21 @@ class Scheduler:
         del self._table.workers[worker]
         return count
 
-    def results(self, worker: str, indices: Sequence[int], now: float) -> list[Verdict]:
-        """Note the results in a message; return a verdict for each.
+    def refused(self, worker: str) -> int:
+        """Forget a worker that cannot build the task, and its errors, which say nothing about the jobs; as `lost`."""
+        for errors in self._table.errors.values():
+            errors.pop(worker, None)
+        return self.lost(worker)
+
+    def results(self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0) -> list[Verdict]:
+        """Note the results in a message, simulated in some seconds (0: not measured); return a verdict for each.
 
         Only "new" counts. "doubled": the job was done before; "stale": not a job of this round; "unasked": this
         worker was never given it in this round. Results of a worker that has left count. The caller must drop
         messages of other rounds.
         """
         self._tick(now)
-        self._learn(worker, indices)
+        self._learn(worker, indices, seconds)
         given = self._table.given.get(worker, ())
         new = iter(self._table.finish(worker, [index for index in indices if index in given]))
         return [
@@ -156,6 +162,7 @@ class Scheduler:
         It must if the job failed on `max_errors` hosts that have sent results before, or failed as often and
         no worker is left to try: a defect of some machines must not stop a run that others can serve. Until
         then the job is issued again, to a different worker if possible. Errors of unknown workers are ignored.
+        A worker that cannot build the task has tried no job: for that see `refused`.
         """
         self._tick(now)
         counts, again = self._table.fail(worker, index, self._now)
@@ -196,15 +203,15 @@ class Scheduler:
         self._now = max(self._now, now)
         self._seen = -math.inf
 
-    def _learn(self, worker: str, indices: Sequence[int]) -> None:
-        """Learn the time per job: from when the worker could start, divided by the number of jobs it did."""
-        known = self._table.workers.get(worker)
-        if known is None:
+    def _learn(self, worker: str, indices: Sequence[int], seconds: float) -> None:
+        """Learn the time of the jobs: from when the worker could start."""
+        state = self._table.workers.get(worker)
+        if state is None:
             return
-        sent = [known.held[index] for index in set(indices) if index in known.held]
+        sent = [state.held[index] for index in set(indices) if index in state.held]
         if sent:
-            self._chunking.learn((self._now - max(known.answered, min(sent))) / len(sent))
-            known.answered = self._now
+            self._chunking.learn(len(sent), self._now - max(state.answered, min(sent)), seconds)
+            state.answered = self._now
 
     def _first_time(self, size: int) -> list[Assignment]:
         """Hand out pending jobs in chunks, lowest index first; evenly if there are not two chunks for each worker."""

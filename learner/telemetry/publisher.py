@@ -4,17 +4,15 @@ import logging
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 from farm.net import codec, keys
 from farm.net.session import Session
 from farm.net.stats import GenerationStats
-from farm.net.telemetry import Line, RunEnd, RunHistory, RunReport
-from farm.net.work import WireTrajectory
-from learner import config as configs
-from learner.evaluation import Evaluation
-from learner.learner import Learner
-from learner.telemetry.report import Report, packed, wire
+from farm.net.telemetry import Line, Report, RunEnd, RunHistory
+from farm.sim.model_files import split
+from learner.run import config as configs
+from learner.run.learner import Learner
 from learner.telemetry.report_log import ReportLog
 
 log = logging.getLogger(__name__)
@@ -37,17 +35,17 @@ class Publisher(logging.Handler):
     def __init__(self, session: Session, farm: str, incarnation: str, learner: Learner) -> None:
         """Start with the earlier generations in the run's folder."""
         super().__init__(logging.INFO)
-        self._session, self._key, self._incarnation = session, keys.history(farm, learner.folder.name), incarnation
-        self._run, self._recording, self._config = learner.folder.name, learner.run, configs.to_dict(learner.config)
-        self._files = dict(learner.problem.task.sources)
-        self._history, self._generation = ReportLog(), learner.state.generation
-        self._end: RunEnd | None = None
-        self._best: tuple[WireTrajectory | None, int] = (None, 0)
-        self._lines: list[Line] = []
-        self._told = False
-        for report in _before(learner.folder.progress(), self._run, incarnation):
-            self._history.add(report)
-        self._outlet = session.outlet(keys.report(farm, self._run))
+        self._session, self._key = session, keys.history(farm, learner.folder.name)
+        texts, assets = split(learner.problem.task.sources)
+        self._run = RunHistory(  # replaced as a whole, because another thread reads it
+            run=learner.folder.name, incarnation=incarnation, recording=learner.run,
+            config=configs.to_dict(learner.config), files=texts, assets=assets,
+            generation=learner.state.generation, reports=(), end=None, undone=learner.undone,
+        )  # fmt: skip
+        self._reports, self._lines, self._warned = ReportLog(), list[Line](), False
+        for report in _before(learner.folder.progress(), incarnation):
+            self._reports.add(report)
+        self._outlet = session.outlet(keys.report(farm, self._run.run))
         session.answer_asked(self._key, self._page)
         logging.getLogger().addHandler(self)
 
@@ -57,50 +55,16 @@ class Publisher(logging.Handler):
 
     def generation(self, report: Report) -> None:
         """Publish a finished generation."""
-        message = packed(self._bounded(report), self._run, self._incarnation, self._taken())
-        if message.replay is not None:
-            self._best = message.replay, message.replay_generation
-        self._history.add(message)
-        self._generation = message.generation
+        message = replace(self._bounded(report), incarnation=self._run.incarnation, lines=self._taken())
+        self._reports.add(message)
+        self._run = replace(self._run, generation=message.generation)
         if self._outlet.heard:
             self._outlet.publish(codec.encode(message))
 
-    def end(self, summary: dict[str, Any], evaluation: Evaluation | None, best_generation: int) -> None:
-        """Announce the end of the run, and give recorders a moment to request missing reports."""
-        best = wire(evaluation.replay) if evaluation else None
-        if best is not None:
-            self._best = best, best_generation
-        self._end = RunEnd(
-            summary=summary, lines=self._taken(), best=self._best[0], best_generation=self._best[1],
-            mean=wire(evaluation.mean.trajectory) if evaluation else None,
-        )  # fmt: skip
+    def end(self, end: RunEnd) -> None:
+        """Announce the end of the run."""
+        self._run = replace(self._run, end=replace(end, lines=self._taken()))
         self._session.publish(self._key, b"", block=False)
-        until = time.monotonic() + _FAREWELL
-        while self._outlet.heard and time.monotonic() < until:  # they leave when they have everything
-            time.sleep(_LOOK)
-
-    def close(self) -> None:
-        """Accept no more log messages."""
-        logging.getLogger().removeHandler(self)
-        super().close()
-
-    def _page(self, asked: str) -> bytes:
-        """Past reports from a generation on: `from=<generation>`; called on another thread."""
-        digits = asked.removeprefix("from=")[:12]
-        first = int(digits) if digits.isascii() and digits.isdigit() else 1
-        done, end = self._generation, self._end  # before the reports, which may grow meanwhile
-        return codec.encode(
-            RunHistory(
-                run=self._run,
-                incarnation=self._incarnation,
-                recording=self._recording,
-                config=self._config,
-                files=self._files,
-                generation=done,
-                reports=self._history.page(first),
-                end=end,
-            )  # fmt: skip
-        )
 
     def _taken(self) -> tuple[Line, ...]:
         self.acquire()  # as logging does around emit
@@ -108,21 +72,36 @@ class Publisher(logging.Handler):
         self.release()
         return lines
 
+    def close(self) -> None:
+        """Accept no more log messages; if the run is over, give recorders a moment to request missing reports."""
+        until = time.monotonic() + _FAREWELL
+        while self._run.end is not None and self._outlet.heard and time.monotonic() < until:
+            time.sleep(_LOOK)  # they leave when they have everything
+        logging.getLogger().removeHandler(self)
+        super().close()
+
+    def _page(self, asked: str) -> bytes:
+        """Past reports from a generation on: `from=<generation>`; called on another thread."""
+        digits = asked.removeprefix("from=")[:12]
+        first = int(digits) if digits.isascii() and digits.isdigit() else 1
+        run = self._run  # before the reports, which may grow meanwhile
+        return codec.encode(replace(run, reports=self._reports.page(first)))
+
     def _bounded(self, report: Report) -> Report:
         """The report, without the traces of all rollouts if they are too large for a message."""
         if "all" not in report.traces or report.traces["all"].nbytes <= _TRACES:
             return report
-        if not self._told:
-            self._told = True
+        if not self._warned:
+            self._warned = True
             log.warning("traces of all rollouts are too large for recorders elsewhere: they get the best and the worst")
         traces = {name: values for name, values in report.traces.items() if name != "all"}
         return replace(report, traces=traces)
 
 
-def _before(progress: list[GenerationStats], run: str, incarnation: str) -> Iterator[RunReport]:
+def _before(progress: list[GenerationStats], incarnation: str) -> Iterator[Report]:
     """Reports of the generations in the folder, without rollouts."""
     rollouts, seconds = 0, 0.0
     for p in progress:
         rate = (p.rollouts - rollouts) / max(p.seconds - seconds, 1e-3)  # seconds are written to the millisecond
         rollouts, seconds = p.rollouts, p.seconds
-        yield RunReport(run=run, incarnation=incarnation, generation=p.generation, progress=p.to_dict(), rate=rate)
+        yield Report(incarnation=incarnation, progress=p, rate=rate)

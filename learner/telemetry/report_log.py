@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from farm.net import codec
-from farm.net.telemetry import RunReport
+from farm.net.telemetry import Report
 
 MEMORY: Final = 32 << 20
 """Memory limit of rollouts and traces [bytes]; the oldest are dropped first."""
@@ -22,15 +22,15 @@ class ReportLog:
 
     def __init__(self, memory: int = MEMORY, page: int = PAGE) -> None:
         self._memory, self._page = memory, page
-        self._reports: list[RunReport | bytes] = []  # as bytes, statistics take a fifth
+        self._reports: list[Report | bytes] = []  # as bytes, statistics take a fifth
         self._whole: deque[int] = deque()  # positions of the reports with rollouts or traces
         self._size = 0
         self._lock = threading.Lock()
 
-    def add(self, report: RunReport) -> None:
+    def add(self, report: Report) -> None:
         """Keep the next generation's report, and drop the oldest rollouts if there are too many."""
         with self._lock:
-            size = _size(report)
+            size = report.nbytes
             self._reports.append(report if size else codec.encode(report))
             if size:
                 self._whole.append(len(self._reports) - 1)
@@ -38,17 +38,17 @@ class ReportLog:
             while self._size > self._memory:
                 at = self._whole.popleft()
                 oldest = self._at(at)
-                self._size -= _size(oldest)
-                self._reports[at] = codec.encode(replace(oldest, traces=(), sample=None, replay=None))
+                self._size -= oldest.nbytes
+                self._reports[at] = codec.encode(replace(oldest, traces={}, sample=None, replay=None))
 
-    def page(self, generation: int) -> tuple[RunReport, ...]:
+    def page(self, generation: int) -> tuple[Report, ...]:
         """Reports from that generation on, as many as fit into a page; at least one, if there is one."""
         with self._lock:
-            chosen: list[RunReport] = []
+            chosen: list[Report] = []
             size = 0
             for i in range(self._first(generation), len(self._reports)):
                 chosen.append(self._at(i))
-                size += _PLAIN + _size(chosen[-1])
+                size += _PLAIN + chosen[-1].nbytes
                 if size >= self._page:
                     break
             return tuple(chosen)
@@ -60,12 +60,6 @@ class ReportLog:
             at -= 1
         return at
 
-    def _at(self, i: int) -> RunReport:
+    def _at(self, i: int) -> Report:
         report = self._reports[i]
-        return codec.decode(report, RunReport) if isinstance(report, bytes) else report
-
-
-def _size(report: RunReport) -> int:
-    """Size of rollouts and traces [bytes]."""
-    shown = sum(part.nbytes for part in (report.sample, report.replay) if part)
-    return shown + sum(trace.values.nbytes for trace in report.traces)
+        return codec.decode(report, Report) if isinstance(report, bytes) else report

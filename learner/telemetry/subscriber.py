@@ -10,14 +10,17 @@ from farm.errors import ConfigError, Interrupted, MessageError, RunError
 from farm.net import codec, keys
 from farm.net.events import Event
 from farm.net.session import Session
-from farm.net.telemetry import RunEnd, RunHistory, RunReport
-from learner import config as configs
-from learner.config import RunConfig
+from farm.net.telemetry import Report, RunEnd, RunHistory
+from farm.sim.model_files import Files, digest, joined
+from learner.run import config as configs
+from learner.run.config import RunConfig
+from learner.run.states import RolledBack
 
 log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] between two checks whether to stop
 _ANSWER: Final = 2.0  # [s] for a learner to answer
+_FILE: Final = 60.0  # [s] for one of a model's files, up to 32 MiB
 _AGAIN: Final = 1.0  # [s] after which a learner that did not answer is asked again
 _QUIET: Final = 3.0  # [s] without a report after which the last may have been lost
 
@@ -29,16 +32,16 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
       ConfigError: there are several.
       Interrupted: it was stopped.
     """
-    token, told = keys.learner_token(farm, "*"), False
+    token, logged = keys.learner_token(farm, "*"), False
     while not stopped():
         runs = sorted(keys.run_in(key, keys.learner_token(farm, "")) for key in session.tokens(token, _ANSWER))
         if len(runs) > 1:
             raise ConfigError(f"farm {farm} has several runs: {', '.join(runs)}; choose one with --run")
         if runs:
             return runs[0]
-        if not told:
+        if not logged:
             log.info("no run on farm %s yet, waiting for one", farm)
-            told = True
+            logged = True
         # Queried repeatedly, not watched: for a token just being declared a watch and a query may disagree.
         session.events.waiting(_WAIT)
     raise Interrupted("stopped before there was a run")
@@ -49,16 +52,18 @@ class Subscriber:
 
     def __init__(self, session: Session, farm: str, run: str, files: tuple[Path, ...] = ()) -> None:
         """Subscribe, so that no later report is missed; `files` are those whose classes may be used."""
-        self._files = files
+        self._files, self._farm = files, farm
         self._session, self._run, self._key = session, run, keys.history(farm, run)
         self._done, self._incarnation = 0, ""
         self._config: RunConfig | None = None
+        self.undone = 0
+        """Generations that the run had undone when it was first asked."""
         self._ask_at = 0.0
         session.subscribe("report", keys.report(farm, run))
         session.subscribe("history", self._key)
         session.watch("learner", keys.learner_token(farm, run))
 
-    def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig, dict[str, str]]:
+    def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig, Files]:
         """The recording's id, the run's configuration and its task's files, as soon as its learner answers.
 
         Raises:
@@ -66,23 +71,37 @@ class Subscriber:
           RunError: the learner has another version.
           Interrupted: it was stopped.
         """
-        told = False
+        logged = False
         while not stopped():
             page = self._ask()
-            if page is not None:
-                self._config = self._read(page)
-                return page.recording, self._config, page.files
-            if not told:
+            files = None if page is None else self._files_of(page)
+            if page is not None and files is not None:
+                self._config, self.undone = self._read(page), page.undone
+                return page.recording, self._config, files
+            if not logged:
                 log.info("waiting for the learner of run %s", self._run)
-                told = True
+                logged = True
             for event in self._session.events.waiting(_WAIT):
                 self._note(event)
         raise Interrupted(f"stopped before run {self._run} was there")
 
-    def follow(self, done: int, stopped: Callable[[], bool]) -> Iterator[RunReport | RunEnd]:
+    def _files_of(self, page: RunHistory) -> Files | None:
+        """The run's files; None if the learner does not send one."""
+        contents: dict[str, bytes] = {}
+        for name, expected in page.assets.items():
+            content = self._session.ask(keys.asset(self._farm, self._run, expected), _FILE)
+            if content is None:
+                return None
+            if digest(content) != expected:
+                raise RunError(f"what the learner of run {self._run} sends as {name} does not match its digest")
+            contents[expected] = content
+        return joined(page.files, page.assets, contents)
+
+    def follow(self, done: int, stopped: Callable[[], bool]) -> Iterator[Report | RunEnd]:
         """Reports after generation `done` in order, each once; finally the end, when the run is over for good.
 
         Raises:
+          RolledBack: the run went back to an earlier generation, because a host was expelled.
           RunError: the run was restarted with other settings, or its learner has another version.
         """
         self._done, self._ask_at = done, 0.0
@@ -97,12 +116,12 @@ class Subscriber:
                         yield page.end
                         return
 
-    def _take(self, event: Event) -> Iterator[RunReport]:
+    def _take(self, event: Event) -> Iterator[Report]:
         if event.topic != "report":
             self._note(event)
             return
         try:
-            report = codec.decode(event.payload, RunReport)
+            report = codec.decode(event.payload, Report)
         except MessageError:
             self._ask_at = 0.0  # the history's answer is checked, with an error message
             return
@@ -131,7 +150,7 @@ class Subscriber:
         except MessageError as error:
             raise RunError(f"the learner of run {self._run} cannot be understood: {error}") from None
 
-    def _page(self, page: RunHistory) -> Iterator[RunReport]:
+    def _page(self, page: RunHistory) -> Iterator[Report]:
         if page.incarnation != self._incarnation:
             self._recognise(page)
         if page.generation > self._done:
@@ -151,6 +170,8 @@ class Subscriber:
                 raise RunError(
                     f"run {self._run} was started again with --{name} {new} instead of {old}; start a new recorder"
                 )
+        if page.undone > self.undone:
+            raise RolledBack(f"run {self._run} went back to generation {page.generation}: a host was expelled")
         if self._incarnation:
             log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
         self._incarnation = page.incarnation

@@ -2,39 +2,31 @@
 
 import contextlib
 import hashlib
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import made
 import numpy as np
 import pytest
 from network import Network, address
 from processes import Farm
+from robot import robot
 
 from farm.commands import certificates
 from farm.errors import FarmError
 from farm.net import codec, keys, session
-from farm.net.messages import Spec
 from farm.net.session import Session, free_endpoint
 from farm.net.tls import Bundle, Roster, find
 from farm.net.work import RoundHeader
+from learner.again.replay import load
+from learner.again.rewind import rewind
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
-POLE = """
-import numpy as np
-import farm
-
-class Pole(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
-    steps = 4
-
-    def reward(self, sim, action):
-        return np.cos(sim.qpos[:, 0])
-"""
 FEW = ("--generations", "2", "--pairs", "4", "--no-record")
 
 
@@ -49,9 +41,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def task(farm: Farm) -> Path:
-    path = farm.folder / "pole.py"
-    path.write_text(POLE)
-    return path
+    return made.pole(farm.folder)
 
 
 @pytest.fixture
@@ -84,7 +74,7 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     farm: Farm, certs: Path, router: str, task: Path
 ) -> None:
     workers = [hire(farm, router, certs, name, "--accept-code") for name in ("w1", "w2")]
-    texts = [POLE.replace("np.cos", f"{factor} * np.cos") for factor in (1, 2, 3)]
+    texts = [made.POLE.replace("np.cos", f"{factor} * np.cos") for factor in (1, 2, 3)]
     took = []
     for i, text in enumerate(texts):
         task.write_text(text)
@@ -107,6 +97,32 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
 
 
+def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(farm: Farm, certs: Path, router: str) -> None:
+    """Meshes, a moving goal and pushes: checked, learnt over TLS by a worker that has nothing, repeated bit by bit."""
+    robot(farm.folder)
+    assert "same bits together" in farm.call("check", "reach.py:Reach", "--picture", "reach.png")
+    empty = farm.folder / "elsewhere"
+    empty.mkdir()
+    other = Farm(empty)
+    words = ("--connect", router, "--tls", str(certs / "own"))
+    worker = other.start("worker", *words, "--name", "w1", "--processes", "1", "--accept-code")
+    flags = ("--task", "reach.py:Reach", "--policy", "linear", "--generations", "3", "--pairs", "4", "--no-record")
+    try:
+        farm.call("learner", *words, *flags, "--name", "there")
+    finally:
+        said = ended(worker)
+    assert "run there: received reach.py" in said
+    assert not list(empty.iterdir())
+    farm.call("run", *flags, "--name", "here")
+    there = farm.summary("there")
+    assert there["parameters_sha256"] == farm.summary("here")["parameters_sha256"]
+    shutil.rmtree(farm.folder / "robot")
+    run = farm.folder / "runs/there"
+    assert load(run).rollout().trajectory.value == there["mean_policy_return"]
+    for line in farm.progress("there"):
+        assert rewind(run, line["generation"]).returns.max() == line["return_max"]
+
+
 def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Path) -> None:
     with closing(Network(3)) as network:
         names = [word for name in ("left", "right") for word in ("--worker", name)]
@@ -120,7 +136,7 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
         ]
         for worker in workers:
             assert any("joined farm" in line for line in worker.stdout or ())
-        for name, text in (("first", POLE), ("second", POLE.replace("np.cos", "-np.cos"))):
+        for name, text in (("first", made.POLE), ("second", made.POLE.replace("np.cos", "-np.cos"))):
             task.write_text(text)
             words = ("--task", "pole.py:Pole", "--name", name, "--generations", "20", "--pairs", "20", "--no-record")
             process = farm.start("learner", *join, "certs/learner", *words, host=network.hosts[0])
@@ -148,7 +164,7 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
     farm: Farm, certs: Path, router: str, task: Path
 ) -> None:
     worker = hire(farm, router, certs, "w1", "--accept-code")
-    task.write_text("import os\ndef look():\n    os.environ['PYTEST_CURRENT_TEST']\nlook()\n" + POLE)
+    task.write_text("import os\ndef look():\n    os.environ['PYTEST_CURRENT_TEST']\nlook()\n" + made.POLE)
     process = learner(farm, router, certs, "broken")
     said = []
     for line in process.stdout:
@@ -160,17 +176,38 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
     assert '  File "pole.py", line 4, in <module>' in said[first + 1]
     assert '  File "pole.py", line 3, in look' in "\n".join(said[first:])
     ended(process)
-    task.write_text(POLE)
+    task.write_text(made.POLE)
     repaired = learner(farm, router, certs, "repaired")
     repaired.communicate(timeout=60)
     assert repaired.returncode == 0
     assert worker.poll() is None
 
 
+def test_a_worker_that_lacks_a_file_ends_nothing_and_a_good_one_learns(
+    farm: Farm, certs: Path, router: str, task: Path
+) -> None:
+    """Received code runs in an empty folder: what it reads itself from beside the task is not there."""
+    (farm.folder / "limits.txt").write_text("1.0")
+    reads = "from pathlib import Path\nLIMIT = float(Path(__file__).with_name('limits.txt').read_text())\n"
+    task.write_text(reads + made.POLE)
+    bad = hire(farm, router, certs, "w1", "--accept-code")
+    process = learner(farm, router, certs, "r")
+    refused = next(line for line in process.stdout if "does not serve this run" in line)
+    assert "worker w1/" in refused
+    assert "limits.txt" in refused
+    good = hire(farm, router, certs, "w2", "--allow-file", "pole.py")
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "failed wherever" not in said
+    assert farm.summary("r")["state"] == "finished"
+    assert "cannot serve run r" in ended(bad)
+    assert "cannot serve" not in ended(good)
+
+
 def test_what_is_refused_at_the_start(farm: Farm, certs: Path, task: Path) -> None:
     said = farm.call("worker", "--accept-code", "--processes", "1", status=2)
     assert said == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
-    task.write_text(POLE + "#" * 1_000_000)
+    task.write_text(made.POLE + "#" * 1_000_000)
     tls = ("--listen", free_endpoint().replace("tcp/", "tls/"), "--tls", str(certs / "own"))
     said = farm.call("learner", "--task", "pole.py:Pole", "--name", "large", *FEW, *tls, status=2)
     assert "a class's file travels to workers and has at most 1000000" in said
@@ -184,9 +221,7 @@ EVIL = b"raise SystemExit('evil')"
 def pose(opened: Session, worker: str, run: str) -> None:
     """Do everything that the learner of such a task does."""
     digest = hashlib.sha256(EVIL).hexdigest()
-    spec = codec.encode(
-        Spec(run=run, task="evil.py:Evil", task_config={}, policy="linear", policy_config={}, code={"task": digest})
-    )
+    spec = codec.encode(made.spec(run=run, task="evil.py:Evil", policy="linear", code={"task": digest}))
     header = RoundHeader(
         run=run, incarnation="i", round=1, generation=0, spec=hashlib.sha256(spec).hexdigest(), traces="none",
         mu=np.zeros(2),
@@ -255,6 +290,6 @@ def test_a_foreign_learner_does_not_reach_the_router(farm: Farm, certs: Path, ro
     worker = hire(farm, router, certs, "w1", "--accept-code")
     words = ("--connect", router, "--tls", str(certs / "foreign"), "--task", "pole.py:Pole", "--name", "foreign", *FEW)
     foreign = farm.start("learner", *words)
-    assert any("may refuse our certificate" in line for line in foreign.stdout)
+    assert any("its certificate is of another authority" in line for line in foreign.stdout)
     ended(foreign)
     assert "foreign" not in ended(worker)

@@ -14,7 +14,7 @@ import pytest
 from processes import SMALL, Farm
 
 from farm.__main__ import main
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 MISTAKES = [
     (("fly",), "unknown command 'fly'; known are run, learner"),
@@ -52,6 +52,9 @@ MISTAKES = [
     (("run", "--task", "gym:Swimmer-v5", "--steps", "10001"), "steps is 10001; expected 0 to 10000"),
     (("run", "--pairs", "-3"), "pairs is -3; expected 1 or more"),
     (("run", "--pairs", "many"), "error parsing --pairs"),
+    (("run", "--episodes", "0"), "episodes is 0; expected 1 to 1000"),
+    (("run", "--episodes", "2", "--no-perturb"), "--episodes 2 and --no-perturb exclude each other"),
+    (("run", "--policy", "rnn", "--units", "0"), "units is 0; expected 1 to 10000"),
     (("run", "--gamma", "1.5"), "gamma is 1.5; expected a positive number, at most 1"),
     (("run", "--workers", "-1"), "workers is -1; expected 0 to 1024"),
     (("run", "--pears", "3"), "did you mean --pairs"),
@@ -187,7 +190,8 @@ def test_no_answer(farm: Farm) -> None:
     endpoint = free_endpoint()
     said = farm.call("worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1)
     assert f"no answer from {endpoint} yet, trying again" in said
-    assert f"no answer from {endpoint} after 4 s: start a learner there, or check --connect" in said
+    assert f"no answer from {endpoint} after 4 s: nothing listens on port" in said
+    assert "start a learner there, or check --connect" in said
     assert "Traceback" not in said
 
 

@@ -2,24 +2,28 @@
 
 import numpy as np
 import pytest
+from made import POLE
 from processes import SMALL, Farm
 
-from learner import checkpoint as checkpoints
-from learner.run_folder import RunFolder
+from learner.run import checkpoint as checkpoints
+from learner.run.folder import RunFolder
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("sigma", ["run", "fresh"])
-def test_a_run_that_starts_from_another(farm: Farm, sigma: str) -> None:
+def test_a_run_that_starts_from_another(farm: Farm) -> None:
     flags = ("--policy", "projected", "--features", "40", *SMALL)
     farm.call("run", "--name", "a", "--generations", "3", *flags)
-    farm.call("run", "--name", "b", "--generations", "0", "--init-from", "runs/a", "--init-sigma", sigma, *flags)
+    begin = ("--generations", "0", "--init-from", "runs/a", "--init-sigma")
+    farm.call("run", "--name", "b", *begin, "run", *flags)
+    farm.call("run", "--name", "fresh", *begin, "fresh", *flags)
     farm.call("run", "--name", "c", "--generations", "1", "--seed", "7", "--init-from", "runs/a", *flags)
-    a, b, c = (checkpoints.load(RunFolder(farm.folder / "runs" / name).checkpoint) for name in "abc")
+    names = ("a", "b", "fresh", "c")
+    a, b, fresh, c = (checkpoints.load(RunFolder(farm.folder / "runs" / name).checkpoint) for name in names)
     assert np.array_equal(b.state["mu"], a.state["mu"])
-    expected = a.state["sigma"] if sigma == "run" else np.full_like(a.state["sigma"], 0.3)
-    assert np.array_equal(b.state["sigma"], expected)
+    assert np.array_equal(fresh.state["mu"], a.state["mu"])
+    assert np.array_equal(b.state["sigma"], a.state["sigma"])
+    assert np.array_equal(fresh.state["sigma"], np.full_like(a.state["sigma"], 0.3))
     assert np.array_equal(b.constants["frequencies"], a.constants["frequencies"])
     assert np.array_equal(c.constants["phases"], a.constants["phases"]), "they belong to the parameters"
     assert (b.state["generation"], b.rollouts, b.state["best"]) == (0, 0, None)
@@ -56,3 +60,31 @@ def test_a_run_that_is_begun_once_and_gone_on_with_later(farm: Farm) -> None:
     assert "a resumed run keeps its settings: --seed is 0 in the run and 1 here" in said
     said = farm.call("run", "--resume-existing", *SMALL, status=2)
     assert "--resume-existing needs --name" in said
+
+
+@pytest.mark.parametrize(
+    ("reward", "flags", "why"),
+    [
+        ("np.zeros(len(sim))", ("--generations", "4"), "no perturbation changes the reward"),
+        ("sim.qpos[:, 0]", ("--generations", "4", "--task-ends"), "ended in their first step"),
+        (
+            "np.where(action[:, 0] < 5.0, action[:, 0], -20.0)",
+            ("--generations", "90", "--algorithm", "es", "--learning-rate-mu", "0.2"),
+            "the steps are too large",
+        ),
+        ("-action[:, 0] ** 2", ("--generations", "60", "--sigma-floor", "0.9"), "sigma is down to 0.9"),
+        ("-action[:, 0] ** 2", ("--generations", "120", "--learning-rate-mu", "0"), "not improved for 100 generations"),
+    ],
+)
+def test_a_run_that_does_not_learn_says_so(farm: Farm, reward: str, flags: tuple[str, ...], why: str) -> None:
+    ends = "--task-ends" in flags
+    text = POLE.replace("np.cos(sim.qpos[:, 0])", reward)
+    (farm.folder / "pole.py").write_text(
+        text + "\n    def ended(self, sim):\n        return np.full(len(sim), True)\n" if ends else text
+    )
+    words = [word for word in flags if word != "--task-ends"]
+    said = farm.call("run", "--task", "pole.py:Pole", "--policy", "constant", "--name", "r", *words, *SMALL)
+    assert said.count(why) == 1
+    assert (farm.folder / "runs/r/log.txt").read_text().count(why) == 1
+    said = farm.call("run", "--resume", "runs/r", "--generations", "130", "--no-record")
+    assert why not in said, "once is enough"

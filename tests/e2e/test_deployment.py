@@ -15,7 +15,7 @@ import yaml
 from processes import SMALL, Farm
 
 from farm.commands import certificates
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -145,7 +145,7 @@ def test_units_are_what_systemd_takes(tmp_path: Path) -> None:
 def test_shell_scripts_are_clean() -> None:
     if not shutil.which("shellcheck"):
         pytest.skip("shellcheck is not installed (Debian: shellcheck)")
-    scripts = [FILES / "workers.sbatch", ROOT / "tests/e2e/base_image.sh", ROOT / ".ci/run"]
+    scripts = [FILES / "workers.sbatch", ROOT / "tests/e2e/base_image.sh", *(ROOT / ".ci").iterdir()]
     done = subprocess.run(["shellcheck", *map(str, scripts)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 

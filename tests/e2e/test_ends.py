@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import SMALL, Farm, children
 
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -87,17 +87,6 @@ def test_a_learner_that_finds_no_router(farm: Farm) -> None:
     assert learner.returncode == 130
     assert "Traceback" not in said
     assert not (farm.folder / "runs").exists()
-
-
-def test_workers_do_not_outlive_a_run_that_is_killed(farm: Farm) -> None:
-    process = farm.start("run", "--name", "r", "--generations", "100000", *SMALL)
-    farm.wait_for(lambda: farm.progress("r"))
-    workers = children(process.pid)
-    assert len(workers) == 2
-    process.kill()
-    process.communicate(timeout=10)
-    farm.wait_for(lambda: not alive(workers), SOON)
-    assert '"running or killed"' in farm.call("runs", "--json")
 
 
 def test_a_run_that_diverges(farm: Farm) -> None:

@@ -1,7 +1,7 @@
 """If anything dies, hangs, slows down or is cut off, every pair counts once, and the numbers stay the same.
 
 Each test ends with the hash of the undisturbed run, and says how long the run stood still at most;
-`pytest --measurements FILE` writes that down (docs/reliability.md holds ours).
+`pytest --measurements FILE` writes that down (docs/results/reliability.md holds ours).
 """
 
 import os
@@ -17,7 +17,7 @@ import pytest
 from network import BadLink, Network, address
 from processes import Farm, children
 
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -155,16 +155,6 @@ def test_a_learner_behind_a_router_killed_and_back(farm: Farm, check: Check) -> 
     assert learner.returncode == -signal.SIGKILL
     away = resume(farm, "--connect", endpoint)
     check("learner behind a router killed and back", 15, away)
-
-
-def test_a_second_learner_of_one_name_is_refused(farm: Farm) -> None:
-    endpoint = free_endpoint()
-    farm.start("router", "--listen", endpoint)
-    farm.start("learner", "--connect", endpoint, *SETTINGS)
-    farm.wait_for(lambda: (farm.folder / "runs/r/log.txt").exists())
-    said = farm.call("learner", "--connect", endpoint, "--out", "elsewhere", *SETTINGS, status=2)
-    assert "a learner of run r is on farm farm already: choose a different --name" in said
-    assert not (farm.folder / "elsewhere").exists()
 
 
 def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:

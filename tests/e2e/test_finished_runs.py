@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -22,18 +23,17 @@ from rerun.chunk import RrdReader
 
 from farm.__main__ import main
 from farm.errors import ConfigError
+from farm.policies.recurrent import Rnn, RnnConfig
 from farm.sim import video
 from farm.sim.engines import DataEngine
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait import model
-from farm.tasks.finger_gait.observations import STATES
-from learner import export
+from learner.again.replay import LoadedPolicy, Replay, load
 from learner.commands.play import rollout
-from learner.replay import LoadedPolicy, Replay, load
-from learner.run_folder import RunFolder
+from learner.export import npz as export
+from learner.run.folder import RunFolder
 
 GENERATIONS = 6
-FOURIER = ("direct", "projected", "cosine")
 PLAY_POLICY = Path(__file__).parents[2] / "examples" / "play_policy.py"
 
 
@@ -101,7 +101,7 @@ def test_a_policy_that_is_not_stored(done: Farm, tmp_path: Path) -> None:
     (copy / "parameters").write_bytes(head.replace(b'"every": 1', b'"every": 2') + b"\n" + kept)
     said = done.call("replay", str(copy), "--generation", "3", status=2)
     assert "generation 3 is not stored" in said
-    assert "2 from 2 to 4 are, the nearest is 2" in said
+    assert "stored are 2 to 4 in steps of 2, the nearest is 2" in said
     assert len(said.splitlines()) == 1
     assert load(copy, 6).generation == 6  # the checkpoint's is always there
     assert np.array_equal(load(copy, 4).mu, stored(done, generation=4).mu)
@@ -361,38 +361,6 @@ def test_a_policy_is_exported_for_other_runtimes(done: Farm, tmp_path: Path) -> 
     np.testing.assert_allclose(action, policy.act(policy.prepare(mu[None]), x), rtol=1e-11, atol=1e-12)
 
 
-EXPORTED = [(policy, "joints+tactile") for policy in (*FOURIER, "mlp", "rbf", "weighted-kernel", "linear")]
-EXPORTED += [("kernel", state) for state in STATES]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("policy", "state"), EXPORTED)
-def test_every_policy_and_state_can_be_exported(farm: Farm, policy: str, state: str) -> None:
-    settings = ("--policy", policy, "--state", state, "--initial-sigma", "0.3")
-    settings += ("--features", "40") if policy in FOURIER else ()
-    farm.call("run", "--name", "r", "--pairs", "3", "--generations", "2", "--no-record", *settings)
-    farm.call("export", "runs/r", "p.npz")
-    assert returned(bare(farm, farm.folder / "p.npz")) == farm.summary("r")["mean_policy_return"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("--action", "increment", "--no-clip"),
-        ("--action", "absolute", "--reward", "basic"),
-        ("--state", "joints+contacts", "--contacts-scale", "0.5", "--joints-scale", "2", "--weights", "direct"),
-        ("--policy", "direct", "--features", "20", "--initial-mu", "3", "--initial-sigma", "0.1"),  # drops it
-        ("--policy", "direct", "--features", "20", "--reward", "limited", "--return-scale", "0.3"),
-    ],
-    ids=" ".join,
-)
-def test_other_settings_can_be_exported(farm: Farm, settings: tuple[str, ...]) -> None:
-    farm.call("run", "--name", "r", "--pairs", "3", "--generations", "2", "--no-record", *settings)
-    farm.call("export", "runs/r", "p.npz")
-    assert returned(bare(farm, farm.folder / "p.npz")) == farm.summary("r")["mean_policy_return"]
-
-
 @pytest.mark.slow
 def test_an_exported_policy_in_an_environment_of_its_own(done: Farm, tmp_path: Path) -> None:
     done.call("export", "runs/a", str(tmp_path / "p.npz"))
@@ -410,8 +378,14 @@ def test_an_exported_policy_in_an_environment_of_its_own(done: Farm, tmp_path: P
 # ---------------------------------------------------------------- play
 
 
-def test_what_is_played_is_the_replay_bit_for_bit(done: Farm) -> None:
-    policy, shown = stored(done), again(done)
+@pytest.mark.parametrize("memory", [False, True])
+def test_what_is_played_is_the_replay_bit_for_bit(done: Farm, memory: bool) -> None:
+    policy = stored(done)
+    if memory:
+        other = Rnn(RnnConfig(units=4), policy.problem.spec, {})
+        mu = other.start(np.random.default_rng(0))
+        policy = LoadedPolicy(replace(policy.problem, policy=other), policy.generation, mu)
+    shown = policy.rollout()
     task, seen = policy.problem.task, [shown.frames["qpos"][0]]
     engine = DataEngine(task.model)
     task.setup(Sim(engine))
@@ -477,7 +451,7 @@ MISTAKES = [
     (("replay", "runs/a", "--generation", "0", "--best", "1"), 2, "generation 0 of the run in runs/a has no rollouts"),
     (("replay", "runs/a", "--rollout", "8"), 2, "generation 6 has no rollout 8: there are 0 to 7"),
     (("replay", "runs/a", "--worst", "13"), 2, "worst is 13; expected 1 to 12"),
-    (("replay", "runs/a", "--generation", "-1"), 2, "generation is -1; expected 0 or more"),
+    (("replay", "runs/a", "--generation", "-1"), 2, "generation is -1; expected 0 to 10000000"),
     (("replay", "runs/a", "--object", "cat"), 2, "unknown object 'cat'; known are bar"),
     (("replay", "runs/a", "--friction", "0"), 2, "friction is 0.0; expected a positive number"),
     (("replay", "runs/a", "--friction", "nan"), 2, "friction is nan; expected a finite number"),
@@ -490,7 +464,7 @@ MISTAKES = [
     (("replay", "runs/a", "--to", "runs/a/checkpoint"), 2, "--to runs/a/checkpoint: a recording's name ends in .rrd"),
     (("compare", "runs/a", "runs/b", "--to", "runs/a/config.json"), 2, "a recording's name ends in .rrd"),
     (("view", "runs/a/config.json", "--web"), 2, "runs/a/config.json is not a recording"),
-    (("compare", "runs/a"), 2, "1 runs to compare; expected 2 to 7"),
+    (("compare", "runs/a"), 2, "farm compare takes 2 to 7 runs, not 1"),
     (("compare", "runs/a", "runs/../runs/a"), 2, "is there twice"),
     (("compare", "runs/a", "nowhere"), 2, "nowhere is not a run's folder"),
     (("compare", "runs/a", "runs/b", "--to", "/proc/c.rrd"), 1, "cannot write /proc/c.rrd"),

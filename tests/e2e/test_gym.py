@@ -12,8 +12,8 @@ from processes import Farm, children
 from recordings import content, generations, read, rows
 
 from farm.net.session import free_endpoint
-from learner.config import configure
-from learner.run import Placement, open_run
+from learner.run.config import configure
+from learner.run.launch import Placement, open_run
 from learner.scheduler.scheduler import SchedulerConfig
 
 pytestmark = pytest.mark.slow

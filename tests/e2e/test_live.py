@@ -9,7 +9,7 @@ import rerun_cli
 from processes import Farm
 from recordings import generations
 
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 

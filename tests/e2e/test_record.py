@@ -18,8 +18,8 @@ from farm.errors import ConfigError
 from farm.net import codec, keys, session
 from farm.net.telemetry import RunHistory
 from learner.commands.record import RecordCommand, record
-from learner.run import free_endpoint
-from learner.run_folder import RunFolder
+from learner.run.folder import RunFolder
+from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -159,15 +159,14 @@ def test_a_learner_killed_and_resumed(farm: Farm) -> None:
     assert generations(farm.folder / FILE) == numbers(30)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_and_gone_on(farm: Farm, number: signal.Signals) -> None:
+def test_stopped_and_gone_on(farm: Farm) -> None:
     endpoint = free_endpoint()
     learning = learner(farm, endpoint, 100_000)
     hire(farm, endpoint)
     process = recorder(farm, endpoint, "--serve", str(free_port()))
     until(process, "live: farm view rerun+http://127.0.0.1:")
     farm.wait_for(lambda: (farm.folder / FILE).stat().st_size > 50_000)
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     begun = time.monotonic()
     said = finish(process, 130)
     assert time.monotonic() - begun < 10

@@ -16,8 +16,8 @@ from rerun.chunk import RrdReader
 
 from farm import seeds
 from farm.net.work import Jobs
-from learner.run_folder import RunFolder
-from learner.setup import start
+from learner.run.folder import RunFolder
+from learner.run.setup import start
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +50,7 @@ def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
         (tensor,) = kept[generation + 1]
         assert tensor_of(tensor).tobytes() == given.traces.tobytes()
         state = algorithm.tell(state, eps, given.returns.reshape(-1, 2))
-    assert state.mu.tobytes() == folder.parameters()["mu"][-1].tobytes()
+    assert state.mu.tobytes() == folder.parameters.rows()["mu"][-1].tobytes()
 
 
 def test_new_bests_are_in_the_log(recorded: Farm) -> None:
@@ -129,12 +129,23 @@ def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
     assert generations(folder / "run.rrd") == list(range(1, 31))
 
 
+def test_a_run_that_is_first_recorded_later_has_the_curves_of_its_beginning(farm: Farm) -> None:
+    farm.call("run", *SMALL, "--no-record")
+    farm.call("run", "--resume", "runs/r", "--generations", "6")
+    norms = rows(read(farm.folder / "runs/r/run.rrd")["/learning/mean_norm"], "scalars")
+    assert sorted(norms) == [1, 2, 3, 4, 5, 6]
+    assert {generation: value for generation, [value] in norms.items()} == {
+        line["generation"]: line["mean_norm"] for line in farm.progress("r")
+    }
+
+
 def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
     before = recorded.summary("r")
     said = recorded.call("run", "--resume", "runs/r")
     assert f"continuing after generation {GENERATIONS}" in said
     after = recorded.summary("r")
-    assert {**after, "reissued": 0} == {**before, "reissued": 0}
+    again = {"reissued": 0, "checks": {}}  # its last answers are checked again
+    assert {**after, **again} == {**before, **again}
     folder = recorded.folder / "runs" / "r"
     captions = [text for batch in read(folder / "replay.rrd")["/rollout"] for text in _texts(batch)]
     assert [text.split(",")[0].split(" after")[0] for text in captions] == ["### best rollout", "### mean policy"]

@@ -9,7 +9,7 @@ from processes import SMALL, Farm, children
 
 from farm.commands.status import ask
 from farm.net.session import connect
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ import pytest
 from processes import SMALL, Farm
 
 from farm.commands import certificates
-from learner.run import free_endpoint
+from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 

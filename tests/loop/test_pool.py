@@ -18,11 +18,12 @@ from farm.arrays import FloatArray
 from farm.commands import certificates
 from farm.net.session import free_endpoint, listen
 from farm.net.tls import find
-from learner.config import configure
-from learner.run import Placement, open_run
+from learner.run.config import configure
+from learner.run.launch import Placement, open_run
+from learner.run.setup import problem
 from learner.scheduler import dispatcher
-from learner.setup import problem
-from workers.worker import WorkerConfig, work
+from workers.config import WorkerConfig
+from workers.worker import work
 
 COUNT = 24
 
@@ -253,6 +254,37 @@ def test_ctrl_c_ends_a_call_and_the_workers() -> None:
     assert said.splitlines()[-1].startswith("["), "after Ctrl-C the pool is usable"
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+_LEFT_OPEN = """
+import sys
+import numpy as np
+import farm
+
+pool = farm.Farm("finger-gait", policy="linear", workers=1)
+pairs = pool.imap(np.zeros((3, 72)))
+next(pairs)
+print(*pool.worker_pids, flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "said"),
+    [
+        ("", 0, ""),
+        ("del pool, pairs", 0, ""),
+        ("sys.exit(3)", 3, ""),
+        ("raise ValueError('of the script')", 1, "ValueError: of the script"),
+    ],
+)
+def test_a_script_that_closes_nothing_ends_and_its_workers_too(end: str, status: int, said: str) -> None:
+    script = subprocess.run(
+        [sys.executable, "-c", _LEFT_OPEN + end], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert script.returncode == status
+    assert script.stderr.rstrip().endswith(said)
+    assert bool(script.stderr) == bool(said), "nothing else is said"
+    assert not any(Path(f"/proc/{pid}").exists() for pid in script.stdout.split())
 
 
 @pytest.mark.slow

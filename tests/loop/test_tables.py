@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from learner.config import configure
-from learner.run import learn
+from learner.run.config import configure
+from learner.run.launch import learn
 
 TABLES = Path(__file__).parents[2] / "benchmarks" / "tables.py"
 
@@ -31,6 +31,7 @@ TABLES = Path(__file__).parents[2] / "benchmarks" / "tables.py"
                 "algorithm": "pgpe", "shaping": "ranks", "optimiser": "clipup", "pairs": 50, "interactions": 75000,
                 "most_pairs": 400, "max_speed": 0.015, "learning_rate_mu": 0.0075, "initial_sigma": 0.02165,
                 "sigma_rule": "capped", "sigma_cap": 0.2, "learning_rate_sigma": 0.1, "stop_after_steps": 5000,
+                "bias": False,
             },
         ),
     ],

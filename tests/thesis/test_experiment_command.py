@@ -17,7 +17,7 @@ from benchmarks.thesis.experiment import trial
 from benchmarks.thesis.folder import ExperimentFolder
 from farm.errors import ConfigError
 from farm.net.session import free_endpoint
-from learner import config as configs
+from learner.run import config as configs
 
 pytest.importorskip("matplotlib")
 
@@ -72,7 +72,7 @@ def done(tmp_path_factory: pytest.TempPathFactory):
 def test_the_data_is_what_the_runs_recorded(done: Farm) -> None:
     assert "6 of 6 runs to do" in done.said  # type: ignore[attr-defined]
     assert "runs shortened to 3 generations" in done.said  # type: ignore[attr-defined]
-    for setup in ("joints-D300", "joints-D1500", "joints-D8000"):
+    for setup in ("joints-D300-30", "joints-D1500-30", "joints-D8000-30"):
         with np.load(done.folder / "side" / "data" / f"{setup}.npz", allow_pickle=False) as data:
             assert data["states"].tolist() == ["finished", "finished"]
             for number in range(2):
@@ -86,7 +86,7 @@ def test_the_data_is_what_the_runs_recorded(done: Farm) -> None:
 @pytest.mark.slow
 def test_side_by_side_gives_the_numbers_of_one_after_another(done: Farm) -> None:
     """Each run by itself, with `farm run`: the same bits."""
-    for setup, number in (("joints-D300", 1), ("joints-D8000", 0)):
+    for setup, number in (("joints-D300-30", 1), ("joints-D8000-30", 0)):
         plan = done.folder / "plan.json"
         plan.write_text(json.dumps(configs.to_dict(trial(SETUPS[setup], number, 3))))
         done.call("run", "--config", str(plan), "--name", f"{setup}-s{number}", "--no-record", "--workers", "1")
@@ -164,13 +164,15 @@ def _zombie(pid: int) -> bool:
 @pytest.mark.slow
 def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) -> None:
     begun = start(farm, *SHORT, "--out", "side", "--parallel", "2")
-    farm.wait_for(lambda: list(farm.folder.glob("side/runs/joints-D8000-s0/progress.jsonl")))
-    learners = [pid for pid in children(begun.pid) if b"joints-D8000-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    farm.wait_for(lambda: list(farm.folder.glob("side/runs/joints-D8000-30-s0/progress.jsonl")))
+    learners = [
+        pid for pid in children(begun.pid) if b"joints-D8000-30-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
     assert len(learners) == 1
     os.kill(learners[0], signal.SIGKILL)
     said, _ = begun.communicate(timeout=120)
     assert begun.returncode == 1, said
-    assert "joints-D8000-s0 failed" in said
+    assert "joints-D8000-30-s0 failed" in said
     assert "D 8000: trial 0" in said
     again = call(farm, *SHORT, "--out", "side")
     assert "1 of 6 runs to do" in again

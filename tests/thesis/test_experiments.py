@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made import stats
 
-from benchmarks.thesis import claims, series, shapes
+from benchmarks.thesis import claims, series, shapes, statistics
 from benchmarks.thesis.catalogue import EXPERIMENTS, FITTED, SETUPS, config, setup
 from benchmarks.thesis.claims import features_for
 from benchmarks.thesis.experiment import (
+    UNDECIDED,
+    UNTESTABLE,
     Chain,
     Curves,
     Data,
@@ -29,11 +32,11 @@ from benchmarks.thesis.folder import ExperimentFolder, find
 from benchmarks.thesis.series import COLUMNS, Series
 from farm.errors import ConfigError
 from farm.net import keys
-from farm.net.stats import GenerationStats
-from learner.config import RunConfig, configure, to_dict
-from learner.run_folder import RunFolder
-from learner.setup import problem
-from learner.sweep import todo
+from farm.tasks.standard import nominal
+from learner.run.config import RunConfig, configure, to_dict
+from learner.run.folder import RunFolder
+from learner.run.setup import problem
+from learner.sweep.runs import todo
 
 
 def made(returns: np.ndarray, success: np.ndarray | None = None, **changes: object) -> Series:
@@ -60,10 +63,11 @@ def test_every_experiment_shows_set_ups_that_exist_and_every_set_up_is_shown():
 
 def test_set_ups_are_different_and_their_names_can_be_runs():
     assert all(keys.checked("run", f"{name}-s0") for name in (*SETUPS, *FITTED))
-    assert len({json.dumps(to_dict(config)) for config in SETUPS.values()}) == len(SETUPS), "two names for one set-up"
+    once = [json.dumps(to_dict(config)) for name, config in SETUPS.items() if not name.endswith("-30")]
+    assert len(set(once)) == len(once), "two names for one set-up"
 
 
-@pytest.mark.parametrize("name", ["joints-D300", "default-cylinder", "direct-joints-N5", "cosine-joints-D100"])
+@pytest.mark.parametrize("name", ["joints-D300-30", "default-cylinder", "direct-joints-N5", "cosine-joints-D100"])
 def test_set_ups_can_be_begun(name):
     assert problem(config(name)).policy.size > 0
 
@@ -78,6 +82,8 @@ def test_a_fitted_start_changes_width_and_first_sigma_or_one_of_them():
     assert (of("contacts-D1500-width"), of("contacts-D1500-sigma")) == ((both[0], 2.0), (1.0, both[1]))
     # d 17, mu 1: sigma = h sqrt(2 / d), and a spread moves the exponent by one.
     assert 17 * both[1] ** 2 / (2 * both[0] ** 2) == pytest.approx(1.0)
+    x0 = nominal(problem(config("contacts-D1500")).task)
+    assert both[0] == 0.5 * float(np.sqrt(((1.0 - x0) ** 2).sum())), "as when the experiments were made"
     assert replace(config("contacts-D1500-fitted"), policy_config=config("contacts-D1500").policy_config) == replace(
         config("contacts-D1500"), algorithm_config=config("contacts-D1500-fitted").algorithm_config
     )
@@ -93,7 +99,7 @@ def test_a_set_up_is_its_preset_with_what_is_named_changed():
 
 
 def test_trials_differ_in_their_seed_and_may_be_cut_but_not_stretched():
-    run = replace(RunConfig(), generations=20)
+    run = RunConfig(generations=20)
     assert trial(run, 3) == replace(run, seed=3)
     assert trial(run, 0, 5).generations == 5
     assert trial(run, 0, 50).generations == 20
@@ -126,12 +132,10 @@ def test_the_features_that_the_thesis_recommends():
 
 def folder_with(path: Path, generations: int, state: str = "finished") -> RunFolder:
     """A run's folder with the files of a finished run."""
-    run = RunFolder.create(path, replace(RunConfig(), generations=9))
-    numbers = dict.fromkeys(GenerationStats.__dataclass_fields__, 0.0)
-    counts = ("generation", "rollouts", "ended", "failed", "clamped", "reissued", "workers")
+    run = RunFolder.create(path, RunConfig(generations=9))
     for g in range(1, generations + 1):
-        told = {**numbers, **dict.fromkeys(counts, g), "return_mean": -g / 7, "mean_policy_success": g > 3}
-        run.append(GenerationStats(**told), np.arange(8.0) * g, np.arange(8.0) / g, 9)
+        told = stats(g, return_mean=-g / 7, mean_policy_success=g > 3)
+        run.append(told, np.arange(8.0) * g, np.arange(8.0) / g, 9)
     run.write_summary({
         "state": state, "mean_policy_success": True, "robust_success_rate": 0.9, "mean_policy_return": -0.25,
         "parameters_sha256": "ab", "seconds": 3.0,
@@ -141,7 +145,7 @@ def folder_with(path: Path, generations: int, state: str = "finished") -> RunFol
 
 def test_a_series_is_what_the_runs_recorded_and_survives_its_file(tmp_path):
     runs = [folder_with(tmp_path / "a", 9), folder_with(tmp_path / "b", 4, "diverged"), RunFolder(tmp_path / "none")]
-    read = series.read(runs, replace(RunConfig(), generations=9))
+    read = series.read(runs, RunConfig(generations=9))
     series.save(tmp_path / "s.npz", read)
     for s in (read, series.load(tmp_path / "s.npz")):
         assert s.states == ("finished", "diverged", "missing")
@@ -154,7 +158,7 @@ def test_a_series_is_what_the_runs_recorded_and_survives_its_file(tmp_path):
         assert s.learnt.tolist() == [True, True, False]
         assert s.since[0] == 4
         assert s.hashes == ("ab", "ab", "")
-        assert s.rollouts == 1  # of its first line
+        assert s.rollouts == 30  # of its first line
 
 
 def test_what_is_no_series_is_refused_in_one_line(tmp_path):
@@ -178,10 +182,78 @@ def test_since_when_a_policy_succeeds_to_the_end():
 
 
 def test_a_verdict():
-    yes, no = Finding("", True, ""), Finding("", False, "")
+    yes, no, open_, untestable = (Finding("", holds, "") for holds in (True, False, UNDECIDED, UNTESTABLE))
     assert verdict([yes, yes]) == "reproduced"
     assert verdict([yes, no]) == "in part"
     assert verdict([no, no]) == "not reproduced"
+    assert verdict([yes, untestable]) == verdict([yes, open_]) == "in part"
+    assert verdict([no, open_, untestable]) == "not reproduced"
+    assert verdict([open_, untestable]) == "undecided"
+    assert verdict([untestable, untestable]) == "cannot be tested"
+    assert [finding.answer for finding in (yes, no, open_, untestable)] == [
+        "yes",
+        "no",
+        "undecided",
+        "cannot be tested",
+    ]
+
+
+def test_few_trials_decide_only_what_chance_hardly_does():
+    low, high = np.array([-5.0, -4.9, -5.1, -5.2, -4.8]), np.array([-1.0, -0.9, -5.0, -1.1, -1.2])
+    answer, p = statistics.above(high, low)
+    # As large or larger is the sum of the four high ones with any of -4.8, -4.9 and -5.0 (which is there twice).
+    assert answer is True
+    assert p == pytest.approx(4 / 252)
+    assert statistics.above(low, high)[0] is False
+    assert statistics.above(low, low + 0.01)[0] == "undecided"
+    assert statistics.above(high[:1], low[:1]) == ("undecided", 1.0), "one trial of each"
+    assert statistics.all_above((high, low), (low, low + 0.01))[0] == "undecided"
+    assert statistics.all_above((high, low), (low, high))[0] is False
+    many = np.random.default_rng(0).normal(size=30)
+    assert statistics.less_spread(many, 3.0 * many + 7.0)[0] is True
+    assert statistics.less_spread(many, many + 7.0)[0] == "undecided"
+    assert statistics.above(np.append(high, np.nan), low) == (answer, p), "a missing trial counts for nothing"
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    rng, inside = np.random.default_rng(5), 0
+    for _ in range(100):
+        low, high = statistics.difference(rng.normal(1.0, 1.0, 30), rng.normal(0.0, 1.0, 30))
+        inside += low <= 1.0 <= high
+    assert 88 <= inside <= 99
+    assert statistics.share(0, 5) == pytest.approx((0.0, 1.0 - 0.025**0.2))
+    assert statistics.share(5, 5) == pytest.approx((0.025**0.2, 1.0))
+
+
+def test_set_ups_that_never_learn_are_not_compared():
+    low, lower = (np.full((5, 150), level) + 0.01 * np.arange(5)[:, None] for level in (-5.27, -5.29))
+    for found in (claims.pairs_per_generation, claims.rollouts_count):
+        shown = data(made(low, robust=np.zeros(5)), made(lower, robust=np.zeros(5)))
+        assert set(holds(found(shown))) == {UNTESTABLE}
+        assert verdict(found(shown)) == "cannot be tested"
+    learnt = made(rising(20, -1), success=np.ones((5, 150)))
+    third = claims.states(data(learnt, made(low), made(lower)))[2]
+    assert third.holds == UNTESTABLE, "contacts and touch both fail, and the least bit decides nothing"
+
+
+def test_noise_does_not_make_two_set_ups_equal():
+    rng = np.random.default_rng(3)
+    for spread, holds in ((2.0, UNDECIDED), (0.1, True)):
+        trials = -3.0 + rng.normal(0.0, spread, (2, 5, 1)) + np.zeros((2, 5, 150))
+        assert claims.rollouts_count(data(*(made(own, np.ones((5, 150))) for own in trials)))[1].holds == holds
+
+
+def test_an_experiment_has_its_own_number_of_trials(tmp_path):
+    folder = ExperimentFolder.prepare(tmp_path / "e", ["fig-4.3", "fig-4.4"], None, None)
+    assert (folder.count("joints-D300-30"), folder.count("joints-D1500-30"), folder.count("joints-D1500")) == (
+        30,
+        30,
+        5,
+    )
+    assert len(folder.runs) == 3 * 30 + 3 * 5
+    assert ExperimentFolder.open(folder.path) == folder
+    with pytest.raises(ConfigError, match="has 30 trials: give as many or more"):
+        ExperimentFolder.prepare(folder.path, ["fig-4.3", "fig-4.4"], 5, None)
 
 
 def rising(at: int, to: float, length: int = 150, trials: int = 5) -> np.ndarray:
@@ -209,7 +281,8 @@ def test_the_race_to_the_bottom_is_told_from_learning():
 
 
 def test_more_features_learn_faster_or_they_do_not():
-    few, some, many = made(rising(151, 0)), made(rising(90, -5)), made(rising(40, -1))
+    learnt = np.ones((5, 150))
+    few, some, many = made(rising(151, 0)), made(rising(90, -5), learnt), made(rising(40, -1), learnt)
     for shown, expected in (((few, some, many), True), ((many, some, few), False)):
         found = holds(claims.features(data(*shown)))
         assert found[1] is expected
@@ -224,10 +297,11 @@ def test_scaled_returns_are_compared_after_division():
 
 
 def test_fewer_pairs_learn_sooner_over_rollouts():
-    many, few = made(rising(50, -1), rollouts=100), made(rising(40, -1), rollouts=30)
-    assert holds(claims.rollouts_count(data(many, few)))[0]
-    slow = made(rising(149, -1), rollouts=30)
-    assert holds(claims.rollouts_count(data(made(rising(5, -1), rollouts=100), slow))) == [False, False]
+    learnt = np.ones((5, 150))
+    many, few = made(rising(50, -1), learnt, rollouts=100), made(rising(40, -1), learnt, rollouts=30)
+    assert holds(claims.rollouts_count(data(many, few)))[0] is True
+    slow = made(rising(149, -1), learnt, rollouts=30)
+    assert holds(claims.rollouts_count(data(made(rising(5, -1), learnt, rollouts=100), slow))) == [False, False]
 
 
 def test_a_rise_is_one_and_when_it_was():
@@ -251,7 +325,7 @@ def test_only_what_stays_down_has_fallen():
 def test_a_folder_is_one_experiments(tmp_path):
     out = tmp_path / "out"
     ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)
-    assert ExperimentFolder.open(out).setups == ("joints-D300", "joints-D1500", "joints-D8000")
+    assert ExperimentFolder.open(out).setups == ("joints-D300-30", "joints-D1500-30", "joints-D8000-30")
     assert len(todo(ExperimentFolder.prepare(out, ["fig-4.3"], 3, None).runs)) == 9
     with pytest.raises(ConfigError, match=r"holds fig-4\.3: give a different --out"):
         ExperimentFolder.prepare(out, ["fig-4.5"], 3, None)
@@ -306,8 +380,9 @@ def test_an_unknown_experiment_names_the_known_ones():
 
 def test_runs_that_are_over_are_not_repeated_and_failed_ones_are(tmp_path):
     for state, expected in (("finished", True), ("diverged", True), ("failed", False), ("interrupted", False)):
-        assert (not todo([folder_with(tmp_path / state, 3, state).path])) is expected
-    assert todo([tmp_path / "none"])
+        path = folder_with(tmp_path / state, 3, state).path
+        assert (not todo({path: configure(generations=3)})) is expected
+    assert todo({tmp_path / "none": configure()})
 
 
 # ---------------------------------------------------------------- figures
@@ -373,4 +448,5 @@ def test_every_claim_is_held_against_any_data(name):
         assert judge(experiment, shown_data)
         known[label] = replace(first, states=("finished",) * 4 + ("missing",))
         assert judge(experiment, shown_data) == []
-    assert all(isinstance(finding.holds, bool) and finding.part and finding.numbers for finding in found)
+    assert all(finding.holds in (True, False, UNDECIDED, UNTESTABLE) for finding in found)
+    assert all(finding.part and finding.numbers for finding in found)

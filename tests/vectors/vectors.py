@@ -11,7 +11,8 @@ import numpy as np
 
 from farm.net import codec, keys
 from farm.net.messages import Refusal, Spec, WorkRequest
-from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, WireTrajectory
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
+from farm.sim.trajectory import Trajectory
 
 FOLDER = Path(__file__).parent
 WORKER, RUN = "lab-1/4711-a1b2c3", "balance"
@@ -53,7 +54,8 @@ MESSAGES: dict[str, tuple[str, object]] = {
             run=RUN, task="rig.py:Rig", task_config={"steps": 0, "gamma": 1.0, "perturb": True, "reward_offset": 0.0},
             policy="linear", policy_config={"normalise": False},
             code={"task": "01" * 32, "policy": "23" * 32, "simulation": "45" * 32},
-            files={"model.xml": "<mujoco/>"}, constants={"origin": np.array([0.0, 1.0])},
+            files={"model.xml": "<mujoco/>"}, assets={"meshes/arm.stl": "89" * 32},
+            constants={"origin": np.array([0.0, 1.0])},
         ),
     ),
     "round": (
@@ -75,7 +77,7 @@ MESSAGES: dict[str, tuple[str, object]] = {
         _results(
             [1, 2], 3, traces=np.array([[[0.5]], [[1.5]]], "<f4"), moments=np.array([[50.0, 0.5, 2.0]] * 3),
             trajectories=(
-                WireTrajectory(
+                Trajectory(
                     value=1.0, success=None, channels={"energy": np.array([[1.0], [2.0]], "<f4")},
                     times=np.array([0.0, 0.05]), bodies=np.zeros((2, 1, 7), "<f4"),
                     actions=np.array([[0.0], [1.0]], "<f4"), terms=np.array([[0.0], [1.0]], "<f4"),

@@ -15,7 +15,8 @@ import warp
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import FarmError
 from farm.sim.engines import STATE_FIELDS, check_field
-from farm.sim.sim import Rebound, failed_rows, own_value
+from farm.sim.interfaces import Rebound
+from farm.sim.sim import failed_rows, own_value
 
 _Overflow: Final = mujoco_warp.OverflowType
 _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATIONS))

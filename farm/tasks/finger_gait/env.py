@@ -14,14 +14,16 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from farm.arrays import AnyArray, FloatArray
+from farm.errors import ConfigError
 from farm.sim.channels import Camera
 from farm.sim.engines import DataEngine
 from farm.sim.rendering import aimed
 from farm.sim.scene import quiet
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS, LOWER, UPPER
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD
 from farm.tasks.finger_gait.observations import STATES, Felt
-from farm.tasks.finger_gait.task import CONTROL_PERIOD, FingerGait, FingerGaitConfig
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.finger_gait.touch import TAXELS
 from farm.tasks.loop import Batch
 
@@ -62,6 +64,8 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
           ConfigError: a setting makes no sense.
         """
         config = FingerGaitConfig(action=action, **task)
+        if not isinstance(config.object, str):
+            raise ConfigError(f"object is {', '.join(config.object)}; an environment has one: make one for each")
         quiet()
         self._task = FingerGait(config)
         self._sim = Sim(DataEngine(self._task.model))

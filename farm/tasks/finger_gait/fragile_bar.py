@@ -1,9 +1,9 @@
 """The fragile bar: a finger is added to a grip, gently, on a surface of unknown height.
 
 Index finger and thumb grip a bar as in the finger gait, and the middle finger is added. But the bar under the middle
-finger is up to 10 mm higher or lower than it appears, and breaks at 3 N: only touch tells when to stop closing.
+finger is up to 10 mm higher or lower than it appears, and breaks at 3 N: the force tells when to stop closing.
 Friction, mass and the bar's position vary more than in the finger gait, and the joint readings have a constant error
-that is drawn for each rollout, so that the joints' deflection is a poor measure of force.
+that is drawn for each rollout, which hides the servos' deflection from a policy that does not zero its encoders.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,20 +18,20 @@ from farm.errors import ConfigError
 from farm.settings import setting
 from farm.sim.channels import Channel
 from farm.sim.sim import Sim
-from farm.tasks.base import Record, Score, Task, TaskConfig, TaskSpec
+from farm.tasks.base import Record, Score, TaskConfig
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
-from farm.tasks.finger_gait.observations import STATES
-from farm.tasks.finger_gait.task import (
-    CONTROL_PERIOD,
+from farm.tasks.finger_gait.holding import (
     LEAST_COSINE,
     MAX_SHIFT,
     PRESSES,
     SUCCESS_STEPS,
-    FingerGait,
+    HandTask,
     Perturbation,
+    cut,
     distance,
     stayed,
 )
+from farm.tasks.finger_gait.observations import STATES
 
 TERMS: Final = ("force", "grip", "crush", "pose", "action", "drop")
 """Names of the reward's terms."""
@@ -63,19 +63,12 @@ class FragileBarConfig(TaskConfig):
     """Discount factor of the return, per control step."""
     state: str = "forces"
     """State base, the controller's input x: forces | cop | joints | joints+contacts | tactile | joints+tactile."""
-    bias: float = setting(0.05, least=0.0, most=1.0)
-    """Joint readings are wrong by U(-bias, bias), drawn for each joint and rollout [rad]."""
+    joint_bias: float = setting(0.05, least=0.0, most=1.0)
+    """Joint readings are wrong by U(-joint_bias, joint_bias), drawn for each joint and rollout [rad]."""
     action: Literal["offset", "absolute", "increment"] = "increment"
     """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
-
-    # What the finger gait has settings for, and is fixed here: no fields, so no flags.
-    object = "fragile-bar"
-    pose = "opposed"
-    start_grip = "index+thumb"
-    clip = True
-    joints_scale = contacts_scale = tactile_scale = 1.0
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -86,10 +79,11 @@ class FragileBarConfig(TaskConfig):
             raise ConfigError(f"steps is {self.steps}; expected {SUCCESS_STEPS} to 1000")
 
 
-class FragileBar(FingerGait):
+class FragileBar(HandTask):
     """The middle finger joins the grip of a bar whose surface has an unknown height, without breaking it."""
 
     Config = FragileBarConfig
+    object, pose, start_grip, terms = "fragile-bar", "opposed", "index+thumb", TERMS
     steps = 25
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
@@ -97,19 +91,6 @@ class FragileBar(FingerGait):
             "initial_sigma": 0.5, "generations": 20, "average": 10,
         },
     }  # fmt: skip
-    return_scale = Task.return_scale
-    ends = None  # type: ignore[assignment]  # it begins with a grip, but ends with a force
-
-    def spec(self) -> TaskSpec:
-        """The task's specification, found without closing a grip."""
-        return TaskSpec(
-            observation=STATES[self.config.state].size, action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
-            terms=TERMS, success=True, channels=self.channels,
-        )  # fmt: skip
-
-    def setup(self, sim: Sim) -> None:
-        """Find the start grip; a ConfigError if it does not hold the bar."""
-        self._find_start(sim)
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
         """Set conditions and the surface's height, close the start grip round the frozen bar, and release it."""
@@ -121,7 +102,7 @@ class FragileBar(FingerGait):
 
     def _drawn(self, rng: np.random.Generator) -> Perturbation:
         drawn = Perturbation.draw(rng, self.steps, friction=_FRICTION, mass=_MASS, displacement=_DISPLACEMENT)
-        drawn.noise[:] += rng.uniform(-self.config.bias, self.config.bias, len(JOINTS))
+        drawn.noise[:] += rng.uniform(-self.config.joint_bias, self.config.joint_bias, len(JOINTS))
         return drawn
 
     def score(self, record: Record) -> Score:
@@ -144,10 +125,7 @@ class FragileBar(FingerGait):
             ],
             axis=-1,
         )
-        over = np.arange(self.steps) >= record.steps[:, None]
-        terms[over], terms[over, -1] = 0.0, -_WORST
-        terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)
-        return Score(terms / self.steps, self._succeeded(record, force, middle))
+        return Score(cut(terms, record, _WORST) / self.steps, self._succeeded(record, force, middle))
 
     def _succeeded(self, record: Record, force: FloatArray, middle: FloatArray) -> BoolArray:
         last, pose = slice(-SUCCESS_STEPS, None), slice(len(JOINTS), None)
@@ -161,10 +139,6 @@ class FragileBar(FingerGait):
         """The finger gait's channels, with the range of the middle finger's force that counts as success."""
         window = {"middle": WINDOW}
         return tuple(replace(c, limits=window) if c.name == "contacts/force" else c for c in super().channels)
-
-    def exported(self) -> dict[str, Any]:
-        """Nothing in addition."""
-        return {}
 
 
 def _gentle(middle: FloatArray) -> BoolArray:

@@ -1,7 +1,7 @@
 """The model of the hand with an object: its files, and indices into its arrays."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,38 +33,48 @@ def objects() -> list[str]:
     return sorted(file.stem for file in folder().glob("objects/*.xml"))
 
 
-def files(object_name: str, pose: str) -> dict[str, str]:
-    """The files of the model by name: hand, the task's additions, and an object given by name or file.
+def files(names: Sequence[str], pose: str) -> dict[str, str]:
+    """The files of the model by name: hand, the task's additions, and objects given by name or file, at least one.
 
-    Hand and object are set up for a pose, one of POSES.
+    Hand and objects are set up for a pose, one of POSES.
 
     Raises:
-      ConfigError: the object does not exist.
+      ConfigError: an object does not exist.
     """
+    parts = {name: (folder() / name).read_text("utf-8") for name in ("hand.xml", "finger_gait.xml")}
+    own = {object_file(i): _object(name) for i, name in enumerate(names)}
+    return posed({**parts, **own}, POSES[pose])
+
+
+def object_file(index: int) -> str:
+    """Name of the file of one of several objects; that of the first is object.xml."""
+    return f"object-{index + 1}.xml" if index else "object.xml"
+
+
+def _object(name: str) -> str:
     known = objects()
-    path = Path(object_name) if object_name.endswith(".xml") else folder() / f"objects/{object_name}.xml"
-    if not object_name.endswith(".xml") and object_name not in known:
-        raise ConfigError(f"unknown object {object_name!r}; known are {', '.join(known)}, or a file NAME.xml")
+    path = Path(name) if name.endswith(".xml") else folder() / f"objects/{name}.xml"
+    if not name.endswith(".xml") and name not in known:
+        raise ConfigError(f"unknown object {name!r}; known are {', '.join(known)}, or a file NAME.xml")
     try:
-        own = path.read_text("utf-8")
+        return path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read the object {path}: {error}") from None
-    parts = {name: (folder() / name).read_text("utf-8") for name in ("hand.xml", "finger_gait.xml")}
-    return posed({**parts, "object.xml": own}, POSES[pose])
 
 
 def posed(sources: Mapping[str, str], pose: Pose) -> dict[str, str]:
-    """The files with links turned and the object placed for a pose."""
-    hand, thing = (_parsed(sources, name) for name in ("hand.xml", "object.xml"))
-    out = dict(sources)
+    """The files with links turned and the objects placed for a pose."""
+    hand, out = _parsed(sources, "hand.xml"), dict(sources)
     if pose.turned or pose.options:
         for name, quat in pose.turned.items():
             _body(hand, name).set("quat", quat)
         hand.find("option").attrib.update(pose.options)  # type: ignore[union-attr]
         out["hand.xml"] = ET.tostring(hand, encoding="unicode")
-    if pose.place is not None:
-        _body(thing, OBJECT).set("pos", pose.place)
-        out["object.xml"] = ET.tostring(thing, encoding="unicode")
+    for file in (name for name in sources if name.startswith(OBJECT)):
+        thing = _parsed(sources, file)
+        if pose.place is not None:
+            _body(thing, OBJECT).set("pos", pose.place)
+            out[file] = ET.tostring(thing, encoding="unicode")
     return out
 
 
@@ -82,12 +92,21 @@ def _parsed(sources: Mapping[str, str], name: str) -> ET.Element:
         raise ConfigError(f"the hand's model: {name} cannot be read: {error}") from None
 
 
-def mjcf(sources: Mapping[str, str]) -> str:
-    """The texts of `files` as one MJCF text that needs no other file; a ConfigError if one is not XML."""
-    whole = ET.Element("mujoco")
-    for name in ("hand.xml", "finger_gait.xml", "object.xml"):
-        whole.extend(_parsed(sources, name))
+def mjcf(sources: Mapping[str, str], thing: str = "object.xml", name: str = "") -> str:
+    """The texts of `files` with one object as one MJCF text that needs no other file, a model of this name.
+
+    Raises:
+      ConfigError: a text is not XML.
+    """
+    whole = ET.Element("mujoco", {"model": name} if name else {})
+    for part in ("hand.xml", "finger_gait.xml", thing):
+        whole.extend(_parsed(sources, part))
     return ET.tostring(whole, encoding="unicode")
+
+
+def texts(sources: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    """One such text for each of several objects, models of their names."""
+    return [mjcf(sources, object_file(i), Path(name).stem) for i, name in enumerate(names)]
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from farm.arrays import BoolArray, FloatArray
 from farm.settings import setting
 from farm.sim.channels import Camera
 from farm.sim.sim import Sim
-from farm.tasks.base import Record, Score, Task, TaskConfig, TaskSpec
+from farm.tasks.base import Record, Score, TaskConfig
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
-from farm.tasks.finger_gait.task import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, FingerGait, distance
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, HandTask, cut, distance
 
 TERMS: Final = ("turn", "speed", "pose", "action", "drop")
 """Names of the reward terms."""
@@ -44,18 +44,13 @@ class TurningConfig(TaskConfig):
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
 
-    # Settings of the finger gait that are fixed here: class attributes, so there are no flags for them.
-    object = "plate"
-    pose = "between"
-    start_grip = "index+middle+thumb"
-    action = "offset"
-    clip = True
 
-
-class Turning(FingerGait):
+class Turning(HandTask):
     """A hand turns a plate by regrasping it."""
 
     Config = TurningConfig
+    object, pose, start_grip, terms = "plate", "between", "index+middle+thumb", TERMS
+    action = "offset"
     steps = 80
     ending = "lost"
     camera = Camera(lookat=(0.062, 0.022, 0.022), distance=0.2, azimuth=158.0, elevation=-42.0)
@@ -64,24 +59,11 @@ class Turning(FingerGait):
             "policy": "linear", "algorithm": "snes", "pairs": 20, "initial_sigma": 0.03, "generations": 100,
         },
     }  # fmt: skip
-    return_scale = Task.return_scale
-    ends = None  # type: ignore[assignment]  # no grip is to be reached
-
-    def spec(self) -> TaskSpec:
-        """What both sides must know, without closing a grip."""
-        return TaskSpec(
-            observation=sum(self.parts), action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
-            terms=TERMS, success=True, channels=self.channels,
-        )  # fmt: skip
 
     @property
     def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
         """Sizes of the observation's parts."""
         return tuple(_SIZES[part] for part in self.config.state.split("+"))
-
-    def setup(self, sim: Sim) -> None:
-        """Find the start grip; a ConfigError if it does not hold."""
-        self._find_start(sim)
 
     def observe(self, sim: Sim) -> FloatArray:
         """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d)."""
@@ -90,7 +72,7 @@ class Turning(FingerGait):
         seen = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
         if "joints" in self.config.state:
             noise = sim.own["noise"][:, min(sim.t, self.steps - 1)]
-            seen.append(sim.qpos[:, : len(JOINTS)] + noise - self.start_commands)
+            seen.append(sim.qpos[:, : len(JOINTS)] + noise - self.start_commands[sim.which])
         if "forces" in self.config.state:
             seen.append(_FORCE * self.measure(sim)["force"].sum(axis=-1))
         return np.concatenate(seen, axis=1)
@@ -119,15 +101,9 @@ class Turning(FingerGait):
             ],
             axis=-1,
         )
-        over = np.arange(self.steps) >= record.steps[:, None]
-        terms[over], terms[over, -1] = 0.0, -1.0
-        terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)
+        terms = cut(terms, record, 1.0)
         enough = terms[..., 0].sum(axis=1) >= 0.5 * self.steps
         return Score(terms / self.steps, enough & (record.steps == self.steps) & ~record.failed)
-
-    def exported(self) -> dict[str, Any]:
-        """Nothing of its own."""
-        return {}
 
 
 def turned(pose: FloatArray) -> FloatArray:

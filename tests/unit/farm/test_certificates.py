@@ -120,11 +120,13 @@ def test_a_bundle_that_was_moved_stays_on_the_roster(folder: Path, tmp_path: Pat
     assert main(["certificates", "add", str(folder), "--worker", "w1"]) == 2, "two machines of one name"
 
 
-def test_an_authority_of_before_has_its_list_in_the_bundle_of_the_learner(folder: Path) -> None:
+def test_a_roster_that_is_lost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "ca" / "roster.json").unlink()
-    shutil.rmtree(folder / "worker-w1")
+    said = refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "roster.json is missing or damaged" in said
+    assert "the learner's bundle has a copy" in said
+    shutil.copy(folder / "learner" / "roster.json", folder / "ca")
     assert main(["certificates", "add", str(folder), "--worker", "w2"]) == 0
-    assert roster(folder / "ca") == roster(folder / "learner")
     assert roster(folder / "ca")["workers"] == ["w1", "w2"]
 
 
@@ -132,7 +134,7 @@ def test_an_authority_of_before_has_its_list_in_the_bundle_of_the_learner(folder
 def test_a_damaged_roster(text: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "ca" / "roster.json").write_text(text)
     before = files(folder)
-    assert "roster.json is damaged" in refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "roster.json is missing or damaged" in refused(["add", str(folder), "--worker", "w2"], capsys)
     assert files(folder) == before
 
 

@@ -1,6 +1,7 @@
 """Sources of tasks, policies and commands: built in, installed packages, files; and their errors."""
 
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -24,7 +25,20 @@ def test_built_in() -> None:
     )  # fmt: skip
     assert len(found.digest()) == 64
     assert names("policies") == dict.fromkeys(
-        ("direct", "projected", "kernel", "cosine", "constant", "linear", "mlp", "rbf", "weighted-kernel"), "built in"
+        (
+            "direct",
+            "projected",
+            "kernel",
+            "cosine",
+            "constant",
+            "linear",
+            "mlp",
+            "rbf",
+            "weighted-kernel",
+            "rnn",
+            "cpg",
+        ),
+        "built in",
     )
 
 
@@ -58,6 +72,22 @@ def test_every_built_in_one_is_there(kind: str, name: str) -> None:
 def test_unknown_names_say_what_there_is(kind: str, name: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         find(kind, name)
+
+
+def test_a_file_with_the_unknown_name_is_suggested_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pendulum.py").write_text("class Pendulum: pass\nraise SystemExit('it was run')\n")
+    Path("two.py").write_text("class A: pass\nclass B: pass\n")
+    for name, content in (("empty.py", b""), ("broken.py", b"class ("), ("binary.py", b"\0\xff")):
+        Path(name).write_bytes(content)
+    for name in ("pendulum", "pendulum.py", "pendulum:Pendulum"):
+        with pytest.raises(ConfigError, match=r"or FILE\.py:CLASS; did you mean pendulum\.py:Pendulum\?$"):
+            find("tasks", name)
+    with pytest.raises(ConfigError, match=r"; did you mean two\.py:A or two\.py:B\?$"):
+        find("policies", "two")
+    for name in ("empty", "broken", "binary", "x" * 5000, "a\0b"):
+        with pytest.raises(ConfigError, match=r"or FILE\.py:CLASS$"):
+            find("tasks", name)
 
 
 def test_a_variant_is_what_stands_behind_the_colon() -> None:
@@ -128,9 +158,31 @@ def test_a_file_that_is_of_no_use_is_one_line(write: Write, text: str, words: st
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"policy .*none\.py: there is no such file"):
         find("policies", f"{tmp_path}/none.py:Mine")
+
+
+@pytest.mark.timeout(20)
+def test_what_is_no_file_of_a_class_is_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "zeros.py").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe.py")
     (tmp_path / "folder.py").mkdir()
-    with pytest.raises(ConfigError, match=r"folder\.py: it cannot be read: Is a directory"):
-        find("policies", f"{tmp_path}/folder.py:Mine")
+    for name in ("zeros.py", "pipe.py", "folder.py"):
+        with pytest.raises(ConfigError, match=r"^task .*: it is not a file$"):
+            find("tasks", f"{tmp_path / name}:Mine")
+    with (tmp_path / "large.py").open("wb") as file:
+        file.truncate(100_000_000)
+    words = "has 100000000 bytes; a class's file travels to workers and has at most 1000000: put data into a package"
+    with pytest.raises(ConfigError, match=words):
+        find("tasks", f"{tmp_path / 'large.py'}:Mine")
+
+
+def test_a_name_that_workers_refuse_is_refused_at_the_start(tmp_path: Path) -> None:
+    for name, fine in (("a b (1).py", False), ("-a.py", False), ("a b-1.py", True)):
+        (tmp_path / name).write_text("class Mine: pass\n")
+        if fine:
+            assert find("tasks", f"{tmp_path / name}:Mine").wire == f"{name}:Mine"
+        else:
+            with pytest.raises(ConfigError, match="its name may have letters, .* only; rename it"):
+                find("tasks", f"{tmp_path / name}:Mine")
 
 
 def test_a_file_of_somebody_elses(write: Write, tmp_path: Path) -> None:

@@ -5,20 +5,28 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from covering import any_two
 from hypothesis import given
 from hypothesis import strategies as st
 
+from farm import seeds
 from farm.errors import ConfigError, UnservedError
 from farm.policies.base import Policy
 from farm.policies.fourier import Cosine, Direct, FeaturesConfig, Kernel, KernelConfig, Projected
 from farm.policies.networks import Linear, Mlp, MlpConfig
 from farm.policies.radial import Rbf, RbfConfig, WeightedKernel, WeightedKernelConfig
+from farm.policies.recurrent import Cpg, CpgConfig, Rnn, RnnConfig
 from farm.tasks.base import TaskSpec
 
 ACTIONS = 3
 FOURIER = {"direct": Direct, "projected": Projected, "kernel": Kernel, "cosine": Cosine}
 SINGLE = {f"{name}, single": kind for name, kind in FOURIER.items() if name != "kernel"}
-KINDS = FOURIER | SINGLE | {"linear": Linear, "mlp": Mlp, "rbf": Rbf, "weighted-kernel": WeightedKernel}
+KINDS = (
+    FOURIER
+    | SINGLE
+    | {"linear": Linear, "linear, no bias": Linear, "mlp": Mlp, "rbf": Rbf, "weighted-kernel": WeightedKernel}
+    | {"rnn": Rnn, "cpg": Cpg}
+)
 
 
 def make(name: str = "projected", features: int = 50, size: int = 8, seed: int = 0, bandwidth: float = 1.0) -> Policy:
@@ -26,9 +34,12 @@ def make(name: str = "projected", features: int = 50, size: int = 8, seed: int =
     own = {
         "kernel": {"bandwidth": bandwidth},
         "linear": {},
+        "linear, no bias": {"bias": False},
         "mlp": {"layers": (features, 5)},
         "rbf": {"centres": features, "bandwidth": bandwidth},
         "weighted-kernel": {"width": bandwidth},
+        "rnn": {"units": features},
+        "cpg": {},
     }.get(name, {"features": features, "bandwidth": bandwidth})
     if name in SINGLE:
         own["precision"] = "single"
@@ -47,8 +58,21 @@ def parameters(policy, count, seed=4, scale=1.0):
     return np.random.default_rng(seed).normal(0.5, scale, (count, policy.size))
 
 
+def memories(policy, x):
+    """Memories (B, m) that differ from row to row, in a tuple; an empty one for a policy without."""
+    with np.errstate(over="ignore"):
+        return () if policy.memory is None else (x[:, :1] * np.linspace(0.1, 1.0, len(policy.memory)),)
+
+
 def act(policy, theta, x):
-    return policy.act(policy.prepare(theta), x)
+    given = policy.act(policy.prepare(theta), x, *memories(policy, x))
+    return given[0] if isinstance(given, tuple) else given
+
+
+def acted(policy, prepared, x):
+    """Actions, followed by the next memory if there is one, a row each."""
+    given = policy.act(prepared, x, *memories(policy, x))
+    return np.concatenate(given, axis=1) if isinstance(given, tuple) else given
 
 
 # ---------------------------------------------------------------- features
@@ -157,6 +181,14 @@ def test_single_precision_overflows_like_double():
 def plain(policy, theta, x):
     """One rollout's actions (A,), by numpy's own products and functions."""
     config, a, d = policy.config, ACTIONS, len(x)
+    if isinstance(policy, Rnn):
+        (memory,) = memories(policy, x[None])
+        hidden, output = np.split(theta, [config.units * (d + config.units + 1)])
+        h = np.tanh(hidden.reshape(config.units, -1) @ np.concatenate([x, memory[0], [1.0]]))
+        return output.reshape(a, -1) @ np.append(h, 1.0)
+    if isinstance(policy, Cpg):
+        (turns,), (_, amplitude, shift, offset) = memories(policy, x[None]), theta.reshape(a, 4).T
+        return offset + amplitude * np.sin(2.0 * np.pi * turns[0] + shift)
     if isinstance(policy, Mlp):
         for inputs, units in pairwise((d, *config.layers, a)):
             rows, theta = theta[: units * (inputs + 1)].reshape(units, -1), theta[units * (inputs + 1) :]
@@ -164,7 +196,7 @@ def plain(policy, theta, x):
             x = np.tanh(out)
         return out
     if isinstance(policy, Linear):
-        return theta.reshape(a, -1) @ np.append(x, 1.0)
+        return theta.reshape(a, -1) @ (np.append(x, 1.0) if config.bias else x)
     if isinstance(policy, Rbf):
         k = config.centres
         distance = np.linalg.norm(theta[: k * d].reshape(k, d) - x, axis=1)
@@ -178,11 +210,35 @@ def plain(policy, theta, x):
 @pytest.mark.parametrize("size", [1, 8, 62])
 def test_actions_are_those_of_plain_numpy(name, size):
     policy = make(name, features=7, size=size, bandwidth=1.3)
-    sizes = {"mlp": 7 * (size + 1) + 5 * 8 + 3 * 6, "rbf": 7 * (size + 3)}
+    sizes = {"mlp": 7 * (size + 1) + 5 * 8 + 3 * 6, "rbf": 7 * (size + 3), "linear, no bias": 3 * size}
+    sizes |= {"rnn": 7 * (size + 7 + 1) + 3 * 8, "cpg": 12}
     assert policy.size == sizes.get(name, 3 * (size + 1))
     theta, x = parameters(policy, 5), states(5, size)
     wanted = [plain(policy, *row) for row in zip(theta, x, strict=True)]
     np.testing.assert_allclose(act(policy, theta, x), wanted, rtol=1e-11, atol=1e-13)
+
+
+def test_the_hidden_layer_of_an_rnn_is_its_next_memory():
+    policy, x = make("rnn", features=4), states(3)
+    theta = parameters(policy, 3)
+    [memory] = memories(policy, x)
+    _, after = policy.act(policy.prepare(theta), x, memory)
+    rows = theta[:, : 4 * 13].reshape(3, 4, 13)  # 8 observations, 4 memories, a bias
+    for row, seen, known, found in zip(rows, x, memory, after, strict=True):
+        np.testing.assert_allclose(found, np.tanh(row @ np.concatenate([seen, known, [1.0]])), rtol=1e-12)
+    assert policy.memory.tolist() == [0.0] * 4
+
+
+def test_oscillators_are_sines_of_the_time_with_the_written_numbers():
+    policy = make("cpg")
+    frequency, amplitude, shift, offset = [0.7, 3.0, -1.3], [1.0, -0.5, 2.0], [0.0, 0.4, 9.0], [0.1, 0.2, -0.3]
+    prepared = policy.prepare(np.array([frequency, amplitude, shift, offset]).T.reshape(1, -1))
+    memory = policy.memory[None]
+    for step in range(500):
+        action, memory = policy.act(prepared, states(1), memory)
+        angle = 2.0 * np.pi * np.array(frequency) * step * policy.spec.period + shift
+        np.testing.assert_allclose(action[0], offset + amplitude * np.sin(angle), atol=1e-11)
+        assert ((memory >= 0.0) & (memory < 1.0)).all()
 
 
 def test_a_weighted_kernel_begins_at_rest_and_may_act_with_either_sign():
@@ -233,17 +289,15 @@ def test_the_kernel_is_one_at_its_centre():
 # ---------------------------------------------------------------- rows do not know of each other
 
 
-@pytest.mark.parametrize("features", [1, 7, 50, 1000])
-@pytest.mark.parametrize("size", [1, 8, 62])
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(*any_two(name=KINDS, size=(1, 8, 62), features=(1, 7, 50, 1000)))
 def test_a_row_does_not_depend_on_its_batch(name, size, features):
     policy = make(name, features, size)
     theta, x = parameters(policy, 32), states(32, size)
-    alone = [act(policy, theta[i : i + 1], x[i : i + 1])[0].tobytes() for i in range(32)]
+    alone = [acted(policy, policy.prepare(theta[i : i + 1]), x[i : i + 1])[0].tobytes() for i in range(32)]
 
     def check(rows, some_theta, some_x):
         prepared = policy.prepare(some_theta)
-        for actions in (policy.act(prepared, some_x), policy.act(np.asfortranarray(prepared), some_x)):
+        for actions in (acted(policy, prepared, some_x), acted(policy, np.asfortranarray(prepared), some_x)):
             assert [row.tobytes() for row in actions] == [alone[i] for i in rows]
 
     check(range(7), theta[:7], x[:7])
@@ -275,7 +329,7 @@ def test_inputs_are_left_alone(name):
     prepared = policy.prepare(theta).copy()
     for values in (theta, x, prepared, *policy.constants.values()):
         values.setflags(write=False)
-    assert act(policy, theta, x).tobytes() == policy.act(prepared, x).tobytes()
+    assert acted(policy, policy.prepare(theta), x).tobytes() == acted(policy, prepared, x).tobytes()
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -316,6 +370,9 @@ def test_a_wrong_setting_is_named(options, message):
         (MlpConfig, {"layers": "32"}, "layers is '32'; expected tuple"),
         (RbfConfig, {"centres": 0}, "centres is 0; expected 1 to 100000"),
         (RbfConfig, {"bandwidth": -1.0}, "bandwidth is -1.0; expected a positive"),
+        (RnnConfig, {"units": 0}, "units is 0; expected 1 to 10000"),
+        (CpgConfig, {"frequency": 0.0}, "frequency is 0.0; expected a positive"),
+        (CpgConfig, {"amplitude": -1.0}, "amplitude is -1.0; expected 0 to 1000"),
         (WeightedKernelConfig, {"width": 0.0}, "width is 0.0; expected a positive"),
         (WeightedKernelConfig, {"weight_scale": 0.0}, "weight-scale is 0.0; expected a positive"),
     ],
@@ -323,3 +380,55 @@ def test_a_wrong_setting_is_named(options, message):
 def test_a_wrong_setting_of_the_others_is_named(kind, options, message):
     with pytest.raises(ConfigError, match=message):
         kind(**options)
+
+
+# ---------------------------------------------------------------- where the search starts
+
+
+def test_an_mlp_starts_at_random_weights_by_layer():
+    spec = TaskSpec(observation=50, action=40, steps=1, period=0.1)
+    policy = Mlp(MlpConfig(layers=(60, 80)), spec, {})
+    start = policy.start(np.random.default_rng(0))
+    assert (start.shape, start.dtype) == ((policy.size,), np.float64)
+    first = 0
+    for inputs, units, scale in ((50, 60, 1.0), (60, 80, 1.0), (80, 40, 0.1)):
+        layer = start[first : first + units * (inputs + 1)].reshape(units, inputs + 1)
+        assert (layer[:, -1] == 0.0).all(), "biases"
+        z = layer[:, :-1] * np.sqrt(inputs) / scale
+        assert abs(z.mean()) < 4 / np.sqrt(z.size)
+        assert abs(z.std() - 1.0) < 4 / np.sqrt(2 * z.size)
+        first += layer.size
+    assert first == policy.size
+
+
+def test_a_start_is_determined_by_the_seed():
+    policy = make("mlp")
+    one, same, other = (policy.start(seeds.start(seed)) for seed in (3, 3, 4))
+    assert one.tobytes() == same.tobytes()
+    assert (one != other).any()
+    assert seeds.start(3).random() != seeds.features(3).random()
+
+
+def test_an_rnn_starts_as_an_mlp_of_what_it_sees_and_remembers():
+    rnn = make("rnn", features=20)
+    mlp = Mlp(MlpConfig(layers=(20,)), TaskSpec(observation=28, action=ACTIONS, steps=1, period=0.1), {})
+    one, other = (policy.start(np.random.default_rng(0)) for policy in (rnn, mlp))
+    assert one.tobytes() == other.tobytes()
+
+
+def test_oscillators_start_at_the_settings_and_act():
+    policy = Cpg(CpgConfig(frequency=2.0, amplitude=0.3), TaskSpec(observation=8, action=2, steps=1, period=0.1), {})
+    assert policy.start(np.random.default_rng(0)).tolist() == [2.0, 0.3, 0.0, 0.0] * 2
+
+
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in ("mlp", "rnn", "cpg")])
+def test_other_policies_start_at_the_algorithms_mean(name):
+    assert make(name).start(np.random.default_rng(0)) is None
+
+
+def test_the_first_mean_of_an_mlp_sees_the_observation():
+    policy, x = make("mlp"), states(5)
+    start = policy.start(np.random.default_rng(0))
+    actions = act(policy, np.tile(start, (5, 1)), x)
+    assert np.ptp(actions, axis=0).min() > 1e-3
+    assert np.ptp(act(policy, np.zeros((5, policy.size)), x), axis=0).max() == 0.0

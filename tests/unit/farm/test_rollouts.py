@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made import POLE, pole, spec_of
 
 from farm import plugins
 from farm import rollouts as rolling
@@ -13,13 +14,14 @@ from farm.net import codec
 from farm.net.messages import Spec
 from farm.net.work import Jobs, Results, Simulated
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import SIMULATION, Runner, backend, build_task, served
+from farm.rollouts import Runner, backend, build_task, served
 from farm.settings import setting
 from farm.sim.channels import Channel
 from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
-from learner.config import configure
-from learner.setup import problem
+from farm.tasks.probe import specification
+from learner.run.config import configure
+from learner.run.setup import problem
 from workers.backends.cpu import CpuBackend
 
 XML = """<mujoco><option timestep="0.01"/><worldbody>
@@ -68,7 +70,7 @@ class Pole(Task):
 @pytest.fixture(scope="module")
 def runner():
     task = Pole()
-    spec, config = task.spec(), FeaturesConfig(features=10)
+    spec, config = specification(task), FeaturesConfig(features=10)
     return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
 
 
@@ -128,7 +130,7 @@ def test_what_is_sent_is_what_the_receiver_expects(runner):
     jobs = Jobs.joined([Jobs.mean("control", [None]), Jobs.exploring(EPS, (1, -1), SEEDS)])
     head = {"run": "r", "incarnation": "i", "round": 0, "worker": "w/0"}
     for traces, count in (("none", 0), ("extremes", 2), ("all", 8)):
-        sent = Results.carrying(runner.run(MU, jobs, traces), jobs, **head)
+        sent = Results.carrying(runner.run(MU, jobs, traces), jobs, 0.0, **head)
         back = codec.decode(codec.encode(sent), Results)
         assert back.traces.shape[1:] == (5, 1)
         assert len(back.traces) == count
@@ -165,37 +167,18 @@ def test_the_seed_is_all_there_is_to_a_start(runner):
 
 # ---------------------------------------------------------------- specifications
 
-POLE = """
-import numpy as np
-import farm
-
-class Pole(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody>
-      <actuator><motor joint="j"/></actuator></mujoco>'''
-    steps = 3
-
-    def reward(self, sim, action):
-        return sim.qpos[:, 0]
-"""
-
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    path = tmp_path / "pole.py"
-    path.write_text(POLE)
-    return path
+    return pole(tmp_path)
 
 
 @pytest.fixture
 def spec(file: Path) -> Spec:
     """What a learner says of a task in that file."""
-    task, policy = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", "direct")
-    code = {"task": task.digest(), "policy": policy.digest(), "simulation": plugins.code_digest(SIMULATION)}
-    constants = Direct.draw(FeaturesConfig(features=4), task.target().spec(), np.random.default_rng(0))
-    said = Spec(
-        run="r", task=task.wire, task_config={"steps": 2}, policy="direct", policy_config={"features": 4}, code=code,
-        files={"model.xml": task.target.xml}, constants=constants,
-    )  # fmt: skip
+    drawn = specification(plugins.find("tasks", f"{file}:Pole").target())
+    constants = Direct.draw(FeaturesConfig(features=4), drawn, np.random.default_rng(0))
+    said = spec_of(file, "direct", task_config={"steps": 2}, policy_config={"features": 4}, constants=constants)
     return codec.decode(codec.encode(said), Spec)
 
 
@@ -217,9 +200,7 @@ def test_a_file_is_served_by_permission_only_and_only_if_it_is_the_same(spec, fi
     other.write_text(POLE)
     with pytest.raises(UnservedError, match="--allow-file pole.py"):
         served(spec, (other,))
-    changed = tmp_path / "changed" / "pole.py"
-    changed.parent.mkdir()
-    changed.write_text(POLE + "\nraise RuntimeError('it was imported')\n")
+    changed = pole(tmp_path / "changed", POLE + "\nraise RuntimeError('it was imported')\n")
     with pytest.raises(UnservedError, match=r"pole\.py differs from the learner's pole\.py: copy the learner's"):
         served(spec, (changed,))
     with pytest.raises(UnservedError, match="has no class 'Hole'; it has Pole"):
@@ -278,7 +259,7 @@ def test_a_specification_that_makes_no_sense_is_a_clear_error(spec, file, change
 def test_a_file_that_changes_meanwhile_is_what_it_is_now(spec, file):
     """A worker goes on from run to run; the file that it may serve is edited on both sides."""
     served(spec, (file,))
-    file.write_text(POLE.replace("steps = 3", "steps = 7"))
+    file.write_text(POLE.replace("steps = 4", "steps = 7"))
     with pytest.raises(UnservedError, match="differs from the learner's"):
         served(spec, (file,))
     code = spec.code | {"task": plugins.find("tasks", f"{file}:Pole").digest()}
@@ -354,10 +335,95 @@ def test_a_policy_of_ones_own_that_cannot_be_is_named(tmp_path, file, members, s
         problem(configure(f"{file}:Pole", policy=f"{path}:Mine"))
 
 
+@pytest.mark.parametrize(
+    ("given", "got"),
+    [
+        ("np.zeros(3)", r"array of float64 \(3,\)"),
+        ("np.zeros((2, 1))", r"array of float64 \(2, 1\)"),
+        ("np.array([0.0, np.nan])", r"array of float64 \(2,\)"),
+        ("np.array([1, 2])", r"array of int64 \(2,\)"),
+        ("[0.0, 0.0]", "list"),
+    ],
+)
+def test_a_start_that_cannot_be_is_named(tmp_path, file, given, got):
+    path = tmp_path / "mine.py"
+    path.write_text(POLICY.format(f"def start(self, rng): return {given}", "2"))
+    line = f"start of mine.py:Mine gave an? {got}; expected 2 finite numbers of float64, or None$"
+    with pytest.raises(ConfigError, match=line):
+        problem(configure(f"{file}:Pole", policy=f"{path}:Mine")).begin()
+
+
+@pytest.mark.parametrize(
+    ("given", "got"),
+    [
+        ("np.zeros((2, 1))", r"array of float64 \(2, 1\)"),
+        ("np.array([np.inf])", r"array of float64 \(1,\)"),
+        ("np.array([1, 2])", r"array of int64 \(2,\)"),
+        ("0.0", "float"),
+    ],
+)
+def test_a_memory_that_cannot_be_is_named(tmp_path, file, given, got):
+    path = tmp_path / "mine.py"
+    path.write_text(POLICY.format(f"memory = {given}", "2"))
+    line = f"memory of mine.py:Mine gave an? {got}; expected a vector of finite numbers of float64, or None$"
+    with pytest.raises(ConfigError, match=line):
+        problem(configure(f"{file}:Pole", policy=f"{path}:Mine"))
+
+
+def test_a_start_of_ones_own_is_added_to_the_algorithms_mean(tmp_path, file):
+    path = tmp_path / "mine.py"
+    path.write_text(POLICY.format("def start(self, rng): return np.array([2.0, -3.0])", 2))
+    for algorithm in ("pgpe", "es", "sep-cma"):
+        found = problem(configure(f"{file}:Pole", policy=f"{path}:Mine", algorithm=algorithm, initial_mu=0.5))
+        assert found.begin().mu.tolist() == [2.5, -2.5]
+
+
+def test_prepared_values_are_one_array():
+    task, config = Pole(Pole.Config()), FeaturesConfig(features=3)
+    policy = Direct(config, specification(task), Direct.draw(config, specification(task), np.random.default_rng(0)))
+    policy.prepare = lambda theta: (theta, theta[:, :1])
+    with pytest.raises(TaskError, match="prepare of the policy gave a tuple; expected one array, with a row"):
+        Runner(task, policy).rollouts(np.zeros((2, 3)), [None, None])
+
+
 def test_prepared_values_need_a_row_for_each_rollout():
     task, config = Pole(Pole.Config()), FeaturesConfig(features=3)
-    policy = Direct(config, task.spec(), Direct.draw(config, task.spec(), np.random.default_rng(0)))
+    policy = Direct(config, specification(task), Direct.draw(config, specification(task), np.random.default_rng(0)))
     policy.prepare = lambda theta: theta[:1]
     line = r"prepare of the policy gave an array of shape \(1, 3\); expected an array of shape \(2, 3\)"
     with pytest.raises(TaskError, match=line):
         Runner(task, policy).rollouts(np.zeros((2, 3)), [None, None])
+
+
+LEAVES = """
+import sys
+import numpy as np
+import farm
+
+class Leaves(farm.Task):
+    xml = '''XML'''
+    steps = 3
+
+    def reward(self, sim, action):
+        return np.cos(sim.qpos[:, 0]) if sim.t < 2 else sys.exit(5)
+"""
+
+
+def test_a_task_that_exits_is_an_error_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "leaves.py"
+    path.write_text(LEAVES.replace("XML", XML))
+    line = path.read_text().partition("sys.exit")[0].count("\n") + 1
+    found = problem(configure(f"{path}:Leaves", policy="constant"))
+    words = rf"^sys\.exit\(5\) in leaves\.py, line {line}: raise an error instead$"
+    with pytest.raises(TaskError, match=words) as raised:
+        found.runner().rollouts(np.zeros((1, found.policy.size)), [None])
+    assert plugins.author_traceback(raised.value)[0].startswith(f'  File "{path}", line {line}, in reward')
+    assert plugins.author_traceback(raised.value)[-1] == "SystemExit: 5"
+
+
+def test_a_task_that_exits_when_it_is_made(tmp_path: Path) -> None:
+    path = tmp_path / "leaves.py"
+    made = "    steps = 3\n\n    def files(self):\n        sys.exit(0)"
+    path.write_text(LEAVES.replace("XML", XML).replace("    steps = 3", made))
+    with pytest.raises(TaskError, match=r"^sys\.exit\(0\) in leaves\.py, line"):
+        problem(configure(f"{path}:Leaves"))

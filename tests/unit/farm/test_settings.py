@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 import pytest
 
-from farm import __version__, plugins
+import farm
+from farm import plugins
 from farm import settings as arguments
 from farm.__main__ import main
 from farm.errors import ConfigError
@@ -238,7 +239,7 @@ def test_the_front_page(capsys: pytest.CaptureFixture[str]) -> None:
         assert all(f"farm {name} " in said for name in COMMANDS)
         assert max(map(len, said.splitlines())) <= 120
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"rolloutfarm {__version__}\n"
+    assert capsys.readouterr().out == f"rolloutfarm {farm.__version__}\n"
     assert main(["fly"]) == 2
     assert capsys.readouterr().err.startswith("farm: unknown command 'fly'; known are run, ")
 

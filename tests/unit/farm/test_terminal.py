@@ -7,10 +7,12 @@ from typing import Any
 import pytest
 from rich.console import Console, Group
 
-from farm import __main__ as door
+from farm.__main__ import main
 from farm.commands import logs, status
 from farm.commands.screen import plain
 from farm.errors import FarmError, printable
+from farm.net import codec, keys
+from farm.net.session import free_endpoint, listen
 from farm.net.telemetry import RunStatus, WorkerStatus
 
 ATTACKS = {
@@ -75,23 +77,46 @@ def test_every_handler_of_ours_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [type(handler.formatter) for handler in logging.root.handlers] == [logs.Formatter]
 
 
+def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
+    """Names in brackets are Rich's own way to change colours."""
+    attacks, endpoint = (
+        [*(ATTACKS[name] for name in ATTACKS if name != "surrogate"), "[bold]", "[/red]"],
+        free_endpoint(),
+    )
+    with listen(endpoint, "farm") as session:
+        for i, attack in enumerate(attacks):
+            machine: Any = {"host": attack, "cores": 1, "version": attack, "canary": attack, "ignored": {attack: 1}}
+            worker = WorkerStatus(worker=f"w{attack}/1", rollouts=1, rate=1.0, seen=1.0, **machine)
+            run = RunStatus(
+                run=f"r{attack}", generation=i, generations=1234, return_mean=None, mean_policy_return=None, open=0,
+                reissued=0, refused=0, ignored={attack: 3}, workers=(worker,),
+            )  # fmt: skip
+            session.answer(keys.status("farm", f"r{i}"), lambda run=run: codec.encode(run))
+        assert main(["status", "--connect", endpoint]) == 0
+    said = capsys.readouterr().out
+    assert_harmless(said)
+    assert all(f"{i}/1234" in said for i in range(len(attacks)))
+    assert all(f"r{name}" in said and f"w{name}/1" in said and f"{name} 3" in said for name in ("[bold]", "[/red]"))
+
+
 @pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
-def test_in_the_table_of_a_farm(attack: str) -> None:
-    machine: Any = {"host": attack, "cores": 1, "version": attack, "canary": attack, "ignored": {attack: 1}}
-    worker = WorkerStatus(worker=f"w{attack}/1", rollouts=1, rate=1.0, seen=1.0, **machine)
-    run = RunStatus(
-        run=f"r{attack}", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0,
-        refused=0, ignored={attack: 3}, workers=(worker,),
-    )  # fmt: skip
-    assert_harmless(shown(status._tables([run])))
+def test_in_lines_that_commands_say(attack: str, capsys: pytest.CaptureFixture[str]) -> None:
+    logs.say(f"reward of {attack}{LETTERS}", "two\nlines")
+    said = capsys.readouterr().out
+    assert_harmless(said)
+    assert said.endswith(f"{LETTERS}\ntwo\nlines\n")
 
 
 def test_in_rows_of_tables() -> None:
     assert_harmless(shown(Group(*map(plain, ATTACKS.values()))))
 
 
-def test_at_the_front_door(capsys: pytest.CaptureFixture[str]) -> None:
-    assert door._ended(FarmError("a learner answers: " + "".join(ATTACKS.values()))) == 1
+def test_at_the_front_door(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: object) -> int:
+        raise FarmError("a learner answers: " + "".join(ATTACKS.values()))
+
+    monkeypatch.setattr(status, "main", fails)
+    assert main(["status"]) == 1
     said = capsys.readouterr().err
     assert_harmless(said)
     assert len(said.splitlines()) == 1

@@ -1,23 +1,21 @@
 """Comparison of runs: names, differences, results."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
+from made import stats
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
 from learner.commands import compare
 from learner.commands.compare import Compared, names, table
-from learner.config import RunConfig, configure
-from learner.run_folder import RunFolder
+from learner.run.config import RunConfig, configure
+from learner.run.folder import RunFolder
 
 
 def progress(generation: int, success: bool) -> GenerationStats:
-    values = {f.name: 0 if f.type is int else 0.0 for f in dataclasses.fields(GenerationStats)}
-    changed = {"generation": generation, "rollouts": 30 * generation, "mean_policy_success": success, "seconds": 12.4}
-    return GenerationStats(**{**values, "baseline": None, **changed})
+    return stats(generation, mean_policy_success=success)
 
 
 def compared(name: str, config: RunConfig, successes: list[bool], **summary: object) -> Compared:
@@ -72,7 +70,7 @@ def test_stored_means(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "r", RunConfig())
     for generation in (1, 2, 3):
         folder.append(progress(generation, False), np.full(4, generation + 0.5), np.ones(4), 3)
-    assert folder.mean(2)[0].tolist() == [2.5] * 4
+    assert folder.parameters.mean(2)[0].tolist() == [2.5] * 4
     for wanted, nearest in ((9, 3), (-4, 1)):
-        with pytest.raises(ConfigError, match=f"3 from 1 to 3 are, the nearest is {nearest}"):
-            folder.mean(wanted)
+        with pytest.raises(ConfigError, match=f"stored are 1 to 3, the nearest is {nearest}"):
+            folder.parameters.mean(wanted)

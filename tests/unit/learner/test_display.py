@@ -7,12 +7,11 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from made import stats
 from rich.console import Console
 
-from farm.net.stats import GenerationStats
-from farm.net.telemetry import WorkerStatus
+from farm.net.telemetry import Report, WorkerStatus
 from learner.commands.display import LiveDisplay
-from learner.telemetry.report import Report
 
 ATTACK = "\x1b[2J\x1b]0;owned\a\u202e\x9b3J [bold]"
 
@@ -20,10 +19,9 @@ ATTACK = "\x1b[2J\x1b]0;owned\a\u202e\x9b3J [bold]"
 def screen(workers: list[WorkerStatus], width: int, show: Callable[[], None] = lambda: None) -> str:
     """The output for one generation on a terminal of this width."""
     learner = SimpleNamespace(config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0))
-    farm = SimpleNamespace(census=lambda: workers)
-    run = cast("Any", SimpleNamespace(learner=learner, farm=farm, recording=None, live=None))
-    progress = GenerationStats(**cast("Any", dict.fromkeys(GenerationStats.__dataclass_fields__, 1)))
-    report = Report(progress=progress, rate=1.0, sample=None, traces={}, replay=None, replay_generation=0)
+    dispatcher = SimpleNamespace(census=lambda: workers)
+    run = cast("Any", SimpleNamespace(learner=learner, dispatcher=dispatcher, recording=None, live=None))
+    report = Report(progress=stats(ended=1, failed=1), rate=1.0)
     file = io.StringIO()
     with LiveDisplay(Console(file=file, force_terminal=True, width=width, color_system=None), run, []) as shown:
         show()

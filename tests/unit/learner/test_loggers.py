@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from made import stats
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
@@ -36,15 +37,17 @@ class Nothing:
 """
 
 
-def stats(generation: int) -> GenerationStats:
-    told = dict.fromkeys(GenerationStats.__dataclass_fields__, 1) | {"return_mean": -0.5 * generation}
-    return GenerationStats(**told | {"generation": generation, "mean_policy_success": True, "success_rate": None})
+def figures(generation: int) -> GenerationStats:
+    measures = {"height": 0.25, "push": None}
+    return stats(
+        generation, return_mean=-0.5 * generation, mean_policy_success=True, success_rate=None, measures=measures
+    )
 
 
 def logged(names: tuple[str, ...], folder: Path, *, first: int = 1, last: int = 2) -> None:
     loggers = Loggers(names, folder, CONFIG, first - 1)
     for generation in range(first, last + 1):
-        loggers.generation(stats(generation))
+        loggers.generation(figures(generation))
     loggers.end(SUMMARY)
     loggers.end({})
 
@@ -75,7 +78,10 @@ def test_tensorboard_has_every_figure_of_every_generation(tmp_path: Path) -> Non
                 texts[value.tag.removesuffix("/text_summary")] = value.tensor.string_val[0].decode()
     assert curves["return_mean"] == [(1, -0.5), (2, -1.0)]
     assert curves["mean_policy_success"] == [(1, 1.0), (2, 1.0)]
-    assert set(curves) == set(GenerationStats.__dataclass_fields__) - {"generation", "success_rate"}
+    assert curves["measures_height"] == [(1, 0.25), (2, 0.25)]
+    tables = {"measures", "mean_policy_measures"}
+    known = set(GenerationStats.__dataclass_fields__) - {"generation", "success_rate"} - tables
+    assert set(curves) == known | {"measures_height"}, "what is not known is left out"
     for name, wanted in (("config", CONFIG), ("summary", SUMMARY)):
         assert json.loads(texts[name].removeprefix("```json\n").removesuffix("\n```")) == wanted
 
@@ -108,6 +114,10 @@ def test_wandb_has_the_figures_and_goes_on_with_the_same_run(tmp_path: Path, mon
     said.clear()
     logged(("wandb",), tmp_path, first=3, last=3)
     assert said == [("init", own), ("step 3", -1.5), *end]
+    said.clear()
+    logged(("wandb",), tmp_path, first=2, last=2)  # a host was expelled: no step is logged twice in one run
+    assert said[0] == ("init", (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG)) != ("init", own)
+    assert said[1:] == [("step 2", -1.0), *end]
 
 
 @pytest.mark.slow

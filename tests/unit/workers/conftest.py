@@ -7,7 +7,7 @@ import pytest
 from stage import FARM, Runner, Stage, served
 
 from farm.net.session import free_endpoint, listen
-from workers import worker as workers
+from workers import runners
 
 
 @pytest.fixture
@@ -24,6 +24,6 @@ def real() -> Iterator[Stage]:
 
 @pytest.fixture
 def stage(real: Stage, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    monkeypatch.setattr(workers, "served", served)
-    monkeypatch.setattr(workers, "Runner", Runner)
+    monkeypatch.setattr(runners, "served", served)
+    monkeypatch.setattr(runners, "Runner", Runner)
     return real

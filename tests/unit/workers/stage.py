@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
+from made import spec
 
 from farm.arrays import FloatArray
 from farm.errors import UnservedError
@@ -20,10 +21,11 @@ from farm.net.events import Event
 from farm.net.messages import Spec, WorkRequest
 from farm.net.session import Session, connect
 from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated
-from workers.worker import Worker, WorkerConfig
+from workers.config import WorkerConfig
+from workers.worker import Worker
 
 FARM, P, WAIT = "try", 3, 20.0
-BEGINNING = Spec(run="", task="made-up", task_config={}, policy="none", policy_config={}, code={})
+BEGINNING = spec(run="")
 
 
 class Runner:
@@ -39,21 +41,24 @@ class Runner:
         self.made.append(name)
         assert callable(make)
 
-    def run(self, mu: FloatArray, jobs: Jobs, traces: str, normaliser: FloatArray | None = None) -> Simulated:
+    def run(
+        self, mu: FloatArray, jobs: Jobs, traces: str, normaliser: FloatArray | None = None, *, terms: bool
+    ) -> Simulated:
         self.ran.append(self.name)
         self.go.wait(WAIT)
         if 13 in jobs.indices:
             raise ArithmeticError("thirteen")
         returns = jobs.theta(mu).sum(axis=1)
         shown = np.zeros((len(returns) if traces == "all" else 0, 1, 2), "<f4")
-        return Simulated(returns, np.zeros((len(returns), 4), bool), np.ones(len(returns), "<i8"), shown, ())
+        flags, steps = np.zeros((len(returns), 4), bool), np.ones(len(returns), "<i8")
+        return Simulated(returns=returns, flags=flags, steps=steps, traces=shown, trajectories=())
 
     def close(self) -> None:
         pass
 
 
-def served(spec: Spec, files: tuple[Path, ...]) -> tuple[str, Any]:
-    assert files == ()
+def served(spec: Spec, files: tuple[Path, ...], contents: dict[str, bytes]) -> tuple[str, Any]:
+    assert (files, contents) == ((), {})
     if spec.task == "broken":
         raise RuntimeError("no such\n  machine")
     if spec.task == "unknown":
@@ -64,7 +69,8 @@ def served(spec: Spec, files: tuple[Path, ...]) -> tuple[str, Any]:
 class Learner:
     """One run as a learner shows it; says only what the test says."""
 
-    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING) -> None:
+    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING, there: Session | None = None) -> None:
+        """As long as the session `there` is open, workers see that it is there."""
         self.session, self.run, self.asked = session, run, Counter[str]()
         self.spec = codec.encode(replace(spec, run=run))
         self.header = RoundHeader(
@@ -74,7 +80,7 @@ class Learner:
         session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
         session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))
         session.answer(keys.generation(FARM, run), lambda: self._say("generation", codec.encode(self.header)))
-        session.token(keys.learner_token(FARM, run))
+        (there or session).token(keys.learner_token(FARM, run))
 
     def _say(self, what: str, payload: bytes) -> bytes:
         self.asked[what] += 1
@@ -99,7 +105,7 @@ class Stage:
     def __init__(self, session: Session, endpoint: str) -> None:
         self.session, self.endpoint = session, endpoint
         self._stop, self._open = threading.Event(), ExitStack()
-        self._hired: list[Worker] = []
+        self._hired: list[Session] = []
         session.subscribe("want", keys.want(FARM, "**"))
         session.watch("worker", keys.worker_token(FARM, "**"))
 
@@ -108,7 +114,7 @@ class Stage:
         session = self._open.enter_context(connect((self.endpoint,), WAIT, lambda: False, config.bundle))
         worker = Worker(config, session)
         self._open.callback(worker.close)
-        self._hired.append(worker)
+        self._hired.append(session)
         worker.join()
         thread = threading.Thread(target=self._work, args=(worker,))
         thread.start()
@@ -131,6 +137,19 @@ class Stage:
                 return keys.worker_in(event.key, keys.worker_token(FARM, "")), event.alive
             return event.topic, codec.decode(event.payload, kind or (WorkRequest if event.topic == "want" else Results))
 
+    @property
+    def queued(self) -> int:
+        """Events that the newest worker has not taken yet."""
+        return len(self._hired[-1].events)
+
+    def asked(self, matches: Callable[[WorkRequest], object]) -> WorkRequest:
+        """The next of a worker's requests that matches."""
+        while True:
+            _, want = self.next("want")
+            assert isinstance(want, WorkRequest)
+            if matches(want):
+                return want
+
     def results(self, *runs: str) -> Results:
         _, said = self.next(*(f"result of {run}" for run in runs or ("r",)))
         assert isinstance(said, Results)
@@ -144,8 +163,8 @@ class Stage:
     def let_go(self) -> None:
         """Ask the worker to leave, and wake it."""
         self._stop.set()
-        for worker in self._hired:
-            worker._session.events.put(Event("refused", "", b""))
+        for session in self._hired:
+            session.events.put(Event("refused", "", b""))
 
     def close(self) -> None:
         self.let_go()

@@ -4,23 +4,29 @@ import hashlib
 import logging
 import os
 import signal
+import subprocess
+import sys
+import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from stage import FARM, Learner, Runner, Stage, indices, until
-from test_worker import POLE, pole
+from made import POLE, pole, spec_of
+from stage import FARM, WAIT, Learner, Runner, Stage, indices, until
 
 from farm.commands import certificates
 from farm.errors import ConfigError
 from farm.net import keys
-from farm.net.session import free_endpoint, listen
+from farm.net.session import Session, connect, free_endpoint, listen
 from farm.net.tls import find
 from workers import subprocess_runner
-from workers.worker import Worker, WorkerConfig
+from workers.config import WorkerConfig
+from workers.source_cache import SourceCache
+from workers.worker import Worker
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +50,16 @@ def safe(certs: Path) -> Iterator[Stage]:
 class Author(Learner):
     """A learner of a run whose task is a class in a file; workers may ask it for the file."""
 
-    def __init__(self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None) -> None:
+    def __init__(
+        self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None, there: Session | None = None
+    ) -> None:
         self.source = file.read_bytes()
-        spec = pole(file) if sends is None else replace(pole(file), code=pole(file).code | {"task": digest(file)})
+        spec = spec_of(file)
+        if sends is not None:
+            spec = replace(spec, code=spec.code | {"task": digest(file)})
         key = keys.code(FARM, run, digest(file))
         stage.session.answer(key, lambda: self._say("code", self.source if sends is None else sends))
-        super().__init__(stage.session, run, spec)
+        super().__init__(stage.session, run, spec, there)
         self.header = replace(self.header, mu=np.ones(2), traces="none")
 
 
@@ -59,18 +69,24 @@ def digest(file: Path) -> str:
 
 def write(folder: Path, text: str = "", name: str = "pole.py") -> Path:
     """The pole's file with something before it."""
-    path = folder / name
-    path.write_text(text + POLE)
-    return path
+    return pole(folder, text + POLE, name)
 
 
 def hire(stage: Stage, certs: Path) -> Worker:
     return stage.hire(tls=certs, accept_code=True)
 
 
-def process(worker: Worker) -> subprocess_runner.SubprocessRunner:
-    [found] = [each for each in worker._runners.values() if isinstance(each, subprocess_runner.SubprocessRunner)]
-    return found
+def kept(file: Path) -> list[Path]:
+    """Where workers of this machine keep that file."""
+    return list(Path(tempfile.gettempdir()).glob(f"rolloutfarm-code-*/{digest(file)}/*"))
+
+
+def alive(pid: int) -> bool:
+    """Whether the process is there, and more than an entry that nobody has read."""
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
 
 
 def test_it_is_fetched_once_and_run_elsewhere(
@@ -96,32 +112,38 @@ print("noise")
         assert (returns > 3.9).all(), "four steps of at most 1"
     assert author.asked["code"] + other.asked["code"] == 1, "a source is fetched once, for all runs"
     assert f"received pole.py (SHA-256 {digest(file)}) from its learner" in caplog.text
-    kept = worker._sources.place("pole.py", digest(file))
-    assert kept.read_bytes() == file.read_bytes()
-    assert kept.parents[1].stat().st_mode & 0o077 == 0
+    [copy] = kept(file)
+    assert copy.read_bytes() == file.read_bytes()
+    assert copy.parents[1].stat().st_mode & 0o077 == 0
     lines = [line.split("|") for line in said.read_text().splitlines()]
     assert len(lines) == 2, "one process for each run"
     for pid, folder, content, bound, session, *names in lines:
         assert int(pid) != os.getpid()
-        assert (Path(folder), content) == (worker._sources.empty, "[]")
+        assert (Path(folder), content) == (copy.parents[1] / "run", "[]")
         assert (bound, session) == ("True", "False"), "no new privileges, and no session"
         assert not {"A_SECRET", "HOME"} & set(names)
     safe.let_go()
 
 
 def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, certs: Path, tmp_path: Path) -> None:
-    author, worker = Author(safe, write(tmp_path)), hire(safe, certs)
-    author.send(worker.id, 0)
-    safe.results()
-    first = process(worker).pid
-    os.kill(first, signal.SIGKILL)
-    until(lambda: process(worker)._process.ended)
-    author.send(worker.id, 1)
-    assert indices(safe.results()) == [1], "its job is tried once more"
-    pid = process(worker).pid
-    assert pid != first
-    safe.session._tokens.pop().undeclare()
-    until(lambda: not Path(f"/proc/{pid}").exists() and not worker._runners)
+    said = tmp_path / "said"
+    spy = f"""
+import os, sys
+if sys.argv[0].endswith("runner_process.py"):
+    print(os.getpid(), file=open({str(said)!r}, "a"))
+"""
+    with connect((safe.endpoint,), WAIT, lambda: False, find(certs, "learner")) as there:
+        author, worker = Author(safe, write(tmp_path, spy), there=there), hire(safe, certs)
+        author.send(worker.id, 0)
+        safe.results()
+        first = int(said.read_text())
+        os.kill(first, signal.SIGKILL)
+        until(lambda: not alive(first))
+        author.send(worker.id, 1)
+        assert indices(safe.results()) == [1], "its job is tried once more"
+        second = int(said.read_text().split()[-1])
+        assert second != first
+    until(lambda: not Path(f"/proc/{second}").exists())
 
 
 @pytest.mark.parametrize(
@@ -133,11 +155,12 @@ def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, c
     ids=["digest", "size"],
 )
 def test_what_does_not_fit_is_not_run(safe: Stage, certs: Path, tmp_path: Path, sends: bytes, words: str) -> None:
-    author, worker = Author(safe, write(tmp_path), sends=sends), hire(safe, certs)
+    file = write(tmp_path, f"# for {tmp_path} alone\n")
+    author, worker = Author(safe, file, sends=sends), hire(safe, certs)
     author.send(worker.id, 0)
     said = safe.failure()
     assert (said.index, said.error) == (None, words)
-    assert not list(worker._sources._folder.glob("*/*"))
+    assert not kept(file)
 
 
 def test_a_worker_without_accept_code_fetches_none(safe: Stage, certs: Path, tmp_path: Path) -> None:
@@ -151,7 +174,7 @@ def test_a_worker_without_accept_code_fetches_none(safe: Stage, certs: Path, tmp
 
 @pytest.mark.parametrize("name", ["a/pole.py", "..py", "\0.py", "po\nle.py"])
 def test_a_name_that_leads_elsewhere(safe: Stage, certs: Path, tmp_path: Path, name: str) -> None:
-    learner = Learner(safe.session, "r", replace(pole(write(tmp_path)), task=f"{name}:Pole"))
+    learner = Learner(safe.session, "r", replace(spec_of(write(tmp_path)), task=f"{name}:Pole"))
     worker = hire(safe, certs)
     learner.send(worker.id, 0)
     assert "is not a valid name for a file" in safe.failure().error
@@ -170,7 +193,7 @@ def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
         "broken.py cannot be imported: line 4: ModuleNotFoundError: No module named 'nowhere_to_be_found'"
     )
     assert said.traceback == (
-        '  File "broken.py", line 5, in <module>', "    if here: load()", "             ^^^^^^",
+        '  File "broken.py", line 5, in <module>', "    if here: load()",
         '  File "broken.py", line 4, in load', "    import nowhere_to_be_found",
         "ModuleNotFoundError: No module named 'nowhere_to_be_found'",
     )  # fmt: skip
@@ -180,7 +203,7 @@ def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
 
 def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Path, tmp_path: Path) -> None:
     raises = tmp_path / "raises.py"
-    raises.write_text(POLE.replace("return np", "1 / 0\n        return np"))
+    raises.write_text(POLE.replace("return np", "1 / (sim.t < 2)\n        return np"))
     guard = "import sys\nif sys.argv[0].endswith('runner_process.py'): open('pole.xml')\n"
     author, other = Author(safe, raises), Author(safe, write(tmp_path, guard), "other")
     worker = hire(safe, certs)
@@ -190,7 +213,8 @@ def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Pa
     assert said.traceback[0].startswith('  File "raises.py", line 11, in reward')
     other.send(worker.id, 0)
     _, said = safe.next("result of other", kind=type(said))
-    assert said.error.endswith("files beside a class do not travel, but texts that its files() reads do")  # type: ignore[attr-defined]
+    assert said.index is None, "the task cannot be built here"  # type: ignore[attr-defined]
+    assert said.error.endswith("files beside a class do not travel, but those that its xml names do")  # type: ignore[attr-defined]
 
 
 def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,3 +248,42 @@ if sys.argv[0].endswith("runner_process.py"):
 def test_without_certificates_it_is_refused() -> None:
     with pytest.raises(ConfigError, match="--accept-code needs --tls: without certificates anyone could send code"):
         WorkerConfig(accept_code=True)
+
+
+_HOLDS = """
+import time
+from workers.source_cache import SourceCache
+cache = SourceCache()
+print(cache.empty, flush=True)
+time.sleep(1000)
+"""
+
+
+def test_what_a_killed_worker_left_is_deleted_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # of this process; TMPDIR is of the others
+    environment, command = {**os.environ, "TMPDIR": str(tmp_path)}, [sys.executable, "-c", _HOLDS]
+    other = tmp_path / "rolloutfarm-code-link"
+    other.symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").mkdir()
+    with (
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as killed,
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as working,
+    ):
+        try:
+            assert killed.stdout
+            assert working.stdout
+            left, held = (Path(process.stdout.readline().strip()).parent for process in (killed, working))
+            killed.kill()
+            killed.wait()
+            assert left.is_dir()
+            with closing(SourceCache()) as cache:
+                assert cache.empty.is_dir()
+                assert not left.exists()
+                assert held.is_dir(), "its worker is alive"
+                assert other.is_symlink(), "no worker made it"
+        finally:
+            killed.kill()
+            working.kill()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["elsewhere", other.name, held.name])

@@ -10,7 +10,7 @@ from farm.commands import certificates
 from farm.errors import ConfigError
 from workers.__main__ import Process
 from workers.command import WorkerCommand, _flags
-from workers.worker import WorkerConfig
+from workers.config import WorkerConfig
 
 
 def passed_on(config: WorkerConfig) -> Process:
@@ -43,7 +43,10 @@ def test_no_setting_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.touch()
     certificates.main(["new", str(tmp_path / "certs"), "--learner", "localhost", "--worker", "w"])
-    config = WorkerConfig(allow_file=(path,), timeout=1.0, backend="cpu", tls=tmp_path / "certs", accept_code=True)
+    connect = ("tls/localhost:7447",)
+    config = WorkerConfig(
+        connect=connect, allow_file=(path,), timeout=1.0, backend="cpu", tls=tmp_path / "certs", accept_code=True
+    )
     assert passed_on(config).worker == config
     flags = {word.removeprefix("--").replace("-", "_") for word in _flags(WorkerCommand(worker=config))}
     assert {field.name for field in fields(WorkerConfig)} <= flags

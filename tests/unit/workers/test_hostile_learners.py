@@ -9,9 +9,10 @@ import pytest
 from stage import FARM, WAIT, Learner, P, Runner, Stage, at_work, indices, until
 
 from farm.net import codec, keys
-from farm.net.messages import Refusal, WorkRequest
+from farm.net.messages import Refusal
 from farm.net.session import connect
 from farm.sim.engines import CAPACITY
+from workers import inbox
 from workers import worker as workers
 
 
@@ -65,28 +66,24 @@ def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
 
 
 def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_MEMORY", 10_000)
+    monkeypatch.setattr(inbox, "_MEMORY", 10_000)
+    monkeypatch.setattr(workers, "IDLE", 0.05)
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.announce()
     for i in range(20):  # together three times as much, and each of the last ones too much by itself
         header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200 if i < 6 else 2000))
         stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
-    until(lambda: worker._ignored["large"] == 14)
+    stage.asked(lambda want: want.ignored == {"large": 14})
     for i in range(20):
         header = replace(learner.header, run=f"another-{i}", mu=np.ones(200))
         stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
-    until(lambda: "another-19" in worker._runs)
+    stage.asked(lambda want: "another-19" in want.idle)
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1], "what was crowded out is asked for again"
-    kept = [run.header for run in worker._runs.values() if run.header]
-    assert sum(header.mu.nbytes for header in kept) <= 10_000
-    monkeypatch.setattr(workers, "IDLE", 0.0)
-    while True:
-        _, want = stage.next("want")
-        assert isinstance(want, WorkRequest)
-        if want.ignored == {"large": 14}:
-            break
+    kept = [worker.inbox.of(run).header for run in worker.inbox.runs]
+    assert sum(header.mu.nbytes for header in kept if header) <= 10_000
+    stage.asked(lambda want: want.ignored == {"large": 14})
 
 
 def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
@@ -129,16 +126,18 @@ def test_a_false_header_does_not_stall_other_runs(stage: Stage) -> None:
     assert indices(stage.results()) == [2]
 
 
-def test_jobs_of_a_round_that_no_learner_confirms_are_told_of(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+def test_jobs_of_a_round_that_no_learner_confirms_are_told_of(
+    stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "IDLE", 0.05)
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.send(worker.id, 1, round=7)
     until(lambda: "run r sends jobs of a round that its learner does not confirm" in caplog.messages)
-    until(lambda: worker._ignored["stale"] == 1)
+    stage.asked(lambda want: want.ignored == {"stale": 1})
 
 
-def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_ASK", 0.1)
+def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage) -> None:
     over = threading.Event()
     asked: list[str] = []
 
@@ -159,7 +158,7 @@ def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage, monk
         begun = time.monotonic()
         assert indices(stage.results()) == [1]
         assert time.monotonic() - begun < 2.0, "thirty questions were waited for"
-        until(lambda: worker._ignored["stale"] == 30)
+        stage.asked(lambda want: want.ignored == {"stale": 30})
         over.set()
     assert len(asked) < 5
 
@@ -169,7 +168,7 @@ def test_no_more_jobs_are_kept_than_were_asked_for(stage: Stage) -> None:
     most = 8 * CAPACITY
     learner.send(worker.id, *range(10, 10 + most))
     learner.send(worker.id, 3)
-    until(lambda: worker._ignored == {} and len(worker._session.events) == 4)
+    until(lambda: stage.queued == 4)
     Runner.go.set()
     assert [indices(stage.results()) for _ in range(4)] == [[0], [1], [2], [3]]
-    assert worker._ignored == {"large": 1}
+    stage.asked(lambda want: want.ignored == {"large": 1})

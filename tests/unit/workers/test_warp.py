@@ -9,10 +9,12 @@ from farm.arrays import FloatArray
 from farm.errors import FarmError
 from farm.net.work import Jobs
 from farm.policies.networks import Linear
+from farm.policies.recurrent import Cpg, Rnn
 from farm.rollouts import Runner, backend, exact
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
+from farm.tasks.probe import specification
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # compiling takes a minute, once for each machine
 pytest.importorskip("mujoco_warp")
@@ -56,7 +58,7 @@ def runners() -> tuple[Runner, Runner]:
     made = backend("warp")
     assert not exact(made)
     task = Kicked(TaskConfig())
-    policy = Linear(Linear.Config(), task.spec(), {})
+    policy = Linear(Linear.Config(), specification(task), {})
     return Runner(task, policy), Runner(task, policy, made.engine, exact=False)
 
 
@@ -87,6 +89,19 @@ def test_a_rollouts_numbers_do_not_depend_on_the_others(runners: tuple[Runner, R
     alone = gpu.rollouts(theta[2:3], [drawn[2]])
     assert np.array_equal(permuted.returns, together.returns[order])
     assert np.array_equal(alone.frames["qpos"][0], together.frames["qpos"][2])
+
+
+def test_a_policy_with_memory_acts_alike(runners: tuple[Runner, Runner]) -> None:
+    cpu, gpu = runners
+    drawn = [seeds.trial(0, i) for i in range(ROWS)]
+    for policy in (Rnn(Rnn.Config(units=3), cpu.spec, {}), Cpg(Cpg.Config(frequency=3.0), cpu.spec, {})):
+        theta = 0.5 * np.random.default_rng(0).standard_normal((ROWS, policy.size))
+        with pytest.MonkeyPatch.context() as patched:
+            for each in runners:
+                patched.setattr(each, "policy", policy)
+            expected, got = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)
+        np.testing.assert_allclose(got.actions, expected.actions, atol=1e-3)
+        assert np.ptp(got.actions, axis=1).min() > 1e-3
 
 
 def test_the_mean_and_what_is_shown_are_the_processors(runners: tuple[Runner, Runner]) -> None:

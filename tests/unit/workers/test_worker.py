@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made import pole, spec_of
 from stage import BEGINNING, FARM, WAIT, Learner, Runner, Stage, at_work, indices, until
 
 from farm import plugins
 from farm.errors import ConfigError
 from farm.net import codec, keys
-from farm.net.messages import Refusal, Spec, WorkRequest
+from farm.net.messages import Refusal, WorkRequest
 from farm.net.session import connect
 from farm.net.work import Results
-from farm.rollouts import SIMULATION
 from farm.sim.engines import CAPACITY
 from workers import worker as workers
-from workers.worker import WorkerConfig
+from workers.config import WorkerConfig
 
 
 @pytest.mark.parametrize("_", range(3))
@@ -57,7 +57,7 @@ def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
     learner.header = replace(learner.header, round=3)
     learner.announce()
     learner.send(worker.id, 3)
-    until(lambda: len(worker._session.events) == 4)
+    until(lambda: stage.queued == 4)
     Runner.go.set()
     assert [(indices(said), said.round) for said in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
 
@@ -73,7 +73,7 @@ def test_two_runs_in_turn(stage: Stage) -> None:
     for learner, sent in zip(learners, ((1, 2), (0, 1, 2)), strict=True):
         for index in sent:
             learner.send(worker.id, index)
-    until(lambda: len(worker._session.events) == 5)
+    until(lambda: stage.queued == 5)
     Runner.go.set()
     answers = [stage.results("a", "b") for _ in range(6)]
     assert Runner.ran == ["a", "b", "a", "b", "a", "b"]
@@ -81,14 +81,15 @@ def test_two_runs_in_turn(stage: Stage) -> None:
     assert Runner.made == ["a", "b"]
 
 
-def test_a_learner_that_leaves_takes_its_work_along(stage: Stage) -> None:
-    learner = Learner(stage.session, "r")
-    worker = stage.hire()
-    learner.send(worker.id, 0)
-    stage.results()
-    assert list(worker._runs) == ["r"]
-    stage.session._tokens.pop().undeclare()
-    until(lambda: not worker._runs)
+def test_a_learner_that_leaves_takes_its_work_along(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "IDLE", 0.05)
+    with connect((stage.endpoint,), WAIT, lambda: False) as there:
+        learner = Learner(stage.session, "r", there=there)
+        worker = stage.hire()
+        learner.send(worker.id, 0)
+        stage.results()
+        stage.asked(lambda want: want.idle == ("r",))
+    stage.asked(lambda want: want.idle == ())
 
 
 def test_an_idle_worker_says_so(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,7 +117,7 @@ def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
 
 def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
     learner, worker = at_work(stage)
-    until(lambda: len(worker._session.events) == 2)
+    until(lambda: stage.queued == 2)
     stage.let_go()
     Runner.go.set()
     said: list[object] = []
@@ -148,8 +149,12 @@ def test_a_task_it_does_not_know(stage: Stage, caplog: pytest.LogCaptureFixture)
 def test_a_task_it_cannot_build(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
     learner = Learner(stage.session, "r", replace(BEGINNING, task="broken"))
     worker = stage.hire()
-    learner.send(worker.id, 0)
-    assert stage.failure().error == "RuntimeError: no such machine"
+    for _ in range(2):
+        learner.send(worker.id, 0, 1)
+        said = stage.failure()
+        assert said.index is None, "it is not the job"
+        assert said.error == "RuntimeError: no such machine"
+    assert learner.asked["spec"] == 1
     assert caplog.messages[0].startswith("cannot serve run r: no such")
     assert caplog.records[0].exc_info is None, "its learner shows the traceback"
 
@@ -189,6 +194,7 @@ def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixtur
     for _ in range(3):
         refusal = codec.encode(Refusal(run="r", reason="its machine\nrounds"))
         stage.session.publish(keys.refused(FARM, worker.id), refusal)
+    until(lambda: caplog.messages)  # each subscription has a thread of its own: jobs may overtake refusals
     learner.send(worker.id, 0)
     stage.results()
     assert caplog.messages == ["run r does not take this worker: its machine rounds"]
@@ -196,42 +202,16 @@ def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixtur
 
 # ---------------------------------------------------------------- classes in files
 
-POLE = """
-import numpy as np
-import farm
-
-class Pole(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
-    steps = 4
-
-    def reward(self, sim, action):
-        return np.cos(sim.qpos[:, 0])
-"""
-
-
-def pole(file: Path) -> Spec:
-    """A learner's specification of the task in that file."""
-    found, policy = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", "kernel")
-    code = {"task": found.digest(), "policy": policy.digest(), "simulation": plugins.code_digest(SIMULATION)}
-    files = {"model.xml": found.target.xml}
-    return replace(BEGINNING, task=found.wire, policy="kernel", code=code, files=files)
-
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    path = tmp_path / "pole.py"
-    path.write_text(POLE)
-    return path
+    return pole(tmp_path)
 
 
 def test_a_class_in_an_allowed_file_is_served(real: Stage, file: Path, tmp_path: Path) -> None:
-    learner = Learner(real.session, "r", pole(file))
+    learner = Learner(real.session, "r", spec_of(file))
     learner.header = replace(learner.header, mu=np.ones(2))
-    here = tmp_path / "elsewhere" / "pole.py"
-    here.parent.mkdir()
-    here.write_text(POLE)
-    worker = real.hire(allow_file=(here,))
+    worker = real.hire(allow_file=(pole(tmp_path / "elsewhere"),))
     learner.send(worker.id, 0, 1)
     returns = real.results().returns
     assert len(returns) == 2
@@ -239,7 +219,7 @@ def test_a_class_in_an_allowed_file_is_served(real: Stage, file: Path, tmp_path:
 
 
 def test_a_class_in_another_file_is_refused(real: Stage, file: Path) -> None:
-    learner = Learner(real.session, "r", pole(file))
+    learner = Learner(real.session, "r", spec_of(file))
     worker = real.hire()
     learner.send(worker.id, 0)
     said = real.failure()
@@ -268,7 +248,7 @@ def test_a_worker_of_another_farm_hears_which_there_are(
     learner = Learner(real.session, "r")
     learner.announce()
     with connect((real.endpoint,), WAIT, lambda: False) as session:
-        worker = workers.Worker(workers.WorkerConfig(connect=(real.endpoint,), farm="elsewhere", name="w"), session)
+        worker = workers.Worker(WorkerConfig(connect=(real.endpoint,), farm="elsewhere", name="w"), session)
         worker.join()
         until(lambda: (worker.turn(), caplog.messages)[1])
     assert caplog.messages == [f"no learner on farm elsewhere; learners are on {FARM}: see --farm"]

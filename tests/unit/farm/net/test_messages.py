@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made import stats
+from wire import pack
 
 from farm.errors import MessageError
 from farm.net import codec
 from farm.net.messages import Refusal, Spec, WorkRequest
-from farm.net.telemetry import Line, RunEnd, RunHistory, RunReport, RunStatus, Trace, WorkerStatus
-from farm.net.work import RATES, Chunk, Failure, Jobs, Results, RoundHeader, Simulated, WireTrajectory, traced
+from farm.net.telemetry import Line, Report, RunEnd, RunHistory, RunStatus, WorkerStatus
+from farm.net.work import RATES, Chunk, Failure, Jobs, Results, RoundHeader, Simulated, traced
 from farm.sim.trajectory import Trajectory
 
 RNG = np.random.default_rng(0)
 P = 16
+STATS = stats(2, baseline=None, mean_policy_success=None, success_rate=None)
 HEAD = {"run": "run-1", "incarnation": "ab12", "round": 7}
 SHAPES = {"bodies": (3, 7), "actions": (2,), "terms": (2,), "channels/force": (3,), "channels/images": (2, 3, 4)}
 
@@ -33,10 +36,10 @@ def trajectory(frames=4, **changes):
         "value": -5.4,
         "success": True,
     }
-    return Trajectory(**(values | changes))
+    return Trajectory.of(**(values | changes))
 
 
-WIRE = WireTrajectory.of(trajectory())
+WIRE = trajectory()
 EPS = RNG.normal(size=(3, P))
 SEEDS = [(7, 2**32 - 1, 0, 5), (1, 2, 3, 4), (0, 0, 0, 0)]
 JOBS = Jobs.joined(
@@ -50,18 +53,16 @@ TABLE = JOBS.table
 
 
 def report(**changes):
-    trace = np.zeros((1, 15, 6), "<f4")
+    trace = np.zeros((15, 6), "<f4")
     values = {
-        "run": "r",
         "incarnation": "i",
-        "generation": 2,
-        "progress": {"generation": 2, "baseline": None, "best": -0.5},
+        "progress": STATS,
         "rate": 300.0,
         "lines": (Line(level="INFO", text="worker w joined"),),
-        "traces": (Trace(name="best", values=trace), Trace(name="all", values=np.repeat(trace, 4, axis=0))),
+        "traces": {"best": trace, "all": np.repeat(trace[None], 4, axis=0)},
         "sample": WIRE,
     }
-    return RunReport(**(values | changes))
+    return Report(**(values | changes))
 
 
 MESSAGES = {
@@ -111,7 +112,7 @@ MESSAGES = {
     ),
     "failure of all": Failure(**HEAD, worker="host/a1", index=None, error="not served"),
     "report": report(),
-    "report of statistics": report(traces=(), sample=None, lines=()),
+    "report of statistics": report(traces={}, sample=None, lines=()),
     "history": RunHistory(
         run="r", incarnation="i", recording="first", config={"seed": 0}, files={"model.xml": "<mujoco/>"},
         generation=2, reports=(report(), report()),
@@ -121,7 +122,7 @@ MESSAGES = {
         run="r", incarnation="i", recording="r", config={}, files={}, generation=0, reports=(), end=None
     ),
     "trajectory": WIRE,
-    "trajectory of one frame": WireTrajectory.of(trajectory(frames=1, success=None, channels={})),
+    "trajectory of one frame": trajectory(frames=1, success=None, channels={}),
 }  # fmt: skip
 
 
@@ -280,7 +281,7 @@ def test_values_that_make_no_sense_are_refused(name, change):
     packed = {key: list(value) if isinstance(value, tuple) else value for key, value in change.items()}
     plain = msgpack.unpackb(codec.encode(message), ext_hook=msgpack.ExtType) | packed
     with pytest.raises(MessageError, match=f"^{type(message).__name__}[:.]"):
-        codec.decode(msgpack.packb(plain, default=codec._pack), type(message))
+        codec.decode(pack(plain), type(message))
 
 
 @pytest.mark.parametrize(("name", "field"), [("refusal", "reason"), ("results", "worker"), ("spec", "task")])
@@ -295,7 +296,7 @@ def test_texts_have_an_end(name, field):
 )  # fmt: skip
 def test_traces_that_make_no_sense_are_refused(name, shape):
     with pytest.raises(ValueError, match="traces "):
-        Trace(name=name, values=np.zeros(shape, "<f4"))
+        report(traces={name: np.zeros(shape, "<f4")})
 
 
 # ---------------------------------------------------------------- jobs
@@ -339,8 +340,11 @@ def test_some_jobs_are_the_same_jobs(chosen):
 
 
 def test_results_carry_the_jobs_indices():
-    given_ = Simulated(np.arange(3.0), np.zeros((3, 4), bool), np.ones(3, "<i8"), np.zeros((0, 0, 0), "<f4"), (WIRE,))
-    made = Results.carrying(given_, JOBS.take([1, 3]), **HEAD, worker="w/1")
+    given_ = Simulated(
+        returns=np.arange(3.0), flags=np.zeros((3, 4), bool), steps=np.ones(3, "<i8"),
+        traces=np.zeros((0, 0, 0), "<f4"), trajectories=(WIRE,),
+    )  # fmt: skip
+    made = Results.carrying(given_, JOBS.take([1, 3]), 0.5, **HEAD, worker="w/1")
     assert codec.decode(codec.encode(made), Results).jobs.tolist() == [1, 3]
 
 
@@ -363,20 +367,20 @@ def test_traces_of_the_best_and_the_worst(returns, expected):
 
 def test_a_trajectory_comes_back_to_single_precision():
     sent = trajectory()
-    back = codec.decode(codec.encode(WireTrajectory.of(sent)), WireTrajectory).trajectory()
+    back = codec.decode(codec.encode(sent), Trajectory)
     assert (back.value, back.success, back.times.tolist()) == (sent.value, sent.success, sent.times.tolist())
     assert list(back.arrays()) == list(sent.arrays())
     for name, values in back.arrays().items():
-        assert values.dtype == np.float64
-        np.testing.assert_array_equal(sent.arrays()[name].astype("f4").astype("f8"), values)
+        assert values.dtype == np.float32
+        np.testing.assert_array_equal(sent.arrays()[name], values)
 
 
 @pytest.mark.parametrize("bad", [np.inf, -np.inf, 1e300, -1e300, np.nan])
 def test_a_trajectory_of_overflowing_numbers_can_be_sent(bad):
     values = np.zeros((4, 2))
     values[2, 1] = bad
-    payload = codec.encode(WireTrajectory.of(trajectory(terms=values, channels={"force": values})))
-    back = codec.decode(payload, WireTrajectory).trajectory()
+    payload = codec.encode(trajectory(terms=values, channels={"force": values}))
+    back = codec.decode(payload, Trajectory)
     for shown in (back.terms, back.channels["force"]):
         assert shown[2, 1] == np.float32(1e30 if bad > 0 else -1e30)
         assert not shown[:2].any()
@@ -392,7 +396,7 @@ def test_a_trajectory_fits_its_runs_task_or_not(name, width):
     assert not WIRE.fits({name: shape for name, shape in SHAPES.items() if name != "channels/force"})
     values, (kind, _, channel) = np.zeros((4, *width), "<f4"), name.partition("/")
     change = {"channels": WIRE.channels | {channel: values}} if channel else {kind: values}
-    other = codec.decode(codec.encode(dataclasses.replace(WIRE, **change)), WireTrajectory)
+    other = codec.decode(codec.encode(dataclasses.replace(WIRE, **change)), Trajectory)
     assert other.fits(SHAPES | {name: width})
     assert not other.fits(SHAPES)
 

@@ -9,7 +9,7 @@ import pytest
 from farm.errors import MessageError
 from farm.net import codec
 from farm.net.stats import GenerationStats
-from farm.net.telemetry import RunEnd, RunHistory, RunReport, RunStatus, WorkerStatus
+from farm.net.telemetry import RunEnd, RunHistory, RunStatus, WorkerStatus
 
 WORKER: Any = {
     "worker": "w/1", "host": "h", "cores": 1, "version": "1", "canary": "c", "rollouts": 1, "rate": 1.0, "seen": 1.0,
@@ -43,7 +43,6 @@ def test_a_timestamp_among_counts() -> None:
 def test_tables_are_as_json_has_them(value: object) -> None:
     table: dict[str, Any] = {}
     forged = (
-        RunReport(run="r", incarnation="i", generation=1, progress=table, rate=1.0),
         RunEnd(summary=table, lines=(), best=None, best_generation=0, mean=None),
         RunHistory(run="r", incarnation="i", recording="r", config=table, files={}, generation=0, reports=(), end=None),
     )

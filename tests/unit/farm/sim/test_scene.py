@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from farm.errors import ConfigError
-from farm.sim.scene import Scene, compiled
+from farm.sim.model_files import compiled
+from farm.sim.scene import Scene
 
 MJCF = """
 <mujoco>

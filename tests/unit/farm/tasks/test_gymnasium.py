@@ -124,6 +124,15 @@ def test_what_cannot_be_learnt_is_one_line(name, line):
     assert "\n" not in str(said.value)
 
 
+def test_an_environment_that_fails_without_a_word_is_said_to_fail_where(monkeypatch):
+    def refuses(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr(gymnasium, "make", refuses)
+    with pytest.raises(ConfigError, match=r"^task gym:Hand-v1: AssertionError in test_gymnasium.py, line \d+: raise"):
+        make("Hand-v1")
+
+
 @pytest.mark.parametrize(
     "name", ["os:Swimmer-v5", "antigravity:Reacher-v5", "Swimmer", "Swimmer-v", "a/b/c-v1", "x-v1\n"]
 )

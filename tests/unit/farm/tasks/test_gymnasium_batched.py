@@ -67,9 +67,9 @@ def test_every_step_is_the_environments(name: str, own: tuple[str, ...]) -> None
         for at, row in enumerate(list(going)):
             action = actions[at].astype(np.float32)
             seen[row], reward, terminated, *_ = envs[row].step(action)
-            assert batch._terms is not None
-            assert batch._terms[row, t, 0] == pytest.approx(reward, rel=0, abs=1e-9)
-            assert batch._frames["qpos"][row, t].tolist() == envs[row].unwrapped.data.qpos.tolist()
+            assert batch.terms is not None
+            assert batch.terms[row, t, 0] == pytest.approx(reward, rel=0, abs=1e-9)
+            assert batch.frames["qpos"][row, t].tolist() == envs[row].unwrapped.data.qpos.tolist()
             if terminated:
                 going.remove(row)
         assert batch.active.tolist() == going

@@ -7,8 +7,9 @@ import pytest
 from farm.errors import ConfigError
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, GRIPS, JOINTS, LOWER, TIP_RADIUS, UPPER
+from farm.tasks.finger_gait.holding import TIMESTEP
 from farm.tasks.finger_gait.model import CONTACT_WIDTH, CONTACTS
-from farm.tasks.finger_gait.task import TIMESTEP, FingerGait, FingerGaitConfig
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 
 BENT = np.array([0.47, 1.09, 0.88, 0.48, 1.11, 0.88, 0.70, 0.86])
 LINKS = {  # kg: base, proximal, medial, distal with its tip
@@ -163,12 +164,11 @@ OFFSETS = {  # of each body in its parent [m]
 }
 
 
-@pytest.mark.parametrize("name", OFFSETS)
-def test_links_are_as_long_as_the_hands(scene, name):
-    parent, offset = OFFSETS[name]
-    body = scene.model.body(name)
-    assert scene.model.body(body.parentid[0]).name == parent
-    np.testing.assert_allclose(body.pos, offset, atol=1e-12)
+def test_links_are_as_long_as_the_hands(scene):
+    for name, (parent, offset) in OFFSETS.items():
+        body = scene.model.body(name)
+        assert scene.model.body(body.parentid[0]).name == parent, name
+        np.testing.assert_allclose(body.pos, offset, atol=1e-12, err_msg=name)
 
 
 def test_tips_are_as_far_out_as_the_hands(scene):

@@ -48,6 +48,12 @@ def test_a_valid_one_passes_through():
     assert algorithms.tell(Plain(), state, eps, np.zeros((3, 1))).generation == 1
 
 
+def test_a_start_is_added_to_the_first_mean():
+    start = np.arange(4.0)
+    assert algorithms.begin(Plain(), SIZE, start).mu.tolist() == start.tolist()
+    assert algorithms.begin(Plain(), SIZE).mu.tolist() == [0.0] * SIZE
+
+
 @pytest.mark.parametrize(
     ("methods", "line"),
     [

@@ -1,4 +1,4 @@
-"""SNES, ARS, CMA-ES and sep-CMA: compared with plain versions of their equations, and resumed."""
+"""SNES, ARS, ES, CMA-ES and sep-CMA: compared with plain versions of their equations, and resumed."""
 
 import builtins
 import math
@@ -7,18 +7,21 @@ from typing import Any
 import cmaes
 import numpy as np
 import pytest
+from made import checkpoint
 
 from farm import plugins
 from farm.errors import ConfigError
-from farm.net import codec
 from learner.algorithms import Diverged, SearchState
 from learner.algorithms.ars import ARS
 from learner.algorithms.cma import CMAES, CMAState, SepCMA
+from learner.algorithms.es import ES
 from learner.algorithms.snes import SNES, utilities
+from learner.run.checkpoint import load, save
 
 OTHERS: dict[str, Any] = {
     "snes": SNES(pairs=6),
     "ars": ARS(pairs=6, top=3, learning_rate_mu=0.1, initial_sigma=0.1),
+    "es": ES(pairs=6, learning_rate_mu=0.1),
     "cma-es": CMAES(population=8),
     "sep-cma": SepCMA(population=8),
 }
@@ -59,13 +62,13 @@ def test_it_is_chosen_by_its_name_and_climbs(name):
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_a_state_goes_through_a_checkpoint_to_the_same_bits(name):
+def test_a_state_goes_through_a_checkpoint_to_the_same_bits(name, tmp_path):
     algorithm = OTHERS[name]
     whole = learnt(algorithm, algorithm.init(P), 0, 6)
     half = learnt(algorithm, algorithm.init(P), 0, 3)
     before = bits(half)
-    packed = codec.msgpack.packb(half.to_dict(), default=codec._pack)  # as a checkpoint stores it
-    back = algorithm.restore(codec.msgpack.unpackb(packed, ext_hook=codec._unpack))
+    save(tmp_path / "checkpoint", checkpoint(state=half.to_dict()))
+    back = algorithm.restore(load(tmp_path / "checkpoint").state)
     assert bits(learnt(algorithm, back, 3, 6)) == bits(whole)
     assert bits(half) == before, "asked and told, a state stays as it is"
     assert not whole.mu.flags.writeable
@@ -98,7 +101,7 @@ def test_returns_may_be_shifted_and_scaled(name):
     np.testing.assert_allclose(other.sigma, plain.sigma, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["snes", "ars"])
+@pytest.mark.parametrize("name", ["snes", "ars", "es"])
 def test_equal_returns_move_no_mean(name):
     algorithm = OTHERS[name]
     state = algorithm.init(P)
@@ -146,6 +149,51 @@ def test_ars_as_written():
     assert after.sigma.tolist() == [0.1] * P
 
 
+def test_es_as_written():
+    algorithm = ES(pairs=6, learning_rate_mu=0.1, initial_sigma=0.2, weight_decay=0.3)
+    state, mu, m, v = algorithm.init(P), np.zeros(P), np.zeros(P), np.zeros(P)
+    for t in range(1, 5):
+        state, eps, returns = generation(algorithm, state, t)
+        ranks = np.empty(12)
+        ranks[np.argsort(returns.ravel())] = np.arange(12) / 11 - 0.5
+        g = sum((ranks[2 * n] - ranks[2 * n + 1]) * eps[n] / 0.2 for n in range(6)) / (2 * 6 * 0.2) - 0.3 * mu
+        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g**2
+        mu = mu + 0.1 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
+        np.testing.assert_allclose(state.mu, mu, rtol=1e-10)
+    assert state.sigma.tolist() == [0.2] * P
+
+
+def test_es_sees_only_the_order_of_returns():
+    algorithm = OTHERS["es"]
+    state = learnt(algorithm, algorithm.init(P), 0, 2)
+    values = (sphere, lambda x: 8.0 * sphere(x) - 64.0, lambda x: np.exp(sphere(x) / 20.0))
+    one, *others = (generation(algorithm, state, 4, value)[0] for value in values)
+    for other in others:
+        assert {**bits(other), "best": 0} == {**bits(one), "best": 0}
+
+
+def test_the_weight_decay_of_es_pulls_to_zero():
+    told = {}
+    for decay in (0.0, 0.1):
+        algorithm = ES(pairs=6, initial_mu=2.0, weight_decay=decay)
+        state = algorithm.init(P)
+        for seed in range(100):
+            eps = algorithm.ask(state, np.random.default_rng(seed))
+            state = algorithm.tell(state, eps, np.zeros((6, 2)))
+        told[decay] = state.mu
+    assert told[0.0].tolist() == [2.0] * P
+    assert np.abs(told[0.1]).max() < 0.5
+
+
+def test_es_needs_its_memory():
+    values = ES().init(P).to_dict()
+    for name in ("first_moment", "second_moment"):
+        with pytest.raises(ValueError, match=f"state: {name} must have mu's size 5, it is empty"):
+            ES().restore({**values, name: np.empty(0)})
+    with pytest.raises(ValueError, match="state: missing first_moment, second_moment"):
+        ES().restore(ARS().init(P).to_dict())
+
+
 def test_ars_uses_no_more_directions_than_there_are():
     with pytest.raises(ConfigError, match=r"top is 5; expected 1 to 4 \(pairs\)"):
         ARS(pairs=4, top=5)
@@ -166,7 +214,8 @@ def test_cma_is_the_librarys_own_object_that_lives_on(name, kind):
         alive.ask()
         alive.tell([(before.mu + row, -value) for row, value in zip(eps, returns[:, 0], strict=True)])
         np.testing.assert_allclose(state.mu, alive.mean, rtol=1e-9, atol=1e-12)
-    variances = alive._C if name == "sep-cma" else np.diag(alive._C)
+    covariance = alive._C
+    variances = np.diag(covariance) if covariance.ndim == 2 else covariance
     np.testing.assert_allclose(state.sigma, alive._sigma * np.sqrt(variances), rtol=1e-9)
     assert isinstance(state, CMAState)
     samples = algorithm.ask(state, np.random.default_rng(0))

@@ -1,42 +1,24 @@
 """PGPE where its equations are undefined: division by zero, values that are not finite, bounds of sigma and speed."""
 
-import dataclasses
-import itertools
 import math
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pgpe_cases import ALL, CHOICES, cases, name_of, sample, state_of
 
 from learner.algorithms import PGPE, Diverged
-
-CHOICES = {name: get_args(hint) for name, hint in get_type_hints(PGPE).items() if get_args(hint)}
-COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
-
-
-def state_of(config, mu, sigma, **others):
-    empty = config.init(len(mu))
-    return dataclasses.replace(empty, mu=np.array(mu), sigma=np.array(sigma), **others)
-
-
-def sample(seed, config, size=3):
-    """Return a state in the middle of a run, eps and returns."""
-    rng = np.random.default_rng(seed)
-    state = dataclasses.replace(config.init(size), best=1.5, baseline=-3.0, generation=4)
-    return state, config.ask(state, rng), rng.normal(-4.0, 3.0, config.returns_shape)
-
 
 # Without a baseline single rollouts always move mu.
 STILL = [
     choices
-    for choices in COMBINATIONS
+    for choices in ALL
     if (choices["estimator"], choices["baseline"], choices["shaping"]) != ("plain", "none", "raw")
 ]
 
 
-@pytest.mark.parametrize("choices", STILL, ids=lambda c: "-".join(c.values()))
+@pytest.mark.parametrize("choices", cases(of=STILL), ids=name_of)
 def test_equal_returns_move_no_mu(choices):
     config = PGPE(**choices)
     state = config.init(4)
@@ -155,7 +137,7 @@ def test_a_wrong_shape_is_refused(estimator):
         config.tell(state, eps[:, :-1], returns)
 
 
-@pytest.mark.parametrize("choices", COMBINATIONS, ids=lambda c: "-".join(c.values()))
+@pytest.mark.parametrize("choices", cases(), ids=name_of)
 def test_an_overflow_is_diverged_or_finite_and_leaves_the_state(choices):
     config = PGPE(learning_rate_mu=1e300, learning_rate_sigma=1e300, **choices)
     state, eps, returns = sample(0, config)

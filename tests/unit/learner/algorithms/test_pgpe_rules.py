@@ -1,25 +1,17 @@
 """PGPE: examples computed by hand, invariances of the update, and a test that it learns."""
 
 import dataclasses
-import itertools
 import math
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pgpe_cases import ALL, CHOICES, sample, state_of
 
 from learner.algorithms import PGPE
 
-CHOICES = {name: get_args(hint) for name, hint in get_type_hints(PGPE).items() if get_args(hint)}
-COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 MODERN = {"shaping": "ranks", "sigma_rule": "capped", "optimiser": "clipup"}
-
-
-def state_of(config, mu, sigma, **others):
-    empty = config.init(len(mu))
-    return dataclasses.replace(empty, mu=np.array(mu), sigma=np.array(sigma), **others)
 
 
 @pytest.mark.parametrize(("normaliser", "contrast"), [("sehnke", 8 / 10), ("thesis", 8 / 11)])
@@ -77,13 +69,6 @@ def test_optimal_baseline_by_brute_force():
     assert config.tell(state, eps, returns).baseline == pytest.approx(wanted, rel=1e-6)
 
 
-def sample(seed, config, size=3):
-    """Return a state in the middle of a run, eps and returns."""
-    rng = np.random.default_rng(seed)
-    state = dataclasses.replace(config.init(size), best=1.5, baseline=-3.0, generation=4)
-    return state, config.ask(state, rng), rng.normal(-4.0, 3.0, config.returns_shape)
-
-
 @settings(deadline=None)
 @given(
     seed=st.integers(0, 2**32),
@@ -103,7 +88,7 @@ def test_shift_and_scale_of_all_returns_change_nothing(seed, scale, shift, estim
 
 
 @settings(deadline=None)
-@given(seed=st.integers(0, 2**32), choices=st.sampled_from(COMBINATIONS))
+@given(seed=st.integers(0, 2**32), choices=st.sampled_from(ALL))
 def test_a_mirrored_pair_is_the_same_pair(seed, choices):
     config = PGPE(**{**choices, "estimator": "symmetric"}, learning_rate_mu=1e-3)
     state, eps, returns = sample(seed, config)
@@ -118,7 +103,7 @@ def test_a_mirrored_pair_is_the_same_pair(seed, choices):
 
 
 @settings(deadline=None)
-@given(seed=st.integers(0, 2**32), choices=st.sampled_from(COMBINATIONS))
+@given(seed=st.integers(0, 2**32), choices=st.sampled_from(ALL))
 def test_the_order_of_the_rows_does_not_matter(seed, choices):
     config = PGPE(**choices, learning_rate_mu=1e-3, learning_rate_sigma=1e-3)
     state, eps, returns = sample(seed, config)

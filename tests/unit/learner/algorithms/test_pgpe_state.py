@@ -1,29 +1,18 @@
 """PGPE's state and configuration: frozen, checked, the same after a checkpoint."""
 
 import dataclasses
-import itertools
 import math
 import re
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
+from pgpe_cases import CHOICES, cases, name_of, sample
 
 from farm.errors import ConfigError
 from learner.algorithms import PGPE, PGPEState
 
-CHOICES = {name: get_args(hint) for name, hint in get_type_hints(PGPE).items() if get_args(hint)}
-COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 
-
-def sample(seed, config, size=3):
-    """Return a state in the middle of a run, eps and returns."""
-    rng = np.random.default_rng(seed)
-    state = dataclasses.replace(config.init(size), best=1.5, baseline=-3.0, generation=4)
-    return state, config.ask(state, rng), rng.normal(-4.0, 3.0, config.returns_shape)
-
-
-@pytest.mark.parametrize("choices", COMBINATIONS, ids=lambda c: "-".join(c.values()))
+@pytest.mark.parametrize("choices", cases(), ids=name_of)
 def test_the_state_passed_in_is_never_changed(choices):
     config = PGPE(**choices)
     state, eps, returns = sample(0, config)

@@ -10,8 +10,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from farm.arrays import AnyArray
-from farm.net.stats import GenerationStats
-from farm.sim.scene import Scene, compiled
+from farm.sim.model_files import compiled
+from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import Channel, TaskSpec, flat
 from learner.recording.drawing import Drawing
@@ -79,21 +79,6 @@ def start(tmp_path: Path, scene: Scene, spec: TaskSpec) -> Callable[..., Recorde
 
 
 @pytest.fixture
-def stats() -> Callable[..., GenerationStats]:
-    def make(generation: int = 1, **others: Any) -> GenerationStats:
-        numbers: dict[str, Any] = {
-            "generation": generation, "rollouts": 30 * generation, "return_mean": -5.0 + 0.1 * generation,
-            "return_min": -40.0, "return_max": -1.0, "return_std": 2.0, "best": -0.5, "baseline": -5.0,
-            "mean_policy_return": -4.0, "mean_policy_success": False, "success_rate": 0.25, "sigma_mean": 2.0,
-            "sigma_min": 1.0, "sigma_max": 3.0, "mean_norm": 8.0, "ended": 2, "failed": 0, "clamped": 0, "reissued": 1,
-            "workers": 3, "seconds": 1.0,
-        }  # fmt: skip
-        return GenerationStats(**{**numbers, **others})
-
-    return make
-
-
-@pytest.fixture
 def rollout(scene: Scene, spec: TaskSpec) -> Callable[..., Trajectory]:
     """Make a rollout of the task; without touch in the first half of its frames."""
 
@@ -105,7 +90,7 @@ def rollout(scene: Scene, spec: TaskSpec) -> Callable[..., Trajectory]:
         if channels:
             channels["touch/state"] = np.tile(np.arange(frames)[:, None] >= frames // 2, 2) * 1.0
             channels["touch/push"][: frames // 2, :, 3:] = 0.0
-        return Trajectory(
+        return Trajectory.of(
             times=np.arange(frames) * step, bodies=scene.poses(qpos), actions=rng.normal(size=(frames, spec.action)),
             terms=rng.normal(size=(frames, len(spec.terms))), channels=channels, value=-3.25,
             success=True if spec.success else None,
@@ -124,6 +109,10 @@ def traces(rollout: Callable[..., Trajectory], spec: TaskSpec) -> Callable[..., 
     return make
 
 
+def _breaks(values: list[Any]) -> bool:
+    return bool(values) and all(isinstance(value, float) and np.isnan(value) for value in values)
+
+
 class Rows:
     """What a file holds, by entity."""
 
@@ -136,14 +125,21 @@ class Rows:
                 self.static.add(chunk.entity_path)
 
     def column(self, entity: str, name: str) -> list[Any]:
-        """Return a column's values in the order of sim_time."""
+        """Return a column's values in the order of sim_time, without the rows that break curves."""
+        return [value for _, value in self._rows(entity, name) if np.ndim(value) != 1 or not _breaks(value)]
+
+    def breaks(self, entity: str) -> list[int]:
+        """Return the sim_time [ns] at which an entity's curves are broken."""
+        return [time for time, value in self._rows(entity, "scalars") if _breaks(value)]
+
+    def _rows(self, entity: str, name: str) -> list[tuple[int, Any]]:
         rows = []
         for batch in self.batches[entity]:
             found = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
             if found and "sim_time" in batch.schema.names:
                 times = batch.column("sim_time").cast("int64").to_pylist()
                 rows += zip(times, batch.column(found[0]).to_pylist(), strict=True)
-        return [value for _, value in sorted(rows, key=lambda row: row[0]) if value is not None]
+        return [row for row in sorted(rows, key=lambda row: row[0]) if row[1] is not None]
 
     def fixed(self, entity: str, name: str) -> Any:
         """Return a static value."""

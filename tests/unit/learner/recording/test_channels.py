@@ -5,10 +5,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from made import report, stats
 from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
-from farm.sim.scene import Geometry, Scene, compiled
+from farm.sim.model_files import compiled
+from farm.sim.scene import MODEL, Geometry, Scene
+from farm.sim.trajectory import Trajectory, joined
 from farm.tasks.base import Camera, Channel, TaskSpec
 from learner.recording.blueprint import Eye
 from learner.recording.channels import ChannelDrawing, changes, title
@@ -18,10 +21,10 @@ from learner.recording.solids import ENDLESS, rotate, solid
 
 
 @pytest.fixture
-def written(start, rollout, stats, read):
+def written(start, rollout, read):
     shown = rollout(7)  # it ended early
     recorder = start()
-    recorder.generation(stats(), shown, {}, rate=1.0)
+    recorder.generation(report(stats(), shown))
     recorder.close()
     return shown, read()
 
@@ -120,13 +123,13 @@ def test_points_are_coloured_by_value(written):
     np.testing.assert_array_equal(rows.column("/world/goals", "colors"), ramp(values[..., 3], 4.0))
 
 
-def test_a_task_without_channels_has_bodies_actions_and_reward(start, rollout, stats, read, plain):
+def test_a_task_without_channels_has_bodies_actions_and_reward(start, rollout, read, plain):
     recorder = start(spec=plain)
     unknown = {"mean_policy_success": None, "success_rate": None}
-    recorder.generation(stats(**unknown), rollout(spec=plain), {}, rate=1.0)
+    recorder.generation(report(stats(**unknown), rollout(spec=plain)))
     recorder.close()
     rows = read()
-    moving = {"/world/ball", "/world/arm", "/world/caption", "/reward/terms", "/actions"}
+    moving = {"/world/ball", "/world/arm", "/world/caption", "/world/view", "/reward/terms", "/actions"}
     assert {entity for entity in rows.batches if len(rows.times(entity)) == 16} == moving
     assert "/learning/success" not in rows.batches
 
@@ -142,7 +145,7 @@ def test_the_eye_is_the_cameras_or_beside_what_moves(scene):
     eye = Eye.of(scene, Camera(lookat=(1, 2, 3), distance=2.0, azimuth=90.0, elevation=-30.0))
     assert (eye.target.tolist(), eye.tracked) == ([1, 2, 3], None)
     np.testing.assert_allclose(eye.away / np.linalg.norm(eye.away), [0, -np.cos(np.pi / 6), 0.5], atol=1e-12)
-    assert Eye.of(scene, None).tracked == "/world/ball"
+    assert Eye.of(scene, None).tracked == "/world/view"
     still = Scene(compiled('<mujoco><worldbody><geom type="plane" size="4 4 1"/></worldbody></mujoco>', "still"))
     assert Eye.of(still, None).tracked is None
 
@@ -151,7 +154,7 @@ def test_another_tasks_rollout_is_refused(scene, spec, plain, rollout):
     good, drawing = rollout(), Drawing(scene, spec)
     for wrong, name in (
         (replace(good, bodies=good.bodies[:, 1:]), "bodies"),
-        (replace(good, terms=good.terms[1:]), "terms"),
+        (replace(good, terms=good.terms[:, 1:]), "terms"),
         (replace(good, channels={**good.channels, "goals": good.channels["goals"][:, 1:]}), "channels/goals"),
         (rollout(spec=plain), "actions"),
     ):
@@ -215,3 +218,29 @@ def test_colours_run_from_violet_to_yellow():
 def test_changes_are_the_first_row_and_every_other_state():
     assert changes(np.array([False, False, True, True, False])).tolist() == [0, 2, 4]
     assert changes(np.array([True])).tolist() == [0]
+
+
+def test_a_rollout_shows_the_geometries_of_its_own_model_only():
+    """Those that all models have stay as they are; a scale of 0 hides the others."""
+    body = '<mujoco model="{0}"><worldbody>{1}<body name="ball"><freejoint/>{2}</body></worldbody></mujoco>'
+    floor, ball = '<geom name="floor" type="plane" size="4 4 1"/>', '<geom name="ball" size="{}"/>'
+    texts = [body.format(name, floor, ball.format(size)) for name, size in (("small", 0.1), ("big", 0.2))]
+    channel = Channel(name=MODEL, kind="flags", shape=(2,), labels=("small", "big"))
+    spec = TaskSpec(observation=1, action=1, steps=1, period=1.0, channels=(channel,))
+    scene = Scene.of([compiled(text, "one of two") for text in texts])
+    drawing = Drawing(scene, spec)
+    drawn = dict(drawing.static())
+    assert {"/world/world/floor", "/world/ball/ball-0", "/world/ball/ball-1"} <= drawn.keys()
+    assert drawn["/world/ball/ball-1"].half_sizes.as_arrow_array().to_pylist() == [pytest.approx([0.2] * 3)]
+    shown = [
+        Trajectory.of(
+            times=np.arange(2.0), bodies=np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, len(scene.bodies), 1)),
+            actions=np.zeros((2, 1)), terms=np.zeros((2, 1)), channels=scene.said(which, 2), value=0.0, success=None,
+        )
+        for which in (1, 0)
+    ]  # fmt: skip
+    parts = {part.entity: part.columns for part in drawing.columns(joined(shown))}
+    assert "/world/world/floor" not in parts
+    for which, scales in ((0, [0.0, 0.0, 1.0, 1.0]), (1, [1.0, 1.0, 0.0, 0.0])):
+        [column] = [each for each in parts[f"/world/ball/ball-{which}"] if "scale" in str(each.component_descriptor())]
+        assert np.ravel(column.as_arrow_array().to_pylist()).tolist() == np.repeat(scales, 3).tolist()

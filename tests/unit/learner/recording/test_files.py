@@ -56,3 +56,10 @@ def test_what_was_left_goes_although_there_is_nothing_to_compact(tmp_path: Path)
     (tmp_path / "run.merging.rrd").touch()
     assert files.next_part(tmp_path / "run.rrd") == tmp_path / "run.rrd"
     assert not list(tmp_path.iterdir())
+
+
+def test_rerun_sends_no_usage_data_and_says_nothing_of_it(tmp_path: Path) -> None:
+    command = [files.program(), "analytics", "config"]
+    said = subprocess.run(command, env=files.quiet(tmp_path), capture_output=True, text=True, check=True)
+    assert '"analytics_enabled":false' in said.stdout.replace(" ", "").replace("\n", "")
+    assert "usage data" not in said.stdout + said.stderr

@@ -1,5 +1,6 @@
 """Recordings are written and read back with Rerun's own reader."""
 
+import dataclasses
 import pickle
 import re
 import socket
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made import report, stats
 from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
@@ -22,7 +24,9 @@ from learner.recording.replay import record_replay
 WRITE = """
 import os, pickle, resource, sys
 from pathlib import Path
-from farm.sim.scene import Scene, compiled
+from farm.net.telemetry import Report
+from farm.sim.model_files import compiled
+from farm.sim.scene import Scene
 from learner.recording import rows
 from learner.recording.drawing import Drawing
 from learner.recording.recorder import Recorder
@@ -33,7 +37,7 @@ if limit:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 try:
     for stats, traces in calls:
-        recorder.generation(stats, None, traces, 1.0)
+        recorder.generation(Report(progress=stats, rate=1.0, traces=traces))
 except OSError:
     recorder.close()
     print("noticed")
@@ -47,15 +51,15 @@ def killed(path, mjcf, spec, calls, limit=0):
     return subprocess.run([sys.executable, "-uc", WRITE], input=sent, capture_output=True, check=False, timeout=60)
 
 
-def test_generations_are_recorded_on_every_timeline(start, stats, rollout, traces, read):
+def test_generations_are_recorded_on_every_timeline(start, rollout, traces, read):
     recorder = start()
     recorder.log("it begins")
     for generation in (1, 2, 3):
-        recorder.generation(stats(generation), rollout(), traces(), rate=120.0)
+        recorder.generation(report(stats(generation), rollout(), traces(), rate=120.0))
     recorder.close()
     rows = read()
     assert rows.column("/learning/return", "scalars")[2] == [-4.7, -40.0, -1.0, -0.5, -5.0]
-    assert rows.column("/learning/return_std", "variances") == [[4.0]] * 3
+    assert rows.column("/learning/return_std", "variances") == [[6.25]] * 3
     assert rows.column("/learning/lost", "scalars") == [[2.0, 0.0, 0.0]] * 3
     assert rows.column("/learning/success", "scalars") == [[0.25]] * 3
     assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0]] * 3
@@ -72,10 +76,10 @@ def test_generations_are_recorded_on_every_timeline(start, stats, rollout, trace
             assert not {"log_time", "log_tick"} & set(batch.schema.names), entity
 
 
-def test_rollouts_follow_each_other_without_gap(start, stats, rollout, read):
+def test_rollouts_follow_each_other_without_gap(start, rollout, read):
     recorder = start()
     for generation in (4, 5):
-        recorder.generation(stats(generation), rollout(), {}, rate=1.0)
+        recorder.generation(report(stats(generation), rollout()))
     recorder.close()
     rows = read()
     at = np.array(rows.times("/touch/force")) / 1e9
@@ -85,10 +89,10 @@ def test_rollouts_follow_each_other_without_gap(start, stats, rollout, read):
     assert rows.times("/learning/return") == [6_000_000_000, 7_500_000_000]
 
 
-def test_a_finished_run_opens_with_its_last_policy_playing(start, stats, rollout, read, tmp_path):
+def test_a_finished_run_opens_with_its_last_policy_playing(start, rollout, read, tmp_path):
     recorder = start()
     for generation in (1, 2):
-        recorder.generation(stats(generation), rollout(), {}, rate=1.0)
+        recorder.generation(report(stats(generation), rollout()))
     recorder.final(rollout(31, step=0.05))
     recorder.close()
     rows, reader = read(), RrdReader(tmp_path / "run.rrd")
@@ -104,12 +108,16 @@ def test_a_finished_run_opens_with_its_last_policy_playing(start, stats, rollout
     assert values["TimePanelBlueprint:timeline"] == ["sim_time"]
     [selected] = values["TimePanelBlueprint:time_selection"]
     assert (selected["min"], round(selected["max"], -4)) == (3_000_000_000, 4_500_000_000)
+    others = [chunk.to_record_batch() for chunk in reader.stream(store=layout)]
+    tabs = [batch.column("ContainerBlueprint:display_name").to_pylist()[0] for batch in others
+            if "ContainerBlueprint:display_name" in batch.schema.names]  # fmt: skip
+    assert ["Learning (sim_time: 1.5 s per generation)"] in tabs
 
 
-def test_traces_come_back_bit_by_bit(start, stats, traces, read):
+def test_traces_come_back_bit_by_bit(start, traces, read):
     recorder = start()
     kept = traces(30)
-    recorder.generation(stats(), None, kept, rate=1.0)
+    recorder.generation(report(stats(), None, kept))
     recorder.close()
     [[found]] = read().column("/traces/all", "data")
     assert found["shape"] == [30, 15, 12]
@@ -119,22 +127,22 @@ def test_traces_come_back_bit_by_bit(start, stats, traces, read):
     np.testing.assert_array_equal(picture, kept["worst"].T)
 
 
-def test_a_wrong_trace_is_refused(start, stats):
+def test_a_wrong_trace_is_refused(start):
     recorder = start()
-    for name, shape in (("best", (2, 15, 12)), ("worst", (15, 11)), ("all", (15, 12))):
+    for name, shape in (("best", (14, 12)), ("worst", (15, 11)), ("all", (4, 15, 11))):
         with pytest.raises(ValueError, match=f"trace {name} of shape"):
-            recorder.generation(stats(), None, {name: np.zeros(shape)}, rate=1.0)
+            recorder.generation(report(stats(), None, {name: np.zeros(shape, "<f4")}))
     recorder.close()
 
 
-def test_a_run_that_goes_on_keeps_what_is_there(start, stats, rollout, tmp_path, read):
+def test_a_run_that_goes_on_keeps_what_is_there(start, rollout, tmp_path, read):
     path = tmp_path / "run.rrd"
     first = start()
-    first.generation(stats(1), rollout(), {}, rate=1.0)
+    first.generation(report(stats(1), rollout()))
     first.close()
     second = start(done=1)
     second.log("it goes on", "WARNING")
-    second.generation(stats(2), rollout(), {}, rate=1.0)
+    second.generation(report(stats(2), rollout()))
     assert parts(path) == [path, tmp_path / "run.part2.rrd"]
     second.close()
     assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
@@ -155,13 +163,13 @@ def test_parts_are_found_in_order(tmp_path):
     assert [p.name for p in parts(path)] == names
 
 
-def test_what_cannot_be_merged_stays(start, stats, tmp_path, read, monkeypatch, caplog):
+def test_what_cannot_be_merged_stays(start, tmp_path, read, monkeypatch, caplog):
     path = tmp_path / "run.rrd"
     start().close()
     monkeypatch.setattr("sys.executable", "/nowhere/python")
     before = path.read_bytes()
     second = start(done=1)
-    second.generation(stats(2), None, {}, rate=1.0)
+    second.generation(report(stats(2)))
     second.close()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir() if "part" in p.name] == ["run.part2.rrd"]
@@ -172,7 +180,7 @@ def test_what_cannot_be_merged_stays(start, stats, tmp_path, read, monkeypatch, 
     assert read().column("/learning/return", "generation") == [2]
 
 
-def test_rollouts_written_together_are_as_written_one_by_one(start, stats, rollout, read, monkeypatch):
+def test_rollouts_written_together_are_as_written_one_by_one(start, rollout, read, monkeypatch):
     lengths = (16, 3, 16, 1)  # some ended early
     shown = [rollout(frames) for frames in lengths]
     found = []
@@ -181,7 +189,7 @@ def test_rollouts_written_together_are_as_written_one_by_one(start, stats, rollo
         monkeypatch.setattr(recorders.time, "time", iter(range(1_700_000_000, 1_800_000_000)).__next__)
         recorder = start(f"held-{hold:g}.rrd")
         for generation, sample in enumerate(shown, 1):
-            recorder.generation(stats(generation), sample, {}, rate=1.0)
+            recorder.generation(report(stats(generation), sample))
         recorder.close()
         rows = read(f"held-{hold:g}.rrd")
         names = {(e, n) for e, batches in rows.batches.items() for batch in batches for n in batch.schema.names}
@@ -192,39 +200,39 @@ def test_rollouts_written_together_are_as_written_one_by_one(start, stats, rollo
     assert set(found[0]["/touch/state/left", "generation"]) == {0, 1, 2, 3}, "a rollout begins with its state"
 
 
-def test_a_torn_file_is_repaired(start, stats, spec, scene_text, tmp_path, read):
+def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, read):
     path = tmp_path / "run.rrd"
     ended = killed(path, scene_text, spec, [(stats(g), {}) for g in range(1, 6)])
     assert ended.returncode == 9, ended.stderr.decode()
     path.write_bytes(path.read_bytes()[:-37])
     recorder = start()
-    recorder.generation(stats(6), None, {}, rate=1.0)
+    recorder.generation(report(stats(6)))
     recorder.close()
     assert read().column("/learning/return", "generation") == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_full_disk_is_noticed(stats, traces, spec, scene_text, tmp_path):
+def test_a_full_disk_is_noticed(traces, spec, scene_text, tmp_path):
     ended = killed(tmp_path / "run.rrd", scene_text, spec, [(stats(), traces(30))] * 100, limit=300_000)
     assert b"noticed" in ended.stdout, ended.stderr.decode()
 
 
-def test_a_recording_ends_before_the_disk_is_full(start, stats, read, monkeypatch):
+def test_a_recording_ends_before_the_disk_is_full(start, read, monkeypatch):
     recorder = start()
-    recorder.generation(stats(1), None, {}, rate=1.0)
+    recorder.generation(report(stats(1)))
     monkeypatch.setattr("learner.recording.recorder.RESERVE", 1 << 60)
     with pytest.raises(OSError, match="are needed"):
-        recorder.generation(stats(2), None, {}, rate=1.0)
+        recorder.generation(report(stats(2)))
     recorder.close()
     assert read().column("/learning/return", "generation") == [1]
 
 
-def test_viewers_are_served(scene, spec, stats, rollout, traces):
+def test_viewers_are_served(scene, spec, rollout, traces):
     with pytest.raises(ConfigError, match="without a file"):
         Recorder(None, run="try", drawing=Drawing(scene, spec), config="")
     recorder = Recorder(None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", 0))
     assert recorder.uri is not None
     port = int(recorder.uri.removeprefix("rerun+http://127.0.0.1:").removesuffix("/proxy"))
-    recorder.generation(stats(), rollout(), traces(), rate=1.0)
+    recorder.generation(report(stats(), rollout(), traces()))
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     with pytest.raises(ConfigError, match="choose another"):
         Recorder(None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", port))
@@ -245,7 +253,37 @@ def test_replays_follow_each_other(scene, spec, rollout, tmp_path, read):
     assert (np.diff(rows.times("/reward/terms")) > 0).all()
 
 
-def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, stats, rollout, tmp_path, read):
+CURVES = ("/reward/terms", "/actions", "/touch/force", "/touch/force/limits")
+
+
+def test_no_curve_goes_from_one_rollout_of_a_replay_to_the_next(scene, spec, rollout, tmp_path, read):
+    shown = [("one", rollout(31, 0.01)), ("other", rollout()), ("third", rollout())]
+    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=shown)
+    for entity in CURVES:
+        np.testing.assert_allclose(read("r.rrd").breaks(entity), [0.35e9, 1.95e9])
+
+
+def test_no_curve_goes_from_a_rollout_that_ended_early_to_the_next_generations(start, rollout, read):
+    recorder = start()
+    for generation, frames in ((1, 16), (2, 4), (3, 16)):
+        recorder.generation(report(stats(generation), rollout(frames)))
+    recorder.close()
+    for entity in CURVES:
+        np.testing.assert_allclose(read().breaks(entity), [1.5e9 + 0.3e9 + 1e3])
+
+
+def test_the_eye_follows_a_body_that_moves_away(scene, spec, rollout, tmp_path, read):
+    shown, mover = rollout(), scene.mover
+    bodies = np.tile(scene.poses(scene.model.qpos0[None]), (16, 1, 1))
+    bodies[8:, scene.bodies.index(mover.body), 0] += 10.0
+    gone = dataclasses.replace(shown, bodies=bodies.astype("<f4"))
+    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=[("gone", gone)])
+    places = np.array(read("r.rrd").column("/world/view", "positions"))[:, 0]
+    np.testing.assert_allclose(places[:8], np.tile(mover.centre, (8, 1)), atol=1e-6)
+    np.testing.assert_allclose(places[8:, 0], mover.centre[0] + 10.0 - 0.4 * mover.radius, atol=1e-5)
+
+
+def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, rollout, tmp_path, read):
     curves = [stats(g) for g in (1, 2)]
     both = [Shown(name, Drawing(scene, spec), curves, rollout()) for name in ("one", "other")]
     record_comparison(tmp_path / "compare.rrd", both, "| table |")

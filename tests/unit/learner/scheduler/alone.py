@@ -1,11 +1,13 @@
 """A small task in a file, and runs of it without a network."""
 
+from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 
 from farm.net.work import NOT_NORMALISED, Jobs, Results
-from learner import setup
+from learner.run import setup
 from learner.scheduler.round import RoundResults
 
 POLE = """
@@ -50,7 +52,8 @@ class Alone:
     """Instead of the dispatcher: does a round's jobs at once, several together, in any order."""
 
     def __init__(self, found: setup.Problem, seed: int = 0) -> None:
-        self.admission, self.workers, self.reissued = SimpleNamespace(canary="c"), ("w/1",), 0
+        self.admission, self.workers, self.reissued = SimpleNamespace(canary="c", expelled={}), ("w/1",), 0
+        self.hosts = ["w"]
         self.problem, self._runner, self._rng = found, found.runner(), np.random.default_rng(seed)
         self.rounds: list[tuple[int, Jobs, str]] = []
         self.normalisers: list[np.ndarray] = []
@@ -70,10 +73,22 @@ class Alone:
         for some in np.array_split(self._rng.permutation(len(jobs)), 3):
             part = jobs.take(sorted(some.tolist()))
             given = self._runner.run(mu, part, traces, normaliser)
-            said = Results.carrying(given, part, run="r", incarnation="i", round=0, worker="w/1")
+            said = Results.carrying(given, part, 0.0, run="r", incarnation="i", round=0, worker="w/1")
             place = self._round.place(said)
             assert place is not None
             self._round.put(said, place, np.ones(len(part), bool))
+
+    def returns(self, theta: np.ndarray, seeds: list[tuple[int, ...] | None]) -> np.ndarray:
+        """Returns of parameters (S, P) on the starts for these seeds, (S,)."""
+        return self._runner.rollouts(theta, seeds).returns
+
+    def progress(self) -> Iterator[RoundResults]:
+        yield self._round
+
+    checks: ClassVar[dict[str, int]] = {"w": 1}
+
+    def check_the_rest(self) -> None:
+        pass
 
     def collect(self) -> RoundResults:
         return self._round

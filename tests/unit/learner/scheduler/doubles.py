@@ -6,9 +6,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+from made import spec
 
 from farm.net import codec, keys
-from farm.net.messages import Spec, WorkRequest
+from farm.net.messages import WorkRequest
 from farm.net.session import Session
 from farm.net.work import Chunk, Failure, Jobs, Results, traced
 from learner.scheduler.dispatcher import Dispatcher
@@ -17,7 +18,7 @@ from learner.scheduler.round import RoundResults
 from learner.scheduler.scheduler import SchedulerConfig
 
 FARM, RUN, TRACE = "try", "r", (3, 4)
-SPEC = Spec(run=RUN, task="none", task_config={}, policy="none", policy_config={}, code={})
+SPEC = spec(run=RUN)
 SHAPES = {"bodies": (2, 7), "actions": (1,), "terms": (2,), "channels/angle": (1,)}
 PATIENT = SchedulerConfig(straggler_seconds=60.0, audit=0.0)
 WAIT = 20.0
@@ -108,9 +109,9 @@ class Learner:
         scheduler: SchedulerConfig = PATIENT,
         stopped: Callable[[], bool] | None = None,
         join: str | None = "farm worker --connect here",
-        canary: str | None = None,
+        canary: str = "c",
     ) -> Dispatcher:
-        self.farm = Dispatcher(
+        self.dispatcher = Dispatcher(
             self.session,
             FARM,
             SPEC,
@@ -121,11 +122,11 @@ class Learner:
             (TRACE, SHAPES),
             scheduler,
         )
-        return self.farm
+        return self.dispatcher
 
     def collect(self, todo: Jobs) -> "Future[RoundResults]":
-        self.farm.begin(0, np.zeros(2), todo, "extremes")
-        return self._pool.submit(self.farm.collect)
+        self.dispatcher.begin(0, np.zeros(2), todo, "extremes")
+        return self._pool.submit(self.dispatcher.collect)
 
     def close(self) -> None:
         self.stop.set()

@@ -28,14 +28,16 @@ from farm.errors import RunError
 from farm.net import codec, keys
 from farm.net.session import Session, connect
 from farm.net.telemetry import RunStatus
-from farm.net.work import Chunk, Jobs, Results, RoundHeader, WireTrajectory
+from farm.net.work import Chunk, Jobs, Results, RoundHeader
+from farm.sim.trajectory import Trajectory
 from learner.scheduler import dispatcher as dispatchers
+from learner.scheduler import status as answers
 from learner.scheduler.dispatcher import Stopped
 from learner.scheduler.scheduler import SchedulerConfig
 
 
 def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     worker.want(100)
     for _ in range(3):
@@ -43,15 +45,15 @@ def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
         worker.work(20)
         found = collected.result(WAIT)
         assert found.returns.tolist() == [i for i in range(20) for _ in range(2)]
-    assert farm.workers == ("a/1",)
-    assert farm.reissued == 0
-    assert not farm.ignored
+    assert dispatcher.workers == ("a/1",)
+    assert dispatcher.reissued == 0
+    assert not dispatcher.notices.ignored
 
 
 def test_a_round_is_announced(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
-    farm.begin(7, np.array([1.0, 2.0]), jobs(1), "all")
+    dispatcher.begin(7, np.array([1.0, 2.0]), jobs(1), "all")
     said = codec.decode(worker.next("generation"), RoundHeader)
     assert (said.run, said.round, said.generation, said.mu.tolist(), said.traces) == (RUN, 1, 7, [1, 2], "all")
     asked = worker.session.ask(keys.generation(FARM, RUN), WAIT)
@@ -99,24 +101,24 @@ def _next(session: Session):
 def test_a_worker_whose_token_was_missed(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing tells the learner that the token came: it asks for it."""
     monkeypatch.setattr(learner.session, "watch", lambda *_: None)
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(4))
     worker.want(10)
     worker.work(4)
     collected.result(WAIT)
-    assert farm.workers == ("a/1",)
-    assert not farm.ignored
+    assert dispatcher.workers == ("a/1",)
+    assert not dispatcher.notices.ignored
 
 
 def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     worker.want(1)
     collected = learner.collect(Jobs.mean("control", [None]))
     arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items() if "/" not in name}
     angle = {"angle": np.ones((1, 1), "<f4")}
-    good = WireTrajectory(value=0.5, success=False, times=np.zeros(1), channels=angle, **arrays)
+    good = Trajectory(value=0.5, success=False, times=np.zeros(1), channels=angle, **arrays)
     wrong = [(), (replace(good, bodies=np.zeros((1, 3, 7), "<f4")),), (replace(good, channels={}),), (good, good)]
     chunk = worker.chunk()
     said = Results(
@@ -129,11 +131,11 @@ def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
     found = collected.result(WAIT).trajectory(0)
     assert found is not None
     assert (found.value, found.channels["angle"].tolist()) == (0.5, [[1.0]])
-    assert farm.ignored == {"bad": 4}
+    assert dispatcher.notices.ignored == {"bad": 4}
 
 
 def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     worker.want(5)
     collected = learner.collect(jobs(1))
@@ -145,12 +147,12 @@ def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
     worker.answer(worker.results(first, 0, value=-9.0))
     worker.answer(worker.results(chunk))
     assert collected.result(WAIT).returns[0] == 0.0
-    assert farm.ignored == {"stale": 1}
+    assert dispatcher.notices.ignored == {"stale": 1}
 
 
 def test_a_worker_that_is_gone(endpoint: str, learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    farm = learner.show()
+    dispatcher = learner.show()
     with connect((endpoint,), WAIT, lambda: False) as session:
         lost = Worker(session, "a/1")
         lost.want(4)
@@ -161,14 +163,14 @@ def test_a_worker_that_is_gone(endpoint: str, learner: Learner, hire: Hire, capl
     other.want(4)
     assert sorted(other.work(8)) == list(range(8))
     assert done(collected.result(WAIT)) == list(range(8))
-    assert farm.reissued >= 2
-    assert farm.workers == ("b/1",)
+    assert dispatcher.reissued >= 2
+    assert dispatcher.workers == ("b/1",)
     assert any(line.startswith("worker a/1 left; ") for line in caplog.messages)
     assert sum("worker a/1 joined" in line for line in caplog.messages) == 1
 
 
 def test_a_worker_that_lost_its_jobs(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     worker.want(2)
     collected = learner.collect(jobs(5))
@@ -176,11 +178,11 @@ def test_a_worker_that_lost_its_jobs(learner: Learner, hire: Hire) -> None:
     worker.want(2, idle=True)
     assert forgotten <= set(worker.work(5))
     assert done(collected.result(WAIT)) == list(range(5))
-    assert farm.reissued == 2
+    assert dispatcher.reissued == 2
 
 
 def test_a_slow_worker_is_helped(learner: Learner, hire: Hire) -> None:
-    farm = learner.show(SchedulerConfig(straggler_seconds=0.1))
+    dispatcher = learner.show(SchedulerConfig(straggler_seconds=0.1))
     slow, fast = hire("a/1"), hire("b/1")
     slow.want(1)
     collected = learner.collect(jobs(2))
@@ -188,7 +190,7 @@ def test_a_slow_worker_is_helped(learner: Learner, hire: Hire) -> None:
     fast.want(5)
     fast.work(2)
     assert done(collected.result(WAIT)) == [0, 1]
-    assert farm.reissued >= 1
+    assert dispatcher.reissued >= 1
     collected = learner.collect(jobs(1))
     slow.answer(slow.results(stuck))
     fast.work(1)
@@ -244,7 +246,7 @@ def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:
 def test_a_worker_that_cannot_serve_the_run_gets_no_more_jobs(
     learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture
 ) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     idle, worker = hire("a/1"), hire("b/1")
     collected = learner.collect(jobs(6))
     idle.want(3)
@@ -255,14 +257,14 @@ def test_a_worker_that_cannot_serve_the_run_gets_no_more_jobs(
     worker.want(2)
     worker.work(6)
     assert done(collected.result(WAIT)) == [0, 1, 2, 3, 4, 5]
-    assert farm.workers == ("b/1",)
+    assert dispatcher.workers == ("b/1",)
     assert [text for text in caplog.messages if "not allowed" in text] == [
         "worker a/1 does not serve this run: not allowed here"
     ]
 
 
 def test_a_status_query_is_answered(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
+    monkeypatch.setattr(answers, "_PERIOD", 0.0)
     learner.show()
     worker, idle = hire("a/1"), hire("b/1")
     collected = learner.collect(jobs(3))
@@ -322,4 +324,17 @@ def test_a_run_whose_own_workers_are_all_refused_ends(
     collected = learner.collect(jobs(1))
     worker.want(1)
     with pytest.raises(RunError, match="no worker takes part: its machine rounds differently .* --mixed"):
+        collected.result(WAIT)
+
+
+def test_a_run_whose_own_workers_cannot_build_the_task_ends(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatchers, "_PATIENCE", 0.0)
+    learner.show(join=None)
+    worker = hire("a/1")
+    worker.want(1)
+    collected = learner.collect(jobs(1))
+    worker.answer(worker.failure(worker.chunk(), None, "ValueError: no mesh.stl"))
+    with pytest.raises(RunError, match=r"no worker takes part: ValueError: no mesh\.stl"):
         collected.result(WAIT)

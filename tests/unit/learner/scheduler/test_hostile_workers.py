@@ -8,13 +8,12 @@ from doubles import FARM, NEWER, WAIT, Hire, Learner, done, jobs, request
 
 from farm.net import codec, keys
 from farm.net.messages import Refusal
-from learner.scheduler import dispatcher as dispatchers
-from learner.scheduler import membership
+from learner.scheduler import membership, status
 
 
 def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(codec, "MAX_BYTES", 100_000)
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     inbox = keys.want(FARM, worker.name)
     for nonsense in (b"", b"\xc1", NEWER, request("b/1", 50)):
@@ -34,17 +33,24 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     ]  # fmt: skip
     for message in bad:
         worker.answer(message)
-    assert farm.workers == ("a/1",), "a worker joined by the message of another worker"
+    assert dispatcher.workers == ("a/1",), "a worker joined by the message of another worker"
     worker.answer(honest)
     worker.answer(worker.results(first, 0, value=7.0))
     worker.work(3)
     found = collected.result(WAIT)
     assert done(found) == list(range(4))
-    assert farm.ignored == {"bad": 2 + 8, "version": 1 + 2, "large": 1, "foreign": 1 + 2, "stale": 3, "doubled": 1}
+    assert dispatcher.notices.ignored == {
+        "bad": 2 + 8,
+        "version": 1 + 2,
+        "large": 1,
+        "foreign": 1 + 2,
+        "stale": 3,
+        "doubled": 1,
+    }
 
 
 def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     worker.want(1)
     collected = learner.collect(jobs(2))
@@ -53,14 +59,14 @@ def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner
     worker.answer(worker.results(first))
     worker.work(1)
     assert done(collected.result(WAIT)) == [0, 1]
-    assert farm.ignored == {"version": 1}
+    assert dispatcher.notices.ignored == {"version": 1}
 
 
 def test_made_up_names_are_ignored(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membership, "_SOON", 0.0)
-    monkeypatch.setattr(dispatchers, "_STATUS", 0.0)
-    monkeypatch.setattr(dispatchers, "_STATUS_PART", math.inf)
-    farm = learner.show()
+    monkeypatch.setattr(status, "_PERIOD", 0.0)
+    monkeypatch.setattr(status, "_PART", math.inf)
+    dispatcher = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(30))
     for i in range(500):
@@ -68,12 +74,12 @@ def test_made_up_names_are_ignored(learner: Learner, hire: Hire, monkeypatch: py
     worker.want(10)
     worker.work(30)
     collected.result(WAIT)
-    assert farm.workers == ("a/1",)
-    assert [known.worker for known in farm.census()] == ["a/1"]
+    assert dispatcher.workers == ("a/1",)
+    assert [member.worker for member in dispatcher.census()] == ["a/1"]
     collected = learner.collect(jobs(1))
     worker.work(1)
     collected.result(WAIT)
-    assert farm.ignored == {"absent": 500}
+    assert dispatcher.notices.ignored == {"absent": 500}
 
 
 def test_hostile_lines_are_told_of_once(learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
@@ -86,12 +92,12 @@ def test_hostile_lines_are_told_of_once(learner: Learner, hire: Hire, caplog: py
         worker.answer(b"rubbish")
     worker.answer(worker.results(chunk))
     collected.result(WAIT)
-    assert learner.farm.ignored == {"bad": 500}
+    assert learner.dispatcher.notices.ignored == {"bad": 500}
     assert sum("ignored a message" in line for line in caplog.messages) == 1
 
 
 def test_another_release_hears_why_it_gets_nothing(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     other, worker = hire("a/1"), hire("b/1")
     other.session.subscribe("refused", keys.refused(FARM, "a/1"))
     collected = learner.collect(jobs(2))
@@ -100,27 +106,29 @@ def test_another_release_hears_why_it_gets_nothing(learner: Learner, hire: Hire)
     worker.want(2)
     worker.work(2)
     collected.result(WAIT)
-    assert farm.ignored == {"version": 1}
+    assert dispatcher.notices.ignored == {"version": 1}
 
 
-def test_fingerprint_of_a_worker_without_results_does_not_bind_the_run(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
-    worker, odd = hire("b/1"), hire("a/1")
+def test_a_worker_that_claims_other_numbers_gets_nothing_even_if_it_is_the_first(learner: Learner, hire: Hire) -> None:
+    dispatcher = learner.show()
+    odd = hire("a/1")
     collected = learner.collect(jobs(3))
     odd.say(keys.want(FARM, "a/1"), request("a/1", 1, canary="odd"))
-    chunk = odd.chunk()
-    worker.want(2)
-    worker.work(2)
     assert "rounds differently" in codec.decode(odd.refusal(), Refusal).reason
-    assert farm.admission.canary == "c"
-    odd.answer(odd.results(chunk, value=9.0))  # it was given that job, but is no longer admitted
-    worker.work(1)
+    worker = hire("b/1")
+    worker.want(2)
+    chunk = worker.chunk()
+    odd.answer(odd.results(chunk, value=9.0))
+    odd.say(keys.want(FARM, "a/1"), request("a/1", 1, canary="odd"))
+    odd.refusal()  # the learner has both messages
+    worker.answer(worker.results(chunk))
+    worker.work(3 - len(chunk))
     assert done(collected.result(WAIT)) == [0, 1, 2]
-    assert farm.ignored == {"refused": 1}
+    assert dispatcher.notices.ignored == {"refused": 1}
 
 
 def test_patterns_are_not_names(learner: Learner, hire: Hire) -> None:
-    farm = learner.show()
+    dispatcher = learner.show()
     worker = hire("a/1")
     collected = learner.collect(jobs(1))
     for name in ("**", "*/*", "a/**"):
@@ -128,4 +136,4 @@ def test_patterns_are_not_names(learner: Learner, hire: Hire) -> None:
     worker.want(1)
     worker.work(1)
     collected.result(WAIT)
-    assert farm.ignored == {"foreign": 3}
+    assert dispatcher.notices.ignored == {"foreign": 3}

@@ -1,11 +1,11 @@
-"""Which workers may join, which announced workers are connected, and what the learner knows about each."""
+"""Which workers may join, and which announced workers are connected."""
 
 import pytest
 
 from farm.errors import MessageError
 from farm.net.messages import WorkRequest
 from learner.scheduler import membership
-from learner.scheduler.membership import Admission, Attendance, Census
+from learner.scheduler.membership import Admission, Attendance
 
 
 def want(worker: str = "a/1", credits: int = 4, canary: str = "bits") -> WorkRequest:
@@ -15,30 +15,19 @@ def want(worker: str = "a/1", credits: int = 4, canary: str = "bits") -> WorkReq
 # ---------------------------------------------------------------- admission
 
 
-def test_a_device_is_admitted_among_mixed_machines_and_decides_nothing() -> None:
-    assert "it is a device" in str(Admission(None).refusal(want(canary="")))
-    admission = Admission(None, mixed=True)
-    assert admission.refusal(want(canary="")) is None
-    assert not admission.counted("")
-    assert admission.counted("bits")
-    assert admission.refusal(want(canary="")) is None
+def test_a_device_is_admitted_among_mixed_machines() -> None:
+    assert "it is a device" in str(Admission("bits").refusal(want(canary="")))
+    assert Admission("bits", mixed=True).refusal(want(canary="")) is None
 
 
-def test_the_first_result_decides_whose_numbers_count() -> None:
-    admission = Admission(None)
-    assert admission.refusal(want(canary="odd")) is None
-    assert admission.refusal(want("b/1")) is None
-    assert admission.counted("bits")
-    assert not admission.counted("bits")
-    assert admission.refusal(want("b/1")) is None
-    assert "rounds differently" in str(admission.refusal(want("c/1", canary="others")))
-    assert admission.canary == "bits"
-
-
-def test_a_resumed_run_knows_whose_numbers_count() -> None:
-    admission = Admission("bits")
-    assert "--mixed" in str(admission.refusal(want(canary="others")))
-    assert admission.refusal(want()) is None
+def test_only_machines_with_the_runs_numbers_are_admitted() -> None:
+    for reference in ("bits", "bi"):
+        admission = Admission(reference)
+        assert admission.refusal(want()) is None
+        said = str(admission.refusal(want(canary="others")))
+        assert f"(numbers others, the run's are {reference}:" in said
+        assert "--numbers others" in said
+        assert "--mixed" in said
 
 
 def test_mixed_machines_on_request() -> None:
@@ -113,30 +102,3 @@ def test_names_and_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not known.asked(want("d/1", 9), 0.0)
     known.left("a/1")
     assert known.came("c/1") is None
-
-
-# ---------------------------------------------------------------- census
-
-
-def test_rates_are_taken_over_the_last_ten_seconds() -> None:
-    census = Census()
-    census.asked(want(), 100.0)
-    for second in range(101, 121):
-        census.did("a/1", 30, float(second))
-    (status,) = census.status(120.5)
-    assert (status.worker, status.version, status.canary, status.rollouts) == ("a/1", "7.7", "bits", 600)
-    assert status.rate == pytest.approx(30.0)
-    assert status.seen == pytest.approx(0.5)
-    (later,) = census.status(200.0)
-    assert later.rate == 0.0
-
-
-def test_a_new_worker_has_a_rate_at_once_and_one_that_left_has_none() -> None:
-    census = Census()
-    census.asked(want("b/1"), 0.0)
-    census.did("b/1", 40, 2.0)
-    census.did("stranger", 40, 2.0)
-    assert [round(status.rate) for status in census.status(2.0)] == [20]
-    census.left("b/1")
-    census.left("b/1")
-    assert census.status(3.0) == ()

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from farm.net.work import Jobs, Results, WireTrajectory, traced
+from farm.net.work import Jobs, Results, traced
+from farm.sim.trajectory import Trajectory
 from learner.scheduler.round import RoundResults
 
 TRACE = (3, 5)
@@ -15,7 +16,7 @@ PAIRS = 12
 LAST = PAIRS + 1
 RETURNS = np.random.default_rng(0).integers(0, 4, 2 * PAIRS).astype(float)  # many are equal
 TRACES = np.random.default_rng(1).exponential(size=(2 * PAIRS, *TRACE)).astype("<f4")
-SHOWN = WireTrajectory(
+SHOWN = Trajectory(
     value=9.0, success=True, times=np.zeros(1), bodies=np.zeros((1, 2, 7), "<f4"), actions=np.zeros((1, 1), "<f4"),
     terms=np.zeros((1, 2), "<f4"), channels={"angle": np.zeros((1, 1), "<f4")},
 )  # fmt: skip
@@ -154,3 +155,20 @@ def test_answers_differ_by_any_number_that_counts(changed: str) -> None:
     lie = replace(said, **{changed: other})
     assert round_.answer(0) == round_.given(lie, 0)
     assert round_.answer(1) != round_.given(lie, 1)
+
+
+def test_measures_and_terms_belong_to_results_that_were_asked_for_them() -> None:
+    round_ = RoundResults(JOBS, "none", TRACE, SHAPES, measures=3, terms=True)
+    plain = message([0, LAST], "none")
+    assert round_.place(plain) is None
+    own = replace(plain, measures=np.arange(9.0).reshape(3, 3), terms=np.ones((3, 2)))
+    place = round_.place(own)
+    assert place is not None
+    round_.put(own, place, np.array([True, True]))
+    assert round_.measures[[0, 1, -1]].tolist() == own.measures.tolist()
+    assert round_.answer(0) == round_.given(own, 0)
+    other = replace(own, measures=own.measures + 1e-9)
+    assert round_.answer(0) != round_.given(other, 0), "a spot check compares them"
+    for wrong in ({"measures": np.zeros((3, 2))}, {"terms": np.zeros((3, 3))}, {"measures": np.empty((0, 0))}):
+        assert round_.place(replace(own, **wrong)) is None
+    assert begun("none").place(own) is None, "nobody asked for them"

@@ -316,6 +316,30 @@ def test_machines_that_lack_something_do_not_end_a_run_that_others_serve():
     assert scheduler.complete
 
 
+def test_hosts_that_cannot_build_the_task_count_against_no_job():
+    scheduler = started(2, ["bad/1", "bad/2"], credits=2)
+    for now in (0.1, 0.2):
+        for name, _ in scheduler.assign(now):
+            assert scheduler.refused(name) > 0
+    assert not scheduler.workers
+    assert not scheduler.error("bad/1", 0, 0.3), "nothing of it is heard any more"
+    scheduler.want("good/1", 2, 0.4)
+    assert given(scheduler.assign(0.4)) == {"good/1": [0, 1]}
+    assert scheduler.results("good/1", [0, 1], 0.5) == ["new", "new"]
+    assert scheduler.complete
+
+
+def test_errors_of_a_host_that_is_refused_later_do_not_count():
+    scheduler = started(1, ["bad/1"])
+    for now in (0.1, 0.2):
+        assert given(scheduler.assign(now)) == {"bad/1": [0]}
+        assert not scheduler.error("bad/1", 0, now)
+    scheduler.refused("bad/1")
+    scheduler.want("good/1", 1, 0.3)
+    assert given(scheduler.assign(0.3)) == {"good/1": [0]}
+    assert not scheduler.error("good/1", 0, 0.4), "its first error is the only one"
+
+
 def test_processes_of_one_host_are_one_opinion():
     names = ["h/1", "h/2", "h/3", "i/1"]
     scheduler = started(5, names, credits=1)

@@ -4,19 +4,19 @@ import itertools
 
 import numpy as np
 import pytest
+from made import stats
 
 from farm.net import codec
-from farm.net.telemetry import RunHistory, RunReport, Trace
+from farm.net.telemetry import Report, RunHistory
 from learner.telemetry.report_log import ReportLog
 
 TRACE = 15 * 54 * 4  # bytes of one trace
 
 
-def report(generation: int, rollouts: int = 1) -> RunReport:
+def report(generation: int, rollouts: int = 1) -> Report:
     values = np.full((rollouts, 15, 54), generation, "<f4")
-    traces = (Trace(name="all", values=values),) if rollouts else ()
-    progress = {"generation": generation}
-    return RunReport(run="r", incarnation="i", generation=generation, progress=progress, rate=1.0, traces=traces)
+    traces = {"all": values} if rollouts else {}
+    return Report(incarnation="i", progress=stats(generation), rate=1.0, traces=traces)
 
 
 def filled(generations: int, memory: int, page: int) -> ReportLog:
@@ -26,7 +26,7 @@ def filled(generations: int, memory: int, page: int) -> ReportLog:
     return history
 
 
-def read(history: ReportLog, begin: int = 1) -> list[list[RunReport]]:
+def read(history: ReportLog, begin: int = 1) -> list[list[Report]]:
     """Pages, as a recorder asks for them."""
     pages = []
     while page := history.page(begin):
@@ -42,7 +42,7 @@ def test_every_generation_once_and_in_order() -> None:
     assert max(len(codec.encode(tuple_of(page))) for page in pages) < 3 * 10_000
 
 
-def tuple_of(page: list[RunReport]) -> object:
+def tuple_of(page: list[Report]) -> object:
     return RunHistory(
         run="r", incarnation="i", recording="r", config={}, files={}, generation=100, reports=tuple(page), end=None
     )  # fmt: skip
@@ -52,7 +52,7 @@ def test_the_oldest_rollouts_go_and_no_statistics() -> None:
     kept = list(itertools.chain(*read(filled(50, memory=10 * TRACE, page=1 << 20))))
     assert [r.generation for r in kept] == list(range(1, 51))
     assert [r.generation for r in kept if r.traces] == list(range(41, 51))
-    assert all(r.progress == {"generation": r.generation} for r in kept)
+    assert all(r.progress == stats(r.generation) for r in kept)
 
 
 def test_one_report_larger_than_everything() -> None:

@@ -5,13 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from made import stats
 
 from farm.errors import ConfigError, Interrupted, RunError
 from farm.net import codec, keys, session
 from farm.net.session import Session, free_endpoint
-from farm.net.telemetry import RunEnd, RunHistory, RunReport
-from learner import config as configs
-from learner.config import RunConfig
+from farm.net.telemetry import Report, RunEnd, RunHistory
+from learner.run import config as configs
+from learner.run.config import RunConfig
+from learner.run.states import RolledBack
 from learner.telemetry import subscriber as subscribers
 from learner.telemetry.report_log import ReportLog
 from learner.telemetry.subscriber import Subscriber, find_run, localised
@@ -40,15 +42,13 @@ class Told:
         return reply
 
     def report(self, generation: int, *, lost: bool = False) -> None:
-        report = RunReport(
-            run="r", incarnation=self.page.incarnation, generation=generation, progress={}, rate=1.0
-        )  # fmt: skip
+        report = Report(incarnation=self.page.incarnation, progress=stats(generation), rate=1.0)
         self.history.add(report)
         self.page = replace(self.page, generation=generation)
         if not lost:
             self.again(report)
 
-    def again(self, report: RunReport) -> None:
+    def again(self, report: Report) -> None:
         self.link.publish(keys.report("farm", "r"), codec.encode(report))
 
     def end(self) -> None:
@@ -66,9 +66,9 @@ def told() -> Iterator[tuple[Told, Subscriber]]:
         yield learner, follower
 
 
-def take(reports: Iterator[RunReport | RunEnd], count: int) -> list[int]:
+def take(reports: Iterator[Report | RunEnd], count: int) -> list[int]:
     return [
-        message.generation for _, message in zip(range(count), reports, strict=False) if isinstance(message, RunReport)
+        message.generation for _, message in zip(range(count), reports, strict=False) if isinstance(message, Report)
     ]
 
 
@@ -123,7 +123,7 @@ def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Subscriber
     learner.page = replace(learner.page, incarnation="two", generation=3)
     learner.history = ReportLog()
     for generation in range(1, 4):
-        learner.history.add(RunReport(run="r", incarnation="two", generation=generation, progress={}, rate=1.0))
+        learner.history.add(Report(incarnation="two", progress=stats(generation), rate=1.0))
     for generation in (4, 5, 6, 7):
         learner.report(generation)
     assert take(reports, 2) == [6, 7]
@@ -176,7 +176,7 @@ def test_stopped_before_anybody_is_there(told: tuple[Told, Subscriber]) -> None:
 def test_the_only_run_of_a_farm_is_found(told: tuple[Told, Subscriber]) -> None:
     learner, follower = told
     learner.link.token(keys.learner_token("farm", "r"))
-    assert find_run(follower._session, "farm", lambda: False) == "r"
+    assert find_run(learner.link, "farm", lambda: False) == "r"
     learner.link.token(keys.learner_token("farm", "s"))
     with pytest.raises(ConfigError, match="farm farm has several runs: r, s; choose one with --run"):
         find_run(learner.link, "farm", lambda: False)
@@ -194,3 +194,19 @@ def test_classes_in_files_are_those_of_this_machine(tmp_path: Path) -> None:
         ConfigError, match=r"the run's task is a class in pole\.py: copy it here, and give --allow-file"
     ):
         localised(config, (tmp_path / "other.py",))
+
+
+def test_a_run_that_went_back_is_another_recording(told: tuple[Told, Subscriber]) -> None:
+    learner, follower = told
+    for generation in range(1, 7):
+        learner.report(generation)
+    reports = follower.follow(0, lambda: False)
+    assert take(reports, 6) == list(range(1, 7))
+    learner.history = ReportLog()
+    learner.page = replace(learner.page, incarnation="two", recording="r-undone4", generation=2, undone=4)
+    for generation in range(3, 9):  # more than are recorded
+        learner.report(generation)
+    with pytest.raises(RolledBack, match="run r went back to generation .: a host was expelled"):
+        next(reports)
+    assert follower.begin(lambda: False)[0] == "r-undone4"
+    assert follower.undone == 4

@@ -12,7 +12,9 @@ from gymnasium.utils.env_checker import check_env
 
 from farm.errors import ConfigError
 from farm.policies.fourier import Kernel, KernelConfig
+from farm.policies.recurrent import Rnn, RnnConfig
 from farm.rollouts import Runner
+from farm.tasks.acting import Acting
 from farm.tasks.finger_gait.env import FingerGaitEnv
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import STATES
@@ -26,10 +28,10 @@ ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 def episode(env, policy, theta, seed):
     """Drive an environment by a farm's policy: rewards, terms, whether the last step was terminal and successful."""
     x, _ = env.reset(seed=seed)
-    prepared = policy.prepare(theta[None])
+    acting = Acting(policy, theta[None])
     rewards, terms, over = [], [], False
     while not over:
-        x, reward, terminated, truncated, info = env.step(policy.act(prepared, x[None])[0])
+        x, reward, terminated, truncated, info = env.step(acting.act(x[None])[0])
         rewards.append(reward)
         terms.append(list(info["reward_terms"].values()))
         over = terminated or truncated
@@ -41,13 +43,14 @@ def episode(env, policy, theta, seed):
     [("joints", "offset", 0.0), ("joints+tactile", "absolute", 2.0), ("joints+contacts", "increment", 0.0)],
 )
 @pytest.mark.parametrize("seed", [None, 5])
-def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, motion, seed):
+@pytest.mark.parametrize(("kind", "config"), [(Kernel, KernelConfig(bandwidth=3.0)), (Rnn, RnnConfig(units=4))])
+def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, motion, seed, kind, config):
     task = FingerGait(FingerGaitConfig(state=state, perturb=seed is not None, action=action, motion=motion))
-    policy = Kernel(KernelConfig(bandwidth=3.0), task.spec(), {})
+    policy = kind(config, task.spec(), {})
     drawn = None
     if seed is not None:
         drawn = tuple(np.random.default_rng(seed).integers(0, 2**32, 4).tolist())
-    thetas = np.random.default_rng(1).normal(1.0, 0.8, (4, policy.size))
+    thetas = np.random.default_rng(1).normal(1.0 if kind is Kernel else 0.0, 0.8, (4, policy.size))
     rollouts = Runner(task, policy).rollouts(thetas, [drawn] * len(thetas))
     env = FingerGaitEnv(action=action, state=state, perturb=task.config.perturb, motion=motion)
     for i, theta in enumerate(thetas):
@@ -63,8 +66,8 @@ def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, motion, seed
 def test_success_is_the_farms():
     """A grip commanded at once succeeds; one that is held does not."""
     steps, env = 15, FingerGaitEnv(action="absolute")
-    goal = FingerGaitEnv(start_grip="index+middle+thumb")._task.start_commands
-    start = env._task.start_commands
+    goal = FingerGaitEnv(start_grip="index+middle+thumb")._task.start_commands[0]
+    start = env._task.start_commands[0]
     for command, expected in ((goal, True), (start, False)):
         env.reset()
         said = [env.step(command) for _ in range(steps)]

@@ -32,7 +32,7 @@ PLACES = [(finger, row, column) for finger in range(3) for row in range(6) for c
 def task() -> FingerGait:
     """The gait with a small ball as its object."""
     box, ball = r'(<geom name="bar" )type="box" size="[^"]*"', rf'\1type="sphere" size="{BALL}"'
-    files = model.files("bar", "opposed")
+    files = model.files(["bar"], "opposed")
     return FingerGait(files={**files, "object.xml": re.sub(box, ball, files["object.xml"])})
 
 
@@ -45,7 +45,7 @@ def pressed(task: FingerGait) -> Trajectory:
         frames.append(press(task, joints, finger, towards(PITCH[row], ACROSS[column])))
     shown = {name: np.concatenate([frame[name] for frame in frames]) for name in frames[0]}
     count, scene = len(frames), Scene(task.model)
-    return Trajectory(
+    return Trajectory.of(
         times=0.1 * np.arange(count), bodies=scene.poses(shown["qpos"]), actions=np.zeros((count, 8)),
         terms=np.zeros((count, 5)), channels=task.show(shown), value=0.0, success=False,
     )  # fmt: skip

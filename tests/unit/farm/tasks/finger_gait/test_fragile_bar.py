@@ -59,7 +59,7 @@ def judged(middle: np.ndarray, index: float = 3.0, steps: int = STEPS, shift: fl
     qpos[..., 8] = np.linspace(0.0, shift, STEPS)
     frames = {"qpos": qpos, "force": force, "target": np.zeros((1, STEPS, 8))}
     start = {"qpos": qpos[:, 0], "target": np.zeros((1, 8))}
-    record = Record(frames, start, np.zeros((1, STEPS, 8)), np.array([steps]), np.array([False]))
+    record = Record(frames, start, np.zeros((1, STEPS, 8)), np.array([steps]), np.array([False]), np.zeros(1, int))
     score = FragileBar().score(record)
     assert score is not None
     assert score.success is not None
@@ -118,7 +118,7 @@ def test_joint_readings_are_wrong_by_a_constant(runner: Runner) -> None:
     task = runner.task
 
     def noise(bias: float) -> np.ndarray:
-        task.config = FragileBarConfig(bias=bias)
+        task.config = FragileBarConfig(joint_bias=bias)
 
         def look() -> np.ndarray:
             Batch(task, runner.sim, SEEDS)
@@ -164,7 +164,7 @@ def test_settings_that_make_no_sense() -> None:
     with pytest.raises(ConfigError, match="steps is 2; expected 3 to 1000"):
         FragileBarConfig(steps=2)
     with pytest.raises(ConfigError, match="bias"):
-        FragileBarConfig(bias=-1.0)
+        FragileBarConfig(joint_bias=-1.0)
 
 
 def test_the_force_that_is_allowed_is_shown():

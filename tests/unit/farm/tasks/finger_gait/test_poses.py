@@ -11,7 +11,8 @@ from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS
-from farm.tasks.finger_gait.task import MOVED, TURNED, FingerGait, FingerGaitConfig, moved
+from farm.tasks.finger_gait.holding import MOVED, TURNED, moved
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.loop import Batch, Rollouts, again, whole
 
 
@@ -35,13 +36,13 @@ def body(text: str, name: str) -> ET.Element:
 
 
 def test_the_pose_of_the_reproduction_is_what_the_files_say() -> None:
-    files = model.files("bar", "opposed")
+    files = model.files(["bar"], "opposed")
     assert files["hand.xml"] == (model.folder() / "hand.xml").read_text("utf-8")
     assert files["object.xml"] == (model.folder() / "objects/bar.xml").read_text("utf-8")
 
 
 def test_a_pose_turns_links_by_the_angles_it_says() -> None:
-    opposed, between = (model.files("bar", pose)["hand.xml"] for pose in ("opposed", "between"))
+    opposed, between = (model.files(["bar"], pose)["hand.xml"] for pose in ("opposed", "between"))
     for name, axis, angle in (
         ("index_base", (0, 0, 1), -0.14), ("middle_base", (0, 0, 1), 0.14), ("thumb_base", (-1, 0, 0), 1.35 - 1.072),
         ("thumb_proximal", (0, 0, 1), 0.22 - 0.284),
@@ -54,7 +55,7 @@ def test_a_pose_turns_links_by_the_angles_it_says() -> None:
         turn = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis))])
         assert after == pytest.approx(product(before, turn), abs=2e-6), name
     assert ET.fromstring(between).find("option").get("impratio") == "10"  # type: ignore[union-attr]
-    assert body(model.files("bolt", "between")["object.xml"], "object").get("pos") == "0.08 0.0235 0.02"
+    assert body(model.files(["bolt"], "between")["object.xml"], "object").get("pos") == "0.08 0.0235 0.02"
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

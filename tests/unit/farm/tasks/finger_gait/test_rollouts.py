@@ -15,20 +15,10 @@ from farm.tasks.base import Record
 from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, GRIPS, LOWER, UPPER
+from farm.tasks.finger_gait.holding import CLOSING, PRESSES, RAMP, SETTLE, SUBSTEPS, Perturbation, moved, touching
 from farm.tasks.finger_gait.observations import Felt
 from farm.tasks.finger_gait.rewards import WEIGHTS
-from farm.tasks.finger_gait.task import (
-    CLOSING,
-    PRESSES,
-    RAMP,
-    SETTLE,
-    SUBSTEPS,
-    FingerGait,
-    FingerGaitConfig,
-    Perturbation,
-    moved,
-    touching,
-)
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.loop import Rollouts, discounted
 
 POLICIES = ("direct", "projected", "kernel", "cosine")
@@ -169,11 +159,11 @@ def plain_rollout(made, theta, seed):
         if not touching(now[1]):
             count = t + 1
             break
-    task.goal, kept = plain_goal(task.config.goal_grip), task.goal
+    task.goals, kept = [plain_goal(task.config.goal_grip)], task.goals
     names = dict(zip(("qpos", "force", "contact", "tip", "axes"), frames, strict=True))
-    record = Record(names, {"qpos": first[0][None]}, actions, np.array([count]), np.array([False]))
+    record = Record(names, {"qpos": first[0][None]}, actions, np.array([count]), np.array([False]), np.zeros(1, int))
     score = task.score(record)
-    task.goal = kept
+    task.goals = kept
     returns, _ = discounted(score.terms, task.config.gamma, task.return_scale)
     return {"returns": returns, "terms": score.terms, "actions": actions, "success": score.success, **names}
 

@@ -14,7 +14,7 @@ from farm.policies.networks import Linear
 from farm.rollouts import Runner
 from farm.tasks.base import Record
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
-from farm.tasks.finger_gait.task import CONTROL_PERIOD, SUBSTEPS, TIMESTEP
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD, SUBSTEPS, TIMESTEP
 from farm.tasks.finger_gait.turning import TERMS, Turning, TurningConfig, turned
 from farm.tasks.loop import Batch, again
 
@@ -99,7 +99,7 @@ def played(runner, targets):
     def play():
         batch = Batch(runner.task, runner.sim, [None])
         for each in targets:
-            batch.step((each - runner.task.start_commands)[None])
+            batch.step((each - runner.task.start_commands[0])[None])
         return batch.rollouts()
 
     return again(play).returns[0]
@@ -113,7 +113,7 @@ def judged(speed, steps=STEPS, tilt=0.0):
     qpos[0, :, 12], qpos[0, :, 13] = np.cos(angle) * np.sin(tilt / 2), np.sin(angle) * np.sin(tilt / 2)
     frames = {"qpos": qpos[:, 1:], "target": np.zeros((1, STEPS, 8))}
     start = {"qpos": qpos[:, 0], "target": np.zeros((1, 8))}
-    record = Record(frames, start, np.zeros((1, STEPS, 8)), np.array([steps]), np.array([False]))
+    record = Record(frames, start, np.zeros((1, STEPS, 8)), np.array([steps]), np.array([False]), np.zeros(1, int))
     score = Turning(TurningConfig(steps=STEPS, wanted=50.0)).score(record)
     return dict(zip(TERMS, score.terms[0].T, strict=True)), score.terms.sum(), bool(score.success[0])
 
@@ -130,7 +130,7 @@ def test_a_turn_is_positive_clockwise(tilt):
 def test_the_slowed_script_earns_more_than_holding_still(runner):
     keys = Keys(runner.task.hand, Script(stroke=1.0, move=0.2))
     slow = script_of(keys, 1)[SUBSTEPS - 1 :: SUBSTEPS][:STEPS]
-    still = np.tile(runner.task.start_commands, (STEPS, 1))
+    still = np.tile(runner.task.start_commands[0], (STEPS, 1))
     assert played(runner, slow) > 0.05 > played(runner, still) > -0.05
 
 

@@ -1,0 +1,169 @@
+"""Tasks on models of the DeepMind Control Suite (Tassa 2018, arXiv:1801.00690), for own_tasks.py. Needs dm_control.
+
+The models are the suite's own files. Starts, observations and rewards are written here, as a user would who has a
+model and wants something of it: smooth rewards of about 1 per control step at best, 150 to 250 steps.
+"""
+
+import importlib.util
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from farm import Task
+from farm.elementary import cos, exp, sin
+
+
+@cache
+def _mjcf(name: str) -> str:
+    """One of the suite's models, with its includes."""
+    found = importlib.util.find_spec("dm_control")
+    if found is None or found.origin is None:
+        raise ImportError("dm_control is not installed: pip install dm_control")
+    spec = mujoco.MjSpec.from_file(str(Path(found.origin).parent / "suite" / f"{name}.xml"))
+    spec.compile()
+    return spec.to_xml()
+
+
+class Suite(Task):
+    """A model of the suite."""
+
+    name = ""
+
+    def files(self):
+        return {"model.xml": _mjcf(self.name)}
+
+
+class Swingup(Suite):
+    """A cart swings a pole up and keeps it there."""
+
+    name = "cartpole"
+    steps, substeps = 200, 2
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row] = [0.0, np.pi] if rng is None else [rng.uniform(-0.3, 0.3), np.pi + rng.uniform(-0.3, 0.3)]
+
+    def observe(self, sim):
+        angle = sim.qpos[:, 1:]
+        return np.concatenate([sim.qpos[:, :1], sin(angle), cos(angle), sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.5 * (1.0 + cos(sim.qpos[:, 1])) * (1.0 - 0.2 * sim.qpos[:, 0] ** 2)
+
+
+class Cheetah(Suite):
+    """A planar cheetah runs."""
+
+    name = "cheetah"
+    steps, substeps = 250, 2
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 3:] += rng.uniform(-0.1, 0.1, 6)
+            sim.qpos[row, 2] += rng.uniform(-0.1, 0.1)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, 1:], sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return np.clip(sim.qvel[:, 0] / 10.0, -1.0, 1.0)
+
+
+class Catch(Suite):
+    """A cup catches a ball that hangs on a string."""
+
+    name = "ball_in_cup"
+    steps, substeps = 150, 10
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 2] = rng.uniform(-0.1, 0.1)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos, sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        apart = sim.qpos[:, 2:] + [0.0, 0.2] - sim.qpos[:, :2] - [0.0, 0.55]
+        return exp(-((apart / 0.1) ** 2).sum(axis=1))
+
+
+class Walker(Suite):
+    """A planar biped walks at 1 m/s."""
+
+    name = "walker"
+    steps, substeps = 200, 10
+    ending = "fell"
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 3:] += rng.uniform(-0.1, 0.1, 6)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, [0, *range(2, 9)]], sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        upright = 0.5 * (1.0 + cos(sim.qpos[:, 2]))
+        return upright * (0.5 + 0.5 * np.clip(sim.qvel[:, 1], -1.0, 1.0))
+
+    def ended(self, sim):
+        return sim.qpos[:, 0] < -0.5  # the torso is half a metre lower
+
+
+class Spin(Suite):
+    """A finger spins a body by hitting it."""
+
+    name = "finger"
+    steps, substeps = 200, 2
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row] = (
+            [-1.0, 0.0, 0.0] if rng is None else [*rng.uniform([-1.5, -1.0], [-0.5, 1.0]), rng.uniform(-3, 3)]
+        )
+
+    def observe(self, sim):
+        angle = sim.qpos[:, 2:]
+        return np.concatenate([sim.qpos[:, :2], sin(angle), cos(angle), 0.1 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return np.clip(np.abs(sim.qvel[:, 2]) / 15.0, 0.0, 1.0)
+
+
+class Acrobot(Suite):
+    """Two links, driven at the elbow only, swing up."""
+
+    name = "acrobot"
+    steps, substeps = 200, 4
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row] = [np.pi, 0.0] if rng is None else [np.pi, 0.0] + rng.uniform(-0.3, 0.3, 2)
+
+    def observe(self, sim):
+        return np.concatenate([sin(sim.qpos), cos(sim.qpos), 0.2 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        height = cos(sim.qpos[:, 0]) + cos(sim.qpos[:, 0] + sim.qpos[:, 1])  # of the tip above the shoulder [m]
+        return 0.25 * (height + 2.0)
+
+
+class Reach(Suite):
+    """An arm of two links reaches a point, another one in every rollout."""
+
+    name = "reacher"
+    steps, substeps = 100, 1
+
+    def reset(self, sim, row, rng):
+        goal = sim.own.setdefault("goal", np.zeros((len(sim), 2)))
+        angle, radius = (0.5, 0.15) if rng is None else (rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.2))
+        goal[row] = radius * cos(np.array([angle, angle - 0.5 * np.pi]))
+
+    def _apart(self, sim):
+        first, second = sim.qpos[:, 0], sim.qpos[:, 0] + sim.qpos[:, 1]
+        tip = 0.12 * np.stack([cos(first) + cos(second), sin(first) + sin(second)], axis=1)
+        return sim.own["goal"] - tip
+
+    def observe(self, sim):
+        return np.concatenate([sin(sim.qpos), cos(sim.qpos), 0.1 * sim.qvel, 5.0 * self._apart(sim)], axis=1)
+
+    def reward(self, sim, action):
+        return exp(-((self._apart(sim) / 0.05) ** 2).sum(axis=1))

@@ -1,0 +1,132 @@
+"""What a class says of itself as a task, and what one control step shows: its specification, and its first mistakes."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Final, TypeVar
+
+import mujoco
+import numpy as np
+
+from farm.arrays import FloatArray
+from farm.errors import ConfigError, TaskError
+from farm.sim import mixed
+from farm.sim.channels import Camera, Channel, Measure
+from farm.sim.engines import BatchEngine
+from farm.sim.scene import MODEL, quiet
+from farm.sim.sim import Sim
+from farm.tasks.acting import shaped
+from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
+from farm.tasks.loop import Batch, again, scores
+
+T = TypeVar("T")
+
+_METHODS: Final = (
+    *("models", "which", "setup", "prepare", "reset", "observe", "act", "reward", "ended", "success", "measure"),
+    *("score", "outcomes"),
+)
+
+
+def specification(task: Task) -> TaskSpec:
+    """A task's specification: its own, or found by one control step of one nominal rollout.
+
+    Raises:
+      ConfigError: the class cannot be a task.
+      TaskError: it returns invalid arrays.
+    """
+    found = task.spec() or _found(task)
+    measures: object = task.measures
+    if not isinstance(measures, tuple | list) or not all(isinstance(each, Measure) for each in measures):
+        raise ConfigError(f"task {type(task).__name__}: measures is {measures!r:.60}; expected a tuple of farm.Measure")
+    names = [each.name for each in task.measures]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
+    several = (_models(task),) if len(task.simulated) > 1 else ()
+    return replace(found, measures=tuple(task.measures), channels=(*found.channels, *several))
+
+
+def _models(task: Task) -> Channel:
+    """The channel that says which of several models a rollout has."""
+    known = mixed.names(task.simulated)
+    return Channel(name=MODEL, kind="flags", shape=(len(known),), labels=known)
+
+
+def tried(task: Task, rollouts: int, look: Callable[[Sim], T]) -> T:
+    """What a function finds in a simulation of a task, of at most this number of rollouts; it is closed afterwards.
+
+    It may be called again: when it reads an output of the simulator for the first time.
+    """
+    quiet()
+    sim = Sim(task.engine(lambda model: BatchEngine(model, rollouts)))
+
+    def begun() -> T:
+        task.setup(sim)
+        return look(sim)
+
+    try:
+        return again(begun)
+    finally:
+        sim.engine.close()
+
+
+def _found(task: Task) -> TaskSpec:
+    quiet()
+    _check_class(task)
+
+    def look(sim: Sim) -> tuple[int, tuple[str, ...]]:
+        batch = Batch(task, sim, [None])
+        x = batch.observe()
+        with np.errstate(all="ignore"):
+            batch.step(np.zeros((1, task.model.nu)))
+            _check_channels(task, batch.frames)
+        return x.shape[1], batch.names
+
+    size, names = tried(task, 1, look)
+    success = None if scores(task) else type(task).success is not Task.success
+    return TaskSpec(
+        observation=size, action=task.model.nu, steps=task.steps, period=task.period, terms=names or ("reward",),
+        success=bool(success), channels=task.channels,
+    )  # fmt: skip
+
+
+def _check_class(task: Task) -> None:
+    """Check a task's attributes and methods.
+
+    Raises:
+      ConfigError: names the first invalid one.
+    """
+    name = type(task).__name__
+    for what, most in (("steps", STEPS_LIMIT), ("substeps", STEPS_LIMIT)):
+        value = getattr(task, what)
+        if type(value) is not int or not 1 <= value <= most:
+            raise ConfigError(f"task {name}: {what} is {value!r}; expected a whole number from 1 to {most}")
+    if task.camera is not None and not isinstance(task.camera, Camera):
+        raise ConfigError(f"task {name}: camera is {task.camera!r}; expected a farm.Camera")
+    channels: object = task.channels
+    if not isinstance(channels, tuple | list) or not all(isinstance(each, Channel) for each in channels):
+        raise ConfigError(f"task {name}: channels is {channels!r:.60}; expected a tuple of farm.Channel")
+    for geom in (geom for channel in task.channels for geom in channel.geoms):
+        if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
+            raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
+    if not task.model.nu:
+        raise ConfigError(f"task {name}: its model has no actuator, so that there is nothing to learn")
+    for method in _METHODS:
+        own, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
+        try:
+            own.bind(*base.parameters)
+        except TypeError:
+            raise ConfigError(f"task {name}: {method}{own}; expected ({', '.join(base.parameters)})") from None
+
+
+def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
+    """Check that the task measures its channels.
+
+    Raises:
+      TaskError: one is missing or has another shape.
+    """
+    missing = [c.name for c in task.channels if c.name not in frames]
+    if missing and type(task).show is Task.show:
+        raise TaskError(f"channel {missing[0]!r} is not measured: measure gives {', '.join(frames)}")
+    shown = task.show({name: values[:, :1] for name, values in frames.items()})
+    for channel in task.channels:
+        shaped(f"channel {channel.name!r}", shown.get(channel.name), (1, 1, *channel.shape))

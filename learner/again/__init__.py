@@ -1,0 +1,1 @@
+"""Learnt policies act again: replays, rewound exploration, chains."""

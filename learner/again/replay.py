@@ -1,0 +1,172 @@
+"""Loads a run's policy and rolls it out again, under the trained or other settings of its task.
+
+import farm
+
+policy = farm.load("runs/first", friction=0.5)
+print(policy.rollout().trajectory.success)
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from farm import plugins, settings
+from farm.arrays import FloatArray
+from farm.errors import ConfigError
+from farm.moments import normaliser
+from farm.policies.normalised import Normalised
+from farm.rollouts import Runner, build_task
+from farm.sim.model_files import Content, Files
+from farm.sim.trajectory import Trajectory
+from farm.tasks.acting import Acting
+from farm.tasks.loop import Rollouts, Seed, whole
+from learner.run import checkpoint as checkpoints
+from learner.run.checkpoint import Checkpoint
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+from learner.run.setup import Problem, problem, start
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A repeated rollout at physics rate."""
+
+    trajectory: Trajectory
+    frames: Mapping[str, FloatArray]
+    """Measured values of each frame, including qpos (F, nq)"""
+    rollouts: Rollouts
+    """One row."""
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """The mean policy of a run after some generation."""
+
+    problem: Problem
+    generation: int
+    """Number of updates before it."""
+    mu: FloatArray
+    """The search's mean, (P,)"""
+
+    @cached_property
+    def runner(self) -> Runner:
+        """Simulates it in this process."""
+        return self.problem.runner()
+
+    @property
+    def parameters(self) -> FloatArray:
+        """The policy's parameters, (P,): mu, times the policy's scale if it has one."""
+        scale = self.problem.policy.scale
+        return self.mu if scale is None else scale * self.mu
+
+    def acting(self, count: int = 1) -> Acting:
+        """It acts in this number of rollouts, with their memories."""
+        return Acting(self.problem.policy, np.repeat(self.mu[None], count, axis=0))
+
+    def rollout(self, theta: FloatArray | None = None, seed: Seed = None) -> Replay:
+        """One rollout of it, or of other parameters (P,), from the start for a seed (None: nominal)."""
+        chosen = self.mu if theta is None else theta
+        return self.rollouts(chosen[None], [seed])[0]
+
+    def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
+        """Rollouts of parameters (B, P), from the starts for their seeds."""
+        found = self.runner.rollouts(theta, list(seeds), physics=True)
+        rows = range(len(theta))
+        return [Replay(self.runner.trajectory(found, i), whole(found, i), found.at(slice(i, i + 1))) for i in rows]
+
+
+def load(path: str | Path, generation: int | None = None, **changed: Any) -> LoadedPolicy:  # noqa: ANN401
+    """The mean policy of the run in a folder, after a generation (None: the last), with other settings of its task.
+
+    Raises:
+      ConfigError: it is not stored, or cannot be simulated like that.
+
+    Example:
+      ```python
+      import farm
+
+      policy = farm.load("runs/first", friction=0.5)
+      trajectory = policy.rollout(seed=3).trajectory
+      print(trajectory.value, trajectory.success, trajectory.times[-1])  # return, success, duration [s]
+      assert trajectory.bodies.shape[2] == 7  # (F, bodies, 7): position [m] and quaternion
+      ```
+    """
+    folder = RunFolder.open(Path(path))
+    config = folder.read_config()
+    try:
+        task = replace(config.task_config, **changed)
+    except TypeError:
+        raise ConfigError(f"no settings of {config.task}: {', '.join(changed)}") from None
+    return loaded(folder, generation, task)
+
+
+def loaded(
+    folder: RunFolder,
+    generation: int | None = None,
+    task: Any = None,  # noqa: ANN401
+    average: int | None = None,
+) -> LoadedPolicy:
+    """Like `load`, with all settings of the task in one object, and the average of this number of last means.
+
+    Without `average`: the run's own setting for its final policy, 1 for an earlier generation.
+
+    Raises:
+      ConfigError: it is not stored, or cannot be simulated like that.
+    """
+    config = folder.read_config()
+    at = checkpoints.load(folder.checkpoint)
+    last = int(at.state["generation"])
+    chosen = last if generation is None else generation
+    seen = normaliser(at.moments)
+    mu, seen = (at.state["mu"], seen) if chosen == last else _earlier(folder, at, chosen, seen)
+    own = config.average if generation is None else 1
+    mu = folder.parameters.average(chosen, mu, own if average is None else average)
+    return LoadedPolicy(seeing(restored(folder, at, task), seen), chosen, mu)
+
+
+def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
+    """A run's problem from its checkpoint, with all settings of the task in one object; None for the run's own.
+
+    Raises:
+      ConfigError: it cannot be simulated like that.
+    """
+    config, files = folder.read_config(), folder.files(at)
+    if task is not None and task != config.task_config:
+        files = _files(config, replace(config, task_config=task), files)
+        config = replace(config, task_config=task)
+    found = problem(replace(config, stop_when_solved=None), at.constants, files)
+    if changed := [name for name in ("task", "policy") if at.code.get(name) != found.code[name]]:
+        log.warning(
+            "%s: the code of its %s has changed since the run began; these are the numbers of the present code",
+            folder.path, " and ".join(changed),
+        )  # fmt: skip
+    return found
+
+
+def seeing(found: Problem, seen: FloatArray) -> Problem:
+    """The problem with the policy's observations normalised by (2, d); unchanged if d is 0."""
+    return replace(found, policy=Normalised(found.policy, seen)) if seen.size else found
+
+
+def _files(old: RunConfig, new: RunConfig, kept: Files) -> dict[str, Content]:
+    """Files of a task with other settings: the run's own, except those that depend on the settings."""
+    plugin = plugins.find("tasks", old.task)
+    before, after = (dict(build_task(plugin, settings.to_dict(c.task_config), None).sources) for c in (old, new))
+    return {name: kept[name] if name in kept and text == before.get(name) else text for name, text in after.items()}
+
+
+def _earlier(folder: RunFolder, at: Checkpoint, generation: int, last: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """An earlier mean and its normaliser; those of generation 0 follow from the configuration."""
+    if generation != 0:
+        return folder.parameters.mean(generation)
+    config = folder.read_config()
+    if config.init_from is not None:
+        raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
+    return start(config, folder.name, folder.files(at))[1].state["mu"], normaliser(np.zeros(1 + last.size))

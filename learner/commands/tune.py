@@ -1,0 +1,229 @@
+"""`farm tune`: a race of policies and algorithms on one task."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.live import Live
+from rich.table import Table
+
+from farm.commands import logs
+from farm.commands.logs import say
+from farm.commands.screen import compact, plain, wide
+from farm.commands.signals import INTERRUPTED, stop_flag
+from farm.errors import ConfigError, writing
+from farm.settings import Settings, setting
+from learner.commands.options import flag, parse
+from learner.commands.sweep import check_sharing
+from learner.run import config as configs
+from learner.run.config import RunConfig
+from learner.run.files import replace_text
+from learner.sweep import figure, race, result
+from learner.sweep.portfolio import portfolio
+from learner.sweep.race import Entry, Race
+from learner.sweep.runs import Sharing, site
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneCommand(Settings):
+    """Races policies and algorithms on a task: farm tune TASK. Run it again to continue.
+
+    The worse half is dropped again and again; the best one learns to the end.
+    """
+
+    rollouts: int | None = setting(None, least=1, most=race.MOST_ROLLOUTS)
+    """Exploring rollouts of all entries together; half of them are the winner's last ones."""
+    minutes: float | None = setting(None, above=0.0, most=1e5)
+    """Instead of --rollouts: so many rollouts as the local workers do in about this time, measured once."""
+    portfolio: str = "general"
+    """What is tried: a name, or FILE.py:CLASS."""
+    entry: tuple[str, ...] = ()
+    """NAME=V,NAME=V,...: settings that are tried as well, for example policy=mlp,algorithm=es,pairs=40; repeatable."""
+    only: tuple[str, ...] = ()
+    """An entry of the portfolio, repeatable; the others are left out."""
+    list: bool = False
+    """Print the entries as flags of farm run, and do nothing."""
+    out: Path | None = None
+    """Folder of the race: its runs, result.md, figure.svg; by default tunes/TASK-sSEED."""
+    preset: str | None = None
+    """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
+    config: Path | None = None
+    """Settings to start from: a config.json (other flags override it)."""
+    sharing: Sharing = field(default_factory=lambda: Sharing(record=True))
+    """Workers of the runs; --no-record: no recording of the winner."""
+    run: RunConfig = field(default_factory=RunConfig)
+    """Settings of all entries."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rollouts is not None and self.minutes is not None:
+            raise ConfigError("--rollouts and --minutes exclude each other")
+        if self.minutes is not None and not self.sharing.processes:
+            raise ConfigError("--minutes measures this machine, whose workers take no part: give --rollouts")
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command."""
+    words = _task_as_flag(words)
+    command, _, begin = parse(TuneCommand, words, "farm tune")
+    _check_common(command, begin)
+    entries = _entries(command, words)
+    if command.list:
+        _list(entries)
+        return 0
+    if command.rollouts is None and command.minutes is None:
+        raise ConfigError("farm tune needs --rollouts or --minutes: how much to try, for example --rollouts 60000")
+    path = command.out or Path("tunes") / f"{result.plain(command.run.task)}-s{command.run.seed}"
+    chosen = Race(path, tuple(entries), _rollouts(command, entries, path))
+    race.check(chosen)
+    check_sharing(command.sharing)
+    logs.set_up("WARNING")
+    chosen.prepare()
+    with stop_flag("saving and ending") as stop:
+        with Standing(chosen) as shown, site(command.sharing, [entry.config for entry in entries]) as place:
+            over = chosen.run(place, shown, stop.is_set, record=command.sharing.record)
+        if not over:
+            say("the same command continues")
+            return INTERRUPTED
+    _conclude(chosen, recorded=command.sharing.record)
+    return 0
+
+
+def _task_as_flag(words: Sequence[str]) -> list[str]:
+    """The words, with the task of `farm tune TASK` as a flag."""
+    own = list(words)
+    return ["--task", *own] if own and not own[0].startswith("-") else own
+
+
+def _check_common(command: TuneCommand, begin: RunConfig) -> None:
+    """Check that flags for all entries are settings of all entries."""
+    if command.run.generations != begin.generations:
+        raise ConfigError("--generations follows from --rollouts: leave it out")
+    for part in ("policy", "algorithm"):
+        if getattr(command.run, f"{part}_config") != getattr(begin, f"{part}_config"):
+            changed = next(name for name, *_ in configs.changes(begin, command.run))
+            raise ConfigError(
+                f"--{changed} is a setting of one {part}, but entries differ in theirs: put it into an --entry"
+            )
+
+
+def _entries(command: TuneCommand, words: Sequence[str]) -> list[Entry]:
+    """The chosen entries of the portfolio, and those of the flags."""
+    table = portfolio(command.portfolio)
+    if unknown := [name for name in command.only if name not in table]:
+        raise ConfigError(f"--only {unknown[0]}: no such entry; known are {', '.join(table)}")
+    found = race.entries_of(command.run, {k: v for k, v in table.items() if not command.only or k in command.only})
+    for text in command.entry:
+        name = result.plain(text)
+        with race.described(text):
+            own = [flag(*pair) for pair in _pairs(text)]
+            found.append(race.entry_of(name, parse(TuneCommand, [*words, *own], "farm tune")[0].run))
+    return found
+
+
+def _pairs(text: str) -> list[tuple[str, str]]:
+    pairs = [part.partition("=") for part in text.split(",")]
+    if not all(name.strip() and equals and value.strip() for name, equals, value in pairs):
+        raise ConfigError("not of the form NAME=VALUE,NAME=VALUE, for example policy=mlp,algorithm=es,pairs=40")
+    return [(name.strip().lstrip("-"), value.strip()) for name, _, value in pairs]
+
+
+def _list(entries: Sequence[Entry]) -> None:
+    table = compact()
+    for column in ("entry", "rollouts per generation", "flags of farm run"):
+        table.add_column(column, no_wrap=column == "entry")
+    for entry in entries:
+        table.add_row(entry.name, str(entry.per_generation), plain(shlex.join(configs.flags(entry.config))))
+    wide().print(table)
+
+
+def _rollouts(command: TuneCommand, entries: Sequence[Entry], path: Path) -> int:
+    """The number of rollouts: as given, as measured, or as measured when the race began."""
+    if command.minutes is None:
+        assert command.rollouts is not None
+        return command.rollouts
+    if (path / "race.json").exists():
+        return int(race.read(path / "race.json")["rollouts"])
+    found = race.affordable(entries, command.minutes, command.sharing.processes)
+    workers = command.sharing.processes
+    say(
+        f"{command.minutes:g} minutes are some {found} rollouts on {workers} workers: as --rollouts {found} from now on"
+    )
+    return found
+
+
+def _conclude(done: Race, *, recorded: bool) -> None:
+    """Write the page and the figure, and say who has won."""
+    drawn = figure.available()
+    with writing(f"to {done.path}"):
+        if drawn:
+            figure.draw(result.curves(done), done.path / "figure.svg", [rung.rollouts for rung in done.rungs])
+        replace_text(done.path / "result.md", result.page(done, figure=drawn))
+    wide().print(_table(done))
+    folder = done.folder(done.winner)
+    say(f"{done.winner.name} wins; the numbers are mean returns from perturbed starts: {done.path}/result.md")
+    say(f"without the race: {result.command(done)}")
+    say(f"look at it with: farm {'view' if recorded else 'replay'} {folder}")
+    if not drawn:
+        say(f"no figure: {figure.INSTALL}")
+
+
+def _table(shown: Race, now: Mapping[str, str] | None = None) -> Table:
+    """One line per entry, best first; `now` has the state of those that run."""
+    table = compact()
+    for head in (*result.heads(shown), *([] if now is None else ["now"])):
+        table.add_column(head, justify="left" if head in ("entry", "now") else "right", no_wrap=True)
+    for name, *scores in result.rows(shown):
+        table.add_row(name, *scores, *([] if now is None else [now.get(name, "")]))
+    return table
+
+
+class Standing:
+    """Shows a race: a live table on a terminal, else a line per rung and per entry that ends one."""
+
+    def __init__(self, shown: Race) -> None:
+        self._race, self._now = shown, dict[str, str]()
+        self._names = {shown.folder(entry).name: entry.name for entry in shown.entries}
+        self._console = wide()
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._heard: set[str] = set()
+
+    def __enter__(self) -> "Standing":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def rung(self, number: int) -> None:
+        """Say who takes part in a rung."""
+        rung, names = self._race.rungs[number], [entry.name for entry in self._race.running(number)]
+        self._now = dict.fromkeys(names, "waits")
+        if not self._draw():
+            say(f"rung {number + 1} of {len(self._race.rungs)}, to {rung.rollouts} rollouts each: {', '.join(names)}")
+
+    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+        """Show a finished generation."""
+        self._now[self._names[run]] = f"{generation} of {of} generations, {returned:.4g}"
+        self._draw()
+
+    def said(self, run: str, line: str) -> None:
+        """Show a learner's message, for example that no worker answers; equal messages are shown once."""
+        if line not in self._heard:
+            self._heard.add(line)
+            self._console.print(plain(f"{run}: {line}"), highlight=False)
+
+    def ended(self, run: str, state: str, said: str) -> None:
+        """Show that an entry has ended its rung."""
+        self._now[self._names[run]] = state
+        if not self._draw() or state == "failed":
+            self._console.print(plain(f"{run} {state}" + (f": {said}" if said else "")), highlight=False)
+
+    def _draw(self) -> bool:
+        """Draw the live table; return whether there is one."""
+        if self._console.is_terminal:
+            self._live.update(_table(self._race, self._now), refresh=True)
+        return self._console.is_terminal

@@ -1,0 +1,1 @@
+"""Learnt policies for use elsewhere."""

@@ -1,0 +1,1 @@
+"""A run: its settings, its beginning, its loop, its folder, its end."""

@@ -1,0 +1,156 @@
+"""The state needed to resume a run, in one file that is replaced atomically."""
+
+import hashlib
+import logging
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm.arrays import FloatArray, array
+from farm.errors import CheckpointError, MessageError
+from farm.net import codec
+
+log = logging.getLogger(__name__)
+
+_MAGIC: Final = b"rolloutfarm checkpoint 2\n"
+_SCHEMA: Final = 2  # of what follows, whichever version messages have
+_DIGEST: Final = hashlib.sha256().digest_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class BestRollout:
+    """A rollout that can be repeated."""
+
+    seed: tuple[int, ...] | None
+    """None for nominal conditions."""
+    theta: FloatArray = array("<f8", 1)
+    """Its parameters, (P,)"""
+    normaliser: FloatArray = array("<f8", 2, np.empty((2, 0)))
+    """Mean and standard deviation that its observations were normalised by, (2, d) or (2, 0)"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """State of a run between two generations."""
+
+    run: str
+    config: dict[str, Any]
+    """As in config.json."""
+    state: dict[str, Any]
+    """The algorithm's state, from its `to_dict`."""
+    rollouts: int
+    """Exploring rollouts so far."""
+    reissued: int
+    """Jobs reissued so far."""
+    seconds: float
+    """Wall time so far [s]."""
+    solved: int
+    """Successive generations in which the mean policy succeeded."""
+    best: BestRollout | None
+    best_generation: int
+    canary: str
+    """Fingerprint of the machines whose numbers the run accepts, or how it begins."""
+    replayed: bool
+    """Whether it has been recorded at physics rate."""
+    code: dict[str, str]
+    """Digests of the code that determines its numbers."""
+    files: dict[str, str]
+    """Texts of its task by path."""
+    constants: dict[str, Any]
+    """Constant arrays of its policy by name."""
+    assets: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the other files of its task by path; the folder has their contents."""
+    steps: int = 0
+    """Control steps of all exploring rollouts so far."""
+    pairs: int = 0
+    """Pairs of the next generation; 0: the number in the algorithm's settings."""
+    expelled: dict[str, str] = field(default_factory=dict)
+    """Hosts that returned wrong numbers, and the reasons."""
+    checks: dict[str, int] = field(default_factory=dict)
+    """Number of spot checks that each host has passed."""
+    first: dict[str, int] = field(default_factory=dict)
+    """Finished generations when each host answered for the first time."""
+    undone: int = 0
+    """Generations that were repeated because a host in them was expelled."""
+    moments: FloatArray = array("<f8", 1, np.empty(0))
+    """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
+
+
+def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
+    """Replace the file by a new one, or leave the old one as it is.
+
+    A killed process loses nothing. A power failure may truncate the file; `durable` keeps a copy that survives it,
+    `FILE.safe`, but waits for the disk, which takes longer than a short generation.
+    """
+    body = codec.encode(checkpoint, _SCHEMA)
+    content = _MAGIC + hashlib.sha256(body).digest() + body
+    if durable:
+        replace(_safe(path), content, sync=True)
+    replace(path, content)
+
+
+def settle(path: Path) -> None:
+    """Flush the file itself to the disk, and delete the copy."""
+    flush(path)
+    _safe(path).unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Wait until a file is on the disk."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _safe(path: Path) -> Path:
+    return path.with_name(path.name + ".safe")
+
+
+def replace(path: Path, content: bytes, *, sync: bool = False) -> None:
+    """Write a whole file, or (an OSError) leave the old one."""
+    aside = path.with_name(path.name + ".new")
+    try:
+        aside.write_bytes(content)
+        if sync:
+            flush(aside)
+        aside.replace(path)
+    except OSError:
+        aside.unlink(missing_ok=True)
+        raise
+
+
+def load(path: Path) -> Checkpoint:
+    """Read the checkpoint in a file, or in its copy if the file is damaged.
+
+    Raises:
+      CheckpointError: there is none, or it is truncated or of another version.
+    """
+    try:
+        return _read(path)
+    except CheckpointError as error:
+        try:
+            found = _read(_safe(path))
+        except CheckpointError:
+            raise error from None
+        log.warning("%s is missing or damaged; continuing from its copy %s", path, _safe(path).name)
+        return found
+
+
+def _read(path: Path) -> Checkpoint:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"no checkpoint at {path} ({error.strerror}): is this a run's folder?") from None
+    body = content[len(_MAGIC) + _DIGEST :]
+    if not content.startswith(_MAGIC[:-3]):
+        raise CheckpointError(f"{path} is not a checkpoint, or its beginning is damaged")
+    if not content.startswith(_MAGIC):
+        raise CheckpointError(f"{path} is a checkpoint of another version; use the release that wrote it")
+    if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
+        raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
+    try:
+        return codec.decode(body, Checkpoint, _SCHEMA, most=len(body))
+    except MessageError as error:
+        raise CheckpointError(f"{path}: {error}") from None

@@ -1,0 +1,375 @@
+"""The configuration of a run: all settings that its numbers depend on."""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Literal, cast
+
+from farm import plugins, settings
+from farm.errors import ConfigError
+from farm.policies.base import Policy, PolicyConfig
+from farm.seeds import SEEDS
+from farm.settings import Settings, setting
+from farm.tasks.base import Task, TaskConfig
+from learner.algorithms import Algorithm
+
+VERSION: Final = 2
+"""Version of config.json."""
+
+MOST_GENERATIONS: Final = 10_000_000
+"""Of a run."""
+
+PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
+"""Parts of a configuration that are chosen by name and have their own settings, with the kind of plug-in."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Settings):
+    """A run. The same configuration gives the same numbers to the last bit for any number of workers.
+
+    Omitted settings are those of the task's first preset: `RunConfig(task="gym:Swimmer-v5")` can be learnt.
+
+    Raises:
+      ConfigError: a value is invalid, or settings contradict each other.
+
+    Example:
+      ```python
+      import farm
+
+      config = farm.RunConfig(task="finger-gait", policy="linear", seed=3, generations=20)
+      assert (config.algorithm, config.task_config.perturb) == ("pgpe", True)
+      ```
+    """
+
+    task: str = "finger-gait"
+    """What is learnt: a name (farm tasks lists them), gym:NAME, or FILE.py:CLASS."""
+    policy: str = ""
+    """The controller: a name (farm tasks lists them), or FILE.py:CLASS."""
+    algorithm: str = ""
+    """The learning rule: a name (farm tasks lists them), or FILE.py:CLASS."""
+    task_config: TaskConfig = cast("TaskConfig", None)  # filled in below
+    """Settings of the task."""
+    policy_config: PolicyConfig = cast("PolicyConfig", None)
+    """Settings of the policy."""
+    algorithm_config: Algorithm[Any] = cast("Algorithm[Any]", None)
+    """Settings of the algorithm."""
+    seed: int = setting(0, least=0, most=SEEDS - 1)
+    """Seed of everything random in the run."""
+    generations: int = setting(None, least=0, most=MOST_GENERATIONS)  # filled in below
+    """Updates of the search distribution."""
+    stop_when_solved: int | None = setting(None, least=1)
+    """End when the mean policy has succeeded in this number of successive generations, at least those of --average."""
+    stop_after_steps: int | None = setting(None, least=1)
+    """End after the generation in which the exploring rollouts reach this total number of control steps."""
+    episodes: int = setting(1, least=1, most=1000)
+    """Rollouts of each mu + eps and mu - eps, whose mean return counts; with 2 or more, on starts that all share."""
+    average: int = setting(1, least=1, most=MOST_GENERATIONS)
+    """Number of last generations whose means are averaged to give the final policy."""
+    interactions: int | None = setting(None, least=1)
+    """Control steps that a generation should have: the number of pairs, from --pairs to --most-pairs, follows from the
+    steps per pair in the previous generation (Toklu 2020)."""
+    most_pairs: int | None = setting(None, least=1)
+    """With --interactions: largest number of pairs in a generation; by default eight times --pairs."""
+    init_from: str | None = None
+    """Start from the mean, sigma and constants of another run: its folder."""
+    init_sigma: Literal["run", "fresh"] = "run"
+    """With --init-from: take that run's sigma as well, or start with --initial-sigma."""
+    start: Literal["printed", "fitted"] = "printed"
+    """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies kernel, projected)."""
+    traces: Literal["all", "extremes", "none"] = "extremes"
+    """Which traces are recorded: those of all rollouts, of the best and worst of each generation, or none."""
+
+    def __post_init__(self) -> None:
+        """Fill in omitted settings, and check every value."""
+        for part, kind in PARTS.items():
+            if name := getattr(self, part):
+                object.__setattr__(self, part, plugins.find(kind, name).name)  # of a file: with its absolute path
+        for name, value in _filled(self).items():
+            object.__setattr__(self, name, value)
+        super().__post_init__()
+        self._check_interactions()
+        if self.episodes > 1 and not self.task_config.perturb:
+            raise ConfigError(
+                f"--episodes {self.episodes} and --no-perturb exclude each other: unperturbed rollouts are all alike"
+            )
+        owners: dict[str, str] = {"name": "plug-in"}
+        for part in ("run", *PARTS):
+            for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
+                if owners.setdefault(name, part) != part:
+                    whose = f"{part} {getattr(self, part)!r}"
+                    raise ConfigError(f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one")
+
+    def _check_interactions(self) -> None:
+        least = getattr(self.algorithm_config, "pairs", None)
+        if self.interactions is not None and least is None:
+            raise ConfigError(f"--interactions needs an algorithm with --pairs, which {self.algorithm} does not have")
+        if self.most_pairs is not None and self.interactions is None:
+            raise ConfigError("--most-pairs is for --interactions: give both")
+        if self.most_pairs is not None and least is not None and self.most_pairs < least:
+            raise ConfigError(f"most-pairs is {self.most_pairs}; expected at least {least} (pairs)")
+
+    def algorithm_of(self, pairs: int) -> Algorithm[Any]:
+        """The algorithm with this number of pairs; 0: the number in its settings."""
+        own: Any = self.algorithm_config
+        return replace(own, pairs=pairs) if pairs else own
+
+    def pairs_after(self, pairs: int, steps: int) -> int:
+        """Pairs of the generation after one with these pairs and control steps; 0: as in the algorithm's settings."""
+        if self.interactions is None:
+            return 0
+        least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
+        return min(max(-(-self.interactions * (pairs or least) // steps), least), self.pairs_at_most)
+
+    @property
+    def pairs_at_most(self) -> int:
+        """Largest number of pairs in a generation, with interactions."""
+        least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
+        return 8 * least if self.most_pairs is None else self.most_pairs
+
+
+def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
+    return [each.name for each in dataclasses.fields(kind)]
+
+
+def _filled(config: RunConfig) -> dict[str, Any]:
+    """Fill in omitted settings from the task's first preset."""
+    parts = (config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)
+    if all(parts) and config.generations is not None:
+        return {}
+    table = presets(config.task)
+    given: dict[str, Any] = dict(next(iter(table.values()), {}))
+    out: dict[str, Any] = {}
+    if config.generations is None:
+        out["generations"] = given.get("generations", _GENERATIONS)
+    for part, kind in PARTS.items():
+        name = getattr(config, part) or given.get(part) or _GENERAL[part]
+        own = getattr(config, f"{part}_config")
+        out |= {part: name, f"{part}_config": own or _part(kind, name, given)}
+    return out
+
+
+_GENERATIONS: Final = 150
+"""Defaults of presets."""
+
+_FEW: Final = 5
+"""Observed numbers up to which random features learn more than a linear policy: they cover few dimensions only."""
+
+_PGPE: Final[Mapping[str, Any]] = {
+    "algorithm": "pgpe", "initial_mu": 0.0, "shaping": "ranks", "optimiser": "clipup", "sigma_rule": "capped",
+    "learning_rate_sigma": 0.1,
+}  # fmt: skip
+
+_GENERAL: Final[Mapping[str, Any]] = {
+    **_PGPE, "policy": "direct", "features": 50, "bandwidth": 1.0,
+    "initial_sigma": 1.0, "learning_rate_mu": 0.5, "max_speed": 1.0,
+}  # fmt: skip
+"""The settings that runs start from, if the task has no presets and observes few numbers."""
+
+_MANY: Final[Mapping[str, Any]] = {
+    **_PGPE, "policy": "linear", "normalise": True,
+    "initial_sigma": 0.3, "learning_rate_mu": 0.15, "max_speed": 0.3,
+}  # fmt: skip
+"""If it observes more."""
+
+
+@cache
+def _general(task: plugins.Plugin) -> Mapping[str, Any]:
+    """Of a task without presets."""
+    from farm.rollouts import build_task  # imports MuJoCo, which looks for a screen once, when it is imported
+    from farm.tasks.probe import specification
+
+    with suppress(Exception):  # what is wrong with it is said when it is used
+        spec = plugins.no_exit(specification)(build_task(task, {}, None))
+        return _GENERAL if spec.observation <= _FEW else _MANY
+    return _GENERAL
+
+
+def settings_class(kind: str, name: str) -> type[Any]:
+    """The dataclass of a plug-in's settings: its `Config`, or the class itself.
+
+    Raises:
+      ConfigError: there is no such plug-in, or it is of another kind.
+    """
+    target = plugins.find(kind, name).target
+    base = {"tasks": Task, "policies": Policy}.get(kind)
+    if base is not None and not (isinstance(target, type) and issubclass(target, base)):
+        raise ConfigError(f"{name} is not a {base.__name__}: derive its class from farm.{base.__name__}")
+    config = getattr(target, "Config", target)
+    if base is None and not all(hasattr(config, each) for each in ("signs", "init", "restore", "ask", "tell")):
+        raise ConfigError(f"{name} is no algorithm: it needs signs, init, restore, ask and tell")
+    if not dataclasses.is_dataclass(config) or "Config" in vars(target) and _undecorated(config):
+        raise ConfigError(f"settings of {name}: put @dataclass(frozen=True, kw_only=True) on its class")
+    settings_base = {"tasks": TaskConfig, "policies": PolicyConfig}.get(kind, object)
+    if not issubclass(config, settings_base):
+        raise ConfigError(f"settings of {name}: derive its Config from farm.{settings_base.__name__}")
+    return cast("type[Any]", config)
+
+
+def _undecorated(config: type) -> bool:
+    return any(name not in _fields(config) for name in vars(config).get("__annotations__", {}))
+
+
+def _part(kind: str, name: str, given: Mapping[str, Any]) -> Any:  # noqa: ANN401  settings of that plug-in
+    config = settings_class(kind, name)
+    known = {each: value for each, value in given.items() if each in _fields(config)}
+    return settings.from_dict(config, known, name)
+
+
+def presets(task: str) -> dict[str, Mapping[str, Any]]:
+    """Settings that runs of a task start from, by preset and flag; the first preset is the default."""
+    settings_class("tasks", task)
+    plugin = plugins.find("tasks", task)
+    own = plugin.target.presets
+    if not isinstance(own, Mapping) or not own or not all(isinstance(each, Mapping) for each in own.values()):
+        raise ConfigError(f"presets of {task}: expected tables of settings by name, one or more")
+    return {name: given or _general(plugin) for name, given in own.items()}
+
+
+def configure(task: str = "finger-gait", preset: str | None = None, **changed: Any) -> RunConfig:  # noqa: ANN401
+    """A preset with some settings changed, each by its flag's name.
+
+    Raises:
+      ConfigError: there is no such task, preset or setting, or a value is invalid.
+
+    Example:
+      ```python
+      import farm
+
+      config = farm.configure("finger-gait", policy="linear", friction=0.5, pairs=10)
+      assert (config.task_config.friction, config.algorithm_config.pairs) == (0.5, 10)
+      ```
+    """
+    table = presets(task)
+    name = preset or next(iter(table))
+    if name not in table:
+        raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
+    begin = RunConfig(task=task)
+    given: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
+    for part, kind in PARTS.items():  # another policy keeps settings of the preset, another algorithm none
+        own = given.get(part, getattr(begin, part))
+        chosen = changed.get(part, own)
+        others = set(_fields(settings_class(kind, chosen))) if part == "policy" or chosen == own else set()
+        given = {k: v for k, v in given.items() if k in others or k not in _fields(settings_class(kind, own))}
+    return changed_by(begin, {**given, **changed}, fresh=True)
+
+
+def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
+    """A configuration with some settings changed, each by its flag's name.
+
+    A part that is replaced (or all, if `fresh`) starts with its own defaults.
+    """
+    parts: dict[str, Any] = {}
+    known = {"task", "policy", "algorithm"}
+    for part, kind in PARTS.items():
+        name = given.get(part, getattr(config, part))
+        old = getattr(config, f"{part}_config")
+        begin = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
+        known |= set(_fields(settings_class(kind, name)))
+        parts |= {part: name, f"{part}_config": _part(kind, name, {**begin, **given})}
+    run = {k: v for k, v in given.items() if k in _fields(config) and k not in known}
+    if unknown := [k for k in given if k not in known and k not in run]:
+        raise ConfigError(f"unknown setting {', '.join(unknown)}")
+    return replace(config, **parts, **run)
+
+
+_APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved", "stop-after-steps"}
+
+
+def preset_of(config: RunConfig) -> str:
+    """The preset that a configuration equals except for seed and length, or "own"."""
+    for name in presets(config.task):
+        if {change[0] for change in changes(configure(config.task, name), config)} <= _APART:
+            return name
+    return "own"
+
+
+def properties(config: RunConfig) -> dict[str, str | int]:
+    """A short description of a run."""
+    return {"preset": preset_of(config), "policy": config.policy, "task": config.task, "seed": config.seed}
+
+
+def to_dict(config: RunConfig) -> dict[str, Any]:
+    """Its form in config.json and in a checkpoint."""
+    parts = {part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
+             for part in PARTS}  # fmt: skip
+    own = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in PARTS}
+    return {"version": VERSION, **parts, **own}
+
+
+def from_dict(values: object, where: str) -> RunConfig:
+    """The configuration in a parsed config.json.
+
+    Raises:
+      ConfigError: another version, unknown names, wrong types or impossible values; `where` is named.
+    """
+    if not isinstance(values, dict) or values.get("version") != VERSION:
+        found = values.get("version") if isinstance(values, dict) else None
+        raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(found)[:40]!r})")
+    made: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *PARTS)}
+    if unknown := [name for name in (f"{part}_config" for part in PARTS) if name in made]:
+        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}")
+    for part, kind in PARTS.items():
+        table = values.get(part)
+        if not isinstance(table, dict) or type(table.get("name")) is not str:
+            raise ConfigError(f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name")
+        own = {k: v for k, v in table.items() if k != "name"}
+        config = settings.from_dict(settings_class(kind, table["name"]), own, f"{where}: {part}")
+        made |= {part: table["name"], f"{part}_config": config}
+    return settings.from_dict(RunConfig, made, where)
+
+
+def read(path: Path) -> RunConfig:
+    """The configuration in a file.
+
+    Raises:
+      ConfigError: it cannot be read or is invalid.
+    """
+    try:
+        values = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} is not JSON: {error}") from None
+    return from_dict(values, str(path))
+
+
+def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
+    """Settings that differ: name, old and new value; for different plug-ins only those that both have."""
+    before, after = flat(old), flat(new)
+    for name, value in before.items():
+        if name in after and value != after[name]:
+            yield name, value, after[name]
+
+
+def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
+    """Differences that make two configurations different runs: all except the number of generations."""
+    return (change for change in changes(old, new) if change[0] != "generations")
+
+
+def flat(config: RunConfig) -> dict[str, object]:
+    """Every setting by its flag's name."""
+    out: dict[str, Any] = {}
+    for name in _fields(config):
+        value = getattr(config, name)
+        out |= settings.to_dict(value) if name.endswith("_config") else {name: value}
+    return {name.replace("_", "-"): value for name, value in out.items()}
+
+
+def flags(config: RunConfig) -> list[str]:
+    """The flags with which `farm run` takes this configuration."""
+    parts = {part: getattr(config, part) for part in PARTS}
+    general = configure(parts["task"])
+    begin = changed_by(general, {part: parts[part] for part in ("policy", "algorithm")})
+    own = [("task", RunConfig.task, parts["task"]), *((part, getattr(general, part), parts[part]) for part in parts)]
+    return [word for name, old, new in (*own, *changes(begin, config)) if old != new for word in _flag(name, new)]
+
+
+def _flag(name: str, value: object) -> list[str]:
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    values = value if isinstance(value, (tuple, list)) else [value]
+    return [word for each in values for word in (f"--{name}", str(each))]

@@ -1,0 +1,83 @@
+"""What a round says in numbers, and the evaluation of the mean policy: its jobs and their results."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from farm import seeds
+from farm.arrays import BoolArray
+from farm.net.work import Jobs, Simulated
+from farm.sim.trajectory import Trajectory
+from farm.tasks.base import TaskSpec
+from learner.scheduler.round import RoundResults
+
+EVALUATION_ROLLOUTS: Final = 100
+"""Number of rollouts of the evaluation at the end of a run, and default of `farm evaluate`."""
+
+EVALUATION_SEED: Final = 0
+"""Its seed."""
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """The mean policy's rollout under nominal conditions, at physics rate."""
+
+    value: float
+    """Its return."""
+    success: bool | None
+    """None if the task does not define success."""
+    trajectory: Trajectory | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Evaluation at the end of a run: the mean policy, unperturbed and perturbed."""
+
+    mean: Nominal
+    robust_success_rate: float | None
+    """Share of the perturbed rollouts that succeeded; None if the task does not define success."""
+    robust_return: float
+    """Mean return of the perturbed rollouts."""
+    measures: tuple[dict[str, float | None], dict[str, float | None]]
+    """The task's measures by name: of the nominal rollout, and means over the perturbed ones that did not fail."""
+    replay: Trajectory | None
+    """The best rollout of the run at physics rate, if it has not been reported yet."""
+
+
+def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
+    """Jobs of the mean policy on perturbed starts, and last on the nominal one at physics rate."""
+    trials = Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
+    return Jobs.joined([*([trials] if rollouts else []), Jobs.mean("physics", [None])])
+
+
+def outcome(spec: TaskSpec, found: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
+    """The part of GenerationStats that follows from a round: exploring rollouts, then the mean policy's."""
+    returns, flags = found.returns[:rollouts], found.flags[:rollouts]
+    _, ended, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
+    return {
+        "return_mean": float(returns.mean()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "return_std": float(returns.std()),
+        "mean_policy_return": float(found.returns[rollouts]),
+        "mean_policy_success": bool(found.flags[rollouts, 0]) if spec.success else None,
+        "success_rate": success_rate(spec, flags),
+        "ended": ended,
+        "failed": failed,
+        "clamped": clamped,
+        "measures": means_of_measures(spec, found, slice(rollouts)),
+        "mean_policy_measures": means_of_measures(spec, found, slice(rollouts, rollouts + 1)),
+    }
+
+
+def success_rate(spec: TaskSpec, flags: BoolArray) -> float | None:
+    """Fraction of the rollouts (S, 4) that succeeded; None if the task does not define success."""
+    return float(np.mean(flags[:, 0])) if spec.success else None
+
+
+def means_of_measures(spec: TaskSpec, found: RoundResults | Simulated, rows: slice) -> dict[str, float | None]:
+    """Means of the task's measures over rollouts that did not fail, by name."""
+    sound = np.flatnonzero(~found.flags[rows, 2])
+    columns = enumerate(each.name for each in spec.measures)
+    return {name: float(found.measures[rows][sound, at].mean()) if sound.size else None for at, name in columns}

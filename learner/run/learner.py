@@ -1,0 +1,387 @@
+"""The learning loop: ask for samples, simulate, tell the results, save, and report."""
+
+import errno
+import hashlib
+import itertools
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from farm import seeds
+from farm.arrays import FloatArray, IntArray
+from farm.errors import CheckpointError, RunError
+from farm.moments import merged, normaliser
+from farm.net.messages import Spec
+from farm.net.stats import GenerationStats
+from farm.net.telemetry import Report
+from farm.net.work import Jobs
+from farm.tasks.base import Task
+from learner import algorithms
+from learner.algorithms import Algorithm, SearchState
+from learner.run import config as configs
+from learner.run.checkpoint import BestRollout, Checkpoint
+from learner.run.config import RunConfig
+from learner.run.diagnosis import Diagnosis
+from learner.run.evaluation import (
+    EVALUATION_ROLLOUTS,
+    EVALUATION_SEED,
+    Evaluation,
+    Nominal,
+    evaluation_jobs,
+    means_of_measures,
+    outcome,
+    success_rate,
+)
+from learner.run.folder import RunFolder
+from learner.run.setup import Problem
+from learner.run.states import RolledBack, goes_back_to
+from learner.scheduler.dispatcher import Dispatcher
+from learner.scheduler.round import RoundResults
+
+log = logging.getLogger(__name__)
+
+REPLAY_EVERY: Final = 10
+"""Generations between two recordings of the best rollout at physics rate: late in a run, most have a new best."""
+
+
+DURABLE_EVERY: Final = 1.0
+"""Time between two checkpoints that survive a power failure [s]; the others survive a killed learner only."""
+
+_MEASURED: Final = ("mean_policy_measures", "robust_measures")
+"""In the summary."""
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)  # full disk, or the user's quota
+
+
+class Learner:
+    """One run, from its start or its checkpoint to its end."""
+
+    def __init__(self, problem: Problem, folder: RunFolder, at: Checkpoint) -> None:
+        """Continue a run from its checkpoint; a new run has that of `start`.
+
+        Raises:
+          CheckpointError: the checkpoint does not fit the configuration.
+        """
+        # The best rollout is reported again: the process that ends the run writes a new replay.rrd.
+        self.problem, self.config, self.folder = problem, problem.config, folder
+        self._at = replace(at, replayed=at.best is None)
+        try:
+            self.state: SearchState = self._algorithm.restore(at.state)
+        except ValueError as error:
+            raise CheckpointError(f"{folder.checkpoint}: {error}") from None
+        self._before, self._checks = at.reissued, at.checks
+        self._written = configs.to_dict(self.config)
+        self._durable = time.monotonic()
+        self._signs = self.config.algorithm_config.signs()
+        self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.traced else "none"
+        folder.keep_files(problem.task.sources)
+        folder.save(self._at)
+
+    @property
+    def run(self) -> str:
+        """The id of its recordings: the run's original name, as its folder may have been renamed.
+
+        What a run records after it went back is another recording than what it recorded before.
+        """
+        return f"{self._at.run}-undone{self.undone}" if self.undone else self._at.run
+
+    @property
+    def undone(self) -> int:
+        """Generations that were repeated because a host in them was expelled."""
+        return self._at.undone
+
+    @property
+    def spec(self) -> Spec:
+        """The workers' specification, named after the folder, so that copies of a run can continue at the same time."""
+        return self.problem.specification(self.folder.name)
+
+    @property
+    def canary(self) -> str:
+        """Fingerprint of the machines whose numbers the run accepts, or how it begins."""
+        return self._at.canary
+
+    @property
+    def _algorithm(self) -> Algorithm[Any]:
+        """The algorithm with this generation's number of pairs."""
+        return self.config.algorithm_of(self._at.pairs)
+
+    @property
+    def over(self) -> bool:
+        """Whether all generations are done."""
+        config, at = self.config, self._at
+        # With averaging, all averaged means must have succeeded.
+        solved = config.stop_when_solved is not None and at.solved >= max(config.stop_when_solved, config.average)
+        spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
+        return self.state.generation >= config.generations or solved or spent
+
+    def learn(self, dispatcher: Dispatcher) -> Iterator[Report]:
+        """Yield generations until the run is over; the next one is simulated while the caller handles a report.
+
+        Raises:
+          Diverged: mu or sigma would not be finite; the state before is saved.
+          RolledBack: an expelled host had answered in earlier generations; a resume repeats them.
+          RunError: a job failed on several workers, or a file cannot be written.
+          Stopped: the user asked to stop; the last complete generation is saved.
+        """
+        begun = time.monotonic() - self._at.seconds
+        if self.over:
+            return
+        diagnosis = Diagnosis(self.config.algorithm_config)
+        for earlier in self.folder.progress():
+            diagnosis.after(earlier, one_step=self._one_step)
+        eps, hopeless = self._explore(dispatcher), False
+        while not self.over:
+            results, last = self._collected(dispatcher), self._at
+            jobs = len(eps) * self.config.episodes  # the following ones are the mean policy's, and perhaps the best's
+            returns = results.returns[: jobs * len(self._signs)]
+            before = self.state
+            learnt = learnt_from(self.config, self.problem.task, returns, results.steps[: returns.size])
+            self.state = algorithms.tell(self._algorithm, before, eps, learnt)
+            self._note(before, results, returns, learnt, time.monotonic() - begun, dispatcher)
+            if not self.over:
+                eps = self._explore(dispatcher)
+            progress = self._progress(results, returns, dispatcher)
+            try:
+                self._save(progress, last)
+            except OSError as error:
+                self.state, self._at = before, last
+                if not self.folder.there:
+                    raise RunError(f"{self.folder.gone}, after generation {before.generation}") from None
+                advice = "make room and --resume it" if error.errno in _FULL else "--resume it"
+                raise RunError(
+                    f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to generation "
+                    f"{before.generation}: {advice}"
+                ) from None
+            if progress.failed == returns.size and not hopeless:
+                log.warning("all %d rollouts became unstable: farm check shows how they start", returns.size)
+            hopeless = progress.failed == returns.size
+            for message in diagnosis.after(progress, one_step=self._one_step):
+                log.warning("%s", message)
+            dispatcher.report(progress)
+            yield Report(
+                progress=progress,
+                rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
+                sample=results.trajectory(jobs),
+                traces=results.kept_traces(returns.size),
+                replay=results.trajectory(jobs + 1),
+                replay_generation=last.best_generation,
+            )
+
+    def _checked(self, dispatcher: Dispatcher) -> dict[str, int]:
+        """Number of spot checks that each host has passed in the whole run."""
+        now = dispatcher.checks
+        return {name: self._checks.get(name, 0) + now.get(name, 0) for name in sorted({*self._checks, *now})}
+
+    def _collected(self, dispatcher: Dispatcher) -> RoundResults:
+        """A round's results; hosts that are expelled meanwhile are saved at once, so that no resume admits them."""
+        for _ in dispatcher.progress():
+            if dispatcher.admission.expelled.keys() != self._at.expelled.keys():
+                self._expelled(dispatcher)
+        return dispatcher.collect()
+
+    def _expelled(self, dispatcher: Dispatcher) -> None:
+        """Save who is expelled, so that no resume admits or believes them.
+
+        Raises:
+          RolledBack: their numbers are in the state.
+        """
+        self._at = replace(self._at, expelled=dict(dispatcher.admission.expelled))
+        with suppress(OSError):  # if the disk is full, the generation's end says so
+            self.folder.save(self._at)
+        if (generation := goes_back_to(self._at)) is not None:
+            said = f"the run goes back to generation {generation}, before the first answer of a host that is expelled"
+            log.warning("%s; what follows is repeated", said)
+            raise RolledBack(f"{said}: --resume {self.folder.path} repeats what follows")
+
+    def evaluate(self, dispatcher: Dispatcher) -> Evaluation:
+        """The mean policy at the end of the run, averaged over its last generations if the run says so."""
+        jobs = Jobs.joined([evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()])
+        at = self.state.generation
+        mu = self.folder.parameters.average(at, self.state.mu, self.config.average)
+        dispatcher.begin(at, mu, jobs, normaliser=self._normalisers())
+        results, last = self._collected(dispatcher), EVALUATION_ROLLOUTS
+        while dispatcher.check_the_rest():
+            self._expelled(dispatcher)
+            results = self._collected(dispatcher)
+        self._at = replace(self._at, checks=self._checked(dispatcher))
+        self.folder.save(self._at)
+        return Evaluation(
+            mean=Nominal(
+                value=float(results.returns[last]),
+                success=bool(results.flags[last, 0]) if self._judged else None,
+                trajectory=results.trajectory(last),
+            ),
+            robust_success_rate=success_rate(self.problem.spec, results.flags[:last]),
+            robust_return=float(np.mean(results.returns[:last])),
+            measures=(
+                means_of_measures(self.problem.spec, results, slice(last, last + 1)),
+                means_of_measures(self.problem.spec, results, slice(last)),
+            ),
+            replay=results.trajectory(last + 1),
+        )
+
+    def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
+        """The results in summary.json."""
+        at = self.state.generation
+        rates = [p.success_rate for p in self.folder.progress() if p.generation == at]
+        mean = evaluation.mean if evaluation else None
+        numbers = self.state.mu.astype("<f8").tobytes() + self.state.sigma.astype("<f8").tobytes()
+        return {
+            "run": self.folder.name,
+            "seed": self.config.seed,
+            "generations": at,
+            "rollouts": self._at.rollouts,
+            "steps": self._at.steps,
+            "best_return": self.state.best,
+            "mean_policy_return": mean.value if mean else None,
+            "mean_policy_success": mean.success if mean else None,
+            "success_rate": rates[-1] if rates else None,
+            "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
+            "robust_return": evaluation.robust_return if evaluation else None,
+            **(
+                dict(zip(_MEASURED, evaluation.measures, strict=True))
+                if evaluation and self.problem.spec.measures
+                else {}
+            ),
+            "parameters_sha256": hashlib.sha256(numbers).hexdigest(),
+            "seconds": round(self._at.seconds, 3),
+            "rollouts_per_second": round(self._at.rollouts / self._at.seconds, 1) if self._at.seconds else None,
+            "workers": workers,
+            "reissued": self._at.reissued,
+            "checks": self._at.checks,
+            "undone": self._at.undone,
+            "state": state,
+        }
+
+    @property
+    def _one_step(self) -> bool:
+        """Whether every rollout so far was over after one control step, of several."""
+        return self._at.steps == self._at.rollouts and self.problem.task.steps > 1
+
+    @property
+    def best_generation(self) -> int:
+        """The generation of the best rollout so far."""
+        return self._at.best_generation
+
+    def _explore(self, dispatcher: Dispatcher) -> FloatArray:
+        """Draw a generation's eps, and publish its jobs: exploring ones, the mean policy, perhaps the best again."""
+        state = self.state
+        eps, exploring = explored(self.config, state, self._at.pairs)
+        replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
+        jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay])
+        dispatcher.begin(state.generation, state.mu, jobs, self._keep, self._normalisers())
+        return eps
+
+    def _normalisers(self) -> FloatArray:
+        """Normalisers of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
+        now, best = normaliser(self._at.moments), self._at.best
+        return np.stack([now, now if best is None else best.normaliser])
+
+    def _replay_job(self) -> list[Jobs]:
+        """The best rollout so far at physics rate, if it has not been simulated yet."""
+        best = self._at.best
+        return [] if best is None or self._at.replayed else [Jobs.single(best.theta, "physics", best.seed)]
+
+    def _note(
+        self,
+        before: SearchState,
+        results: RoundResults,
+        returns: FloatArray,
+        told: FloatArray,
+        seconds: float,
+        dispatcher: Dispatcher,
+    ) -> None:
+        """Update the checkpoint after the algorithm was told (rows, signs), from the returns (S,) of all rollouts."""
+        best, generation = self._at.best, self._at.best_generation
+        steps = int(results.steps[: returns.size].sum())
+        replayed = self._at.replayed or len(results) > len(told) * self.config.episodes + 1
+        if before.best is None or told.max() > before.best:
+            row, column = divmod(int(told.argmax()), len(self._signs))
+            episode = int(returns.reshape(-1, *told.shape)[:, row, column].argmax())  # the best one of the best
+            job = results.jobs.take([episode * len(told) + row])
+            seed, theta = job.seeds()[column], job.theta(before.mu)[column]
+            best = BestRollout(seed=seed, theta=theta, normaliser=normaliser(self._at.moments))
+            generation, replayed = self.state.generation, False
+        self._at = replace(
+            self._at,
+            config=self._written,
+            state=self.state.to_dict(),
+            rollouts=self._at.rollouts + returns.size,
+            steps=self._at.steps + steps,
+            pairs=self.config.pairs_after(self._at.pairs, steps),
+            reissued=self._before + dispatcher.reissued,
+            checks=self._checked(dispatcher),
+            seconds=seconds,
+            first=dict.fromkeys(dispatcher.hosts, before.generation) | self._at.first,
+            solved=self._at.solved + 1 if results.flags[returns.size, 0] else 0,
+            best=best,
+            best_generation=generation,
+            replayed=replayed,
+            moments=merged(self._at.moments, results.moments[: returns.size]),
+        )
+
+    def _progress(self, results: RoundResults, returns: FloatArray, dispatcher: Dispatcher) -> GenerationStats:
+        state = self.state
+        return GenerationStats(
+            **outcome(self.problem.spec, results, returns.size),
+            generation=state.generation,
+            rollouts=self._at.rollouts,
+            best=float(returns.max()) if state.best is None else state.best,
+            baseline=state.baseline,
+            sigma_mean=float(state.sigma.mean()),
+            sigma_min=float(state.sigma.min()),
+            sigma_max=float(state.sigma.max()),
+            mean_norm=float(np.sqrt((state.mu * state.mu).sum())),
+            reissued=self._at.reissued,
+            workers=len(dispatcher.workers),
+            seconds=round(self._at.seconds, 3),
+        )
+
+    def _save(self, progress: GenerationStats, last: Checkpoint) -> None:
+        if self._at.first != last.first:
+            self.folder.states.keep(last)
+        mu, sigma, seen = self.state.mu, self.state.sigma, normaliser(self._at.moments)
+        self.folder.append(progress, mu, sigma, self.config.generations, seen)
+        now = time.monotonic()
+        durable = now - self._durable > DURABLE_EVERY
+        self._durable = now if durable else self._durable
+        self.folder.save(self._at, durable=durable)
+
+
+def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[FloatArray, Jobs]:
+    """A generation's eps, (rows, P), and its exploring jobs: all its random numbers, seeded by its number.
+
+    Each row has its own start. With several episodes the jobs of all rows come on the first start, then on the second
+    (common random numbers), so that rollouts of a message share a start.
+    """
+    algorithm, episodes = config.algorithm_of(pairs), config.episodes
+    eps = algorithms.ask(algorithm, state, seeds.exploration(config.seed, state.generation))
+    starts = range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
+    drawn = None
+    if config.task_config.perturb:
+        drawn = [seeds.training(config.seed, state.generation, start) for start in starts]
+    return eps, Jobs.exploring(eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), drawn)
+
+
+def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:
+    """What the algorithm is told, (rows, signs): mean returns over the episodes, with the reward's offset.
+
+    Args:
+      config: of the run.
+      task: its task.
+      returns: of the rollouts of `explored`, (S,).
+      steps: their numbers of control steps, (S,).
+    """
+    task_config = config.task_config
+    if task_config.reward_offset:
+        weights = [task.return_scale * task_config.gamma**t * task_config.reward_offset for t in range(task.steps)]
+        returns = returns + np.array([0.0, *itertools.accumulate(weights)])[steps]
+    first, *others = returns.reshape(config.episodes, -1, len(config.algorithm_config.signs()))
+    total = first.copy()
+    for each in others:  # in their order
+        total += each
+    return total / config.episodes

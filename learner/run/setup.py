@@ -1,0 +1,261 @@
+"""The start of a run: task and policy from its configuration, its first state, and its workers' specification."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm import fingerprint, plugins, rollouts, seeds, settings
+from farm.arrays import FloatArray
+from farm.errors import CheckpointError, ConfigError
+from farm.net.messages import Spec
+from farm.policies.base import Policy, check_vector
+from farm.policies.fourier import Kernel, Projected
+from farm.rollouts import Runner, build_policy, build_task
+from farm.sim.model_files import Files, split
+from farm.sim.scene import Scene
+from farm.tasks.base import Task, TaskSpec
+from farm.tasks.probe import specification
+from farm.tasks.standard import nominal, standard
+from learner import algorithms
+from learner.algorithms import SearchState
+from learner.run import checkpoint as checkpoints
+from learner.run import config as configs
+from learner.run.checkpoint import Checkpoint
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+
+MESSAGE_LIMIT: Final = 32 << 20
+"""Largest size of a mean in a message [bytes]; a chunk also holds eps."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A run's search problem: parameters of a policy for a task."""
+
+    config: RunConfig
+    task: Task
+    spec: TaskSpec
+    policy: Policy
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene to draw."""
+        return Scene.of(self.task.simulated)
+
+    def specification(self, run: str) -> Spec:
+        """The specification for workers."""
+        config = self.config
+        task, policy = self._plugins.values()
+        texts, assets = split(self.task.sources)
+        return Spec(
+            run=run, task=task.wire, task_config=settings.to_dict(config.task_config), release=task.release,
+            policy=policy.wire, policy_config=settings.to_dict(config.policy_config), policy_release=policy.release,
+            task_release=self.spec.release, code=self.code, files=texts, assets=assets,
+            constants=dict(self.policy.constants),
+        )  # fmt: skip
+
+    def runner(self) -> Runner:
+        """Prepare simulation in this process; a ConfigError if the task cannot start."""
+        return Runner(self.task, self.policy)
+
+    @plugins.no_exit
+    def begin(self) -> SearchState:
+        """The algorithm's state before the first generation of a run that does not continue another.
+
+        Raises:
+          ConfigError: the policy's start is invalid; TaskError: the algorithm's state is.
+        """
+        size, found = self.policy.size, self.policy.start(seeds.start(self.config.seed))
+        check_vector(f"start of {self._plugins['policy'].wire}", found, size)
+        if found is not None and self.policy.scale is not None:
+            found = found / self.policy.scale
+        return algorithms.begin(self.config.algorithm_config, size, found)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files of its classes, which workers must be allowed to serve."""
+        return tuple(dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None))
+
+    @cached_property
+    def sources(self) -> dict[str, bytes]:
+        """Those files as they were imported, by SHA-256, for workers that accept code."""
+        return {each.digest(): each.source for each in self._plugins.values() if each.file is not None}
+
+    @cached_property
+    def code(self) -> dict[str, str]:
+        """Digests of the code that determines its numbers."""
+        parts = {name: plugin.digest() for name, plugin in self._plugins.items()}
+        return parts | {"simulation": plugins.code_digest(rollouts.SIMULATION)}
+
+    @cached_property
+    def _plugins(self) -> dict[str, plugins.Plugin]:
+        return {"task": plugins.find("tasks", self.config.task), "policy": plugins.find("policies", self.config.policy)}
+
+
+@plugins.no_exit
+def problem(
+    config: RunConfig, constants: Mapping[str, FloatArray] | None = None, files: Files | None = None
+) -> Problem:
+    """Task and policy of a configuration, with a run's constants and files; by default new ones are drawn and read.
+
+    Raises:
+      ConfigError: the task is not available here, or the policy is larger than a message.
+    """
+    task = build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), files)
+    spec = specification(task)
+    if config.stop_when_solved is not None and not spec.success:
+        raise ConfigError(f"--stop-when-solved: {config.task} knows returns, but no success")
+    plugin = plugins.find("policies", config.policy)
+    kind = plugin.target
+    if constants is None:
+        constants = kind.draw(config.policy_config, spec, seeds.features(config.seed))
+        if not isinstance(constants, dict) or not all(_is_constant(values) for values in constants.values()):
+            raise ConfigError(f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name")
+        if kind.standardised:
+            own: Any = config.policy_config
+            constants = constants | standard(task, own.weight_scale)
+    found = Problem(config, task, spec, build_policy(plugin, config.policy_config, spec, constants))
+    _check_size(found)
+    return found
+
+
+def _is_constant(values: object) -> bool:
+    return isinstance(values, np.ndarray) and values.dtype == np.float64 and bool(np.isfinite(values).all())
+
+
+def _check_size(found: Problem) -> None:
+    """Check that a mean fits into a message.
+
+    Raises:
+      ConfigError: it does not; names the largest size that does.
+    """
+    size, most = found.policy.size, MESSAGE_LIMIT // 8
+    if size > most:
+        raise ConfigError(f"the policy has {size} parameters; at most {most} fit into a message")
+    constants = sum(values.nbytes for values in found.policy.constants.values())
+    if constants > MESSAGE_LIMIT:
+        raise ConfigError(
+            f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit into a message"
+        )
+
+
+def fitted(config: RunConfig, exponent: float = 1.0) -> RunConfig:
+    """The configuration with the kernel's width h and the initial sigma computed, if --start is fitted.
+
+    A Gaussian kernel of many numbers is zero nearly everywhere. With these values the initial mean mu has a small
+    output at the nominal start x0 (d,), and a sample changes the exponent by about one:
+
+        |mu - x0|^2 / (2 h^2) = exponent,   d sigma^2 / (2 h^2) = 1:    sigma = h sqrt(2 / d)
+
+    Raises:
+      ConfigError: policy or algorithm have no such settings, mu is x0, or the task is not available here.
+    """
+    if config.start != "fitted":
+        return config
+    kind = plugins.find("policies", config.policy).target
+    policy: Any = config.policy_config
+    algorithm: Any = config.algorithm_config
+    if not issubclass(kind, Kernel | Projected):
+        raise ConfigError(f"--start fitted is for the policies kernel and projected, not {config.policy}")
+    if not (hasattr(algorithm, "initial_mu") and hasattr(algorithm, "initial_sigma")):
+        raise ConfigError(
+            f"--start fitted needs --initial-mu and --initial-sigma, which {config.algorithm} does not have"
+        )
+    if config.init_from is not None:
+        raise ConfigError("--start fitted and --init-from exclude each other: both say where the search begins")
+    if policy.normalise:
+        raise ConfigError("--start fitted and --normalise exclude each other: both fit the kernel to the observation")
+    x0 = nominal(build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), None))
+    difference = algorithm.initial_mu - x0
+    bandwidth = float(np.sqrt((difference * difference).sum() / (2.0 * exponent)))
+    if bandwidth == 0.0:
+        raise ConfigError("--start fitted: --initial-mu is the observation at the start; take another")
+    return replace(
+        config,
+        policy_config=replace(policy, bandwidth=bandwidth),
+        algorithm_config=replace(algorithm, initial_sigma=bandwidth * float(np.sqrt(2.0 / len(x0)))),
+    )
+
+
+def start(config: RunConfig, run: str, files: Files | None = None, numbers: str = "") -> tuple[Problem, Checkpoint]:
+    """A run before its first generation.
+
+    Args:
+      config: of the run.
+      run: its name.
+      files: of its task; by default they are read.
+      numbers: those of the machines that may take part; by default of those like this one.
+
+    Raises:
+      ConfigError: the task is not available here, or the run to start from cannot be used.
+    """
+    other = None if config.init_from is None else _other(config)
+    begun = problem(config, other.constants if other else None, files)
+    state = begun.begin()
+    if other is not None:
+        state = _taken_over(config, state, other)
+    moments = np.zeros(1 + 2 * begun.spec.observation if config.policy_config.normalise else 0)
+    texts, assets = split(begun.task.sources)
+    checkpoint = Checkpoint(
+        run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
+        solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True, code=begun.code,
+        files=texts, assets=assets, constants=dict(begun.policy.constants),
+        moments=other.moments if other else moments,
+    )  # fmt: skip
+    return begun, checkpoint
+
+
+def resumed(
+    folder: RunFolder, config: RunConfig, numbers: str = "", *, mixed: bool = False
+) -> tuple[Problem, Checkpoint]:
+    """A run as saved in its checkpoint, or, if that has numbers of hosts expelled since, as it was before.
+
+    Raises:
+      CheckpointError: it cannot be used, belongs to another configuration, or the code that determines the run's
+        numbers has changed and `mixed` does not allow it.
+    """
+    at = folder.states.without(checkpoints.load(folder.checkpoint))
+    for name, old, new in configs.other(configs.from_dict(at.config, str(folder.checkpoint)), config):
+        raise CheckpointError(
+            f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
+        )
+    if not at.canary.startswith(numbers):
+        raise CheckpointError(f"--numbers {numbers}: the run in {folder.path} began with {at.canary}, and keeps it")
+    found = problem(config, at.constants, folder.files(at))
+    if len(at.moments) != (1 + 2 * found.spec.observation if config.policy_config.normalise else 0):
+        raise CheckpointError(f"{folder.checkpoint}: its statistics are of other observations than its task's")
+    changed = [name for name, digest in found.code.items() if at.code.get(name) != digest]
+    if changed and not mixed:
+        raise CheckpointError(
+            f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back, "
+            "begin a new run with --init-from, or continue with --mixed (then the run is not reproducible)"
+        )
+    return found, at
+
+
+def _other(config: RunConfig) -> Checkpoint:
+    """The run to start from, if its parameters have the same meaning."""
+    folder = RunFolder.open(Path(str(config.init_from)))
+    theirs = folder.read_config()
+    for name in ("task", "policy", "policy_config"):
+        there, here = getattr(theirs, name), getattr(config, name)
+        if there != here:
+            raise ConfigError(
+                f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"
+            )
+    return checkpoints.load(folder.checkpoint)
+
+
+def _taken_over(config: RunConfig, fresh: SearchState, at: Checkpoint) -> SearchState:
+    """Start from another run's mean, and perhaps its sigma."""
+    if len(at.state["mu"]) != len(fresh.mu):
+        raise ConfigError(
+            f"--init-from {config.init_from}: it has {len(at.state['mu'])} parameters, this run {len(fresh.mu)}: "
+            "its observation is another"
+        )
+    state = replace(fresh, mu=at.state["mu"])
+    return replace(state, sigma=at.state["sigma"]) if config.init_sigma == "run" else state

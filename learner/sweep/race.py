@@ -1,0 +1,343 @@
+"""A race of settings on one task: successive halving (Jamieson & Talwalkar 2016, algorithm 1; Li et al. 2018).
+
+All entries learn from the same starts. After each rung they are ordered by the return of their mean policies from the
+same perturbed starts, and by its gain since the rung before: many learning curves are straight over the logarithm of
+the rollouts, so an entry that still gains may reach more in the end. The better half goes on, and the last one learns
+with half of all rollouts. The best of each kind of policy goes on first: kinds differ most, and in how soon they learn.
+
+    race.json               the entries, and their scores at the end of each rung that is over
+    ENTRY-sSEED/            the folder of each entry's run; an entry that goes on is resumed
+    result.md, figure.svg   the result
+
+A race depends on nothing but its settings: its winner is the same to the last bit for any number of workers, and after
+any interruption.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from farm import seeds
+from farm.errors import ConfigError, RunError, writing
+from farm.net import keys
+from farm.tasks.loop import Seed
+from learner.run import config as configs
+from learner.run.config import RunConfig
+from learner.run.files import replace_text
+from learner.run.folder import RunFolder
+from learner.run.learner import explored
+from learner.run.setup import problem
+from learner.sweep.runs import Shown, Site
+
+MOST: Final = 256
+"""Largest number of entries."""
+
+MOST_ROLLOUTS: Final = 100_000_000
+"""Largest number of rollouts of a race."""
+
+_VERSION: Final = 1
+_LEAST: Final = 2  # generations of an entry in the first rung
+_BATCH: Final = 16  # rollouts that are measured
+_EFFICIENCY: Final = 0.7  # of a worker on a machine that also runs the learners
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One set of settings."""
+
+    name: str
+    config: RunConfig
+    per_generation: int
+    """Exploring rollouts per generation."""
+
+    @property
+    def kind(self) -> tuple[str, bool]:
+        """Its kind of policy: the name, and whether its observations are normalised."""
+        return self.config.policy, self.config.policy_config.normalise
+
+    def generations(self, rollouts: int) -> int:
+        """Generations with which it has learnt from this number of rollouts."""
+        return -(-rollouts // self.per_generation)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A part of the race."""
+
+    entries: int
+    """Number of entries that take part."""
+    rollouts: int
+    """Rollouts of each of them since the beginning, at the end of this rung."""
+
+
+class Watching(Shown, Protocol):
+    """Who is told how a race goes."""
+
+    def rung(self, number: int) -> None:
+        """Rung `number`, from 0, begins."""
+
+
+@dataclass
+class Race:
+    """A race and its folder."""
+
+    path: Path
+    entries: tuple[Entry, ...]
+    rollouts: int
+    """Exploring rollouts of all entries together."""
+    scores: list[dict[str, float | None]] = field(default_factory=list)
+    """For each rung that is over, the mean return from perturbed starts by entry; None if a run diverged."""
+
+    @property
+    def rungs(self) -> list[Rung]:
+        """All rungs; the last one has one entry."""
+        return schedule(len(self.entries), self.rollouts)
+
+    def running(self, number: int) -> list[Entry]:
+        """The entries of a rung whose predecessors are over, best first."""
+        entries = list(self.entries)
+        for done, rung in enumerate(self.rungs[1 : number + 1]):
+            entries = kept(entries, self._prospects(done), rung.entries)
+        return entries
+
+    def _prospects(self, number: int) -> dict[str, float]:
+        """Where the entries of a rung that is over seem to go: its scores, and their gains once more."""
+        scores, before = self.scores[number], self.scores[number - 1] if number else self.scores[number]
+        found = {}
+        for name, score in scores.items():
+            last = before[name]
+            known = score is not None and last is not None and math.isfinite(score) and math.isfinite(last)
+            found[name] = score + (score - last) if known else -math.inf
+        return found
+
+    @property
+    def standing(self) -> list[Entry]:
+        """All entries, best first: those still running, then those dropped last, ..., then those dropped first."""
+        found = self.running(len(self.scores))
+        for number in reversed(range(len(self.scores))):
+            found += [entry for entry in ordered(self.running(number), self._prospects(number)) if entry not in found]
+        return found
+
+    @property
+    def winner(self) -> Entry:
+        """The best entry of the rungs that are over."""
+        return self.running(len(self.rungs) - 1)[0]
+
+    def folder(self, entry: Entry) -> Path:
+        """The folder of an entry's run."""
+        return self.path / f"{entry.name}-s{entry.config.seed}"
+
+    def runs(self, number: int) -> dict[Path, RunConfig]:
+        """The runs of a rung, by folder."""
+        total = self.rungs[number].rollouts
+        return {
+            self.folder(entry): replace(entry.config, generations=entry.generations(total))
+            for entry in self.running(number)
+        }
+
+    def run(self, site: Site, shown: Watching, stopped: Callable[[], bool], *, record: bool) -> bool:
+        """Do what is left of the race; the winner's last rung may be recorded. Return whether the race is over.
+
+        Raises:
+          RunError: an entry failed, or the folder cannot be written.
+        """
+        for number in range(len(self.scores), len(self.rungs)):
+            shown.rung(number)
+            runs = self.runs(number)
+            if not site.run(runs, shown, stopped, record=record and number == len(self.rungs) - 1):
+                if stopped():
+                    return False
+                raise RunError(f"rung {number + 1} is not complete: an entry failed, see above")
+            self.scores.append({entry.name: _score(self.folder(entry)) for entry in self.running(number)})
+            self._write()
+        return True
+
+    def prepare(self) -> None:
+        """Make the folder, or continue with it.
+
+        Raises:
+          ConfigError: it belongs to a different race, or is not a race's folder.
+        """
+        file = self.path / "race.json"
+        with writing(f"to {self.path}", ConfigError):
+            if file.exists():
+                self.scores = self._continued(file)
+            elif self.path.exists() and any(self.path.iterdir()):
+                raise ConfigError(f"{self.path} holds something else and no race.json: give a different --out")
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._write()
+
+    def _write(self) -> None:
+        with writing(f"to {self.path}"):
+            replace_text(self.path / "race.json", json.dumps({**self._settings(), "scores": self.scores}, indent=2))
+
+    def _settings(self) -> dict[str, Any]:
+        entries = {entry.name: configs.to_dict(entry.config) for entry in self.entries}
+        return {"version": _VERSION, "rollouts": self.rollouts, "entries": json.loads(json.dumps(entries))}
+
+    def _continued(self, file: Path) -> list[dict[str, float | None]]:
+        """The scores in an existing race's file, if it is this race."""
+        saved, mine = read(file), self._settings()
+        if saved["rollouts"] != self.rollouts:
+            raise ConfigError(
+                f"{self.path} was started with --rollouts {saved['rollouts']}; here it is {self.rollouts}: use that, "
+                "or a different --out"
+            )
+        if list(saved["entries"]) != list(mine["entries"]):
+            raise ConfigError(f"{self.path} has the entries {', '.join(saved['entries'])}: use a different --out")
+        for name, values in saved["entries"].items():
+            if values != mine["entries"][name]:
+                raise ConfigError(f"{self.path} was started with different settings of {name}: use a different --out")
+        return list(saved["scores"])
+
+
+def read(file: Path) -> dict[str, Any]:
+    """The contents of race.json.
+
+    Raises:
+      ConfigError: it cannot be read, or is none.
+    """
+    try:
+        saved = json.loads(file.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {file}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{file} is not JSON: {error}") from None
+    if not isinstance(saved, dict) or saved.get("version") != _VERSION:
+        raise ConfigError(f"{file} is not of version {_VERSION}")
+    kinds = {"rollouts": int, "entries": dict, "scores": list}
+    if wrong := [name for name, kind in kinds.items() if type(saved.get(name)) is not kind]:
+        raise ConfigError(f"{file} is damaged: {', '.join(wrong)}")
+    return saved
+
+
+def schedule(entries: int, rollouts: int) -> list[Rung]:
+    """The rungs for this number of entries and of rollouts in total.
+
+    As in successive halving, the rungs before the last have equal shares of the rollouts: together half of all.
+    """
+    counts = [entries]
+    while counts[-1] > 1:
+        counts.append(-(-counts[-1] // 2))
+    each = rollouts / 2 / max(len(counts) - 1, 1)
+    totals, total = [], 0.0
+    for count in counts[:-1]:
+        total += each / count
+        totals.append(int(total))
+    last = int(total + rollouts / 2) if len(counts) > 1 else rollouts
+    return [Rung(count, most) for count, most in zip(counts, [*totals, last], strict=True)]
+
+
+def kept(entries: Sequence[Entry], prospects: Mapping[str, float], count: int) -> list[Entry]:
+    """The `count` entries that go on, best first.
+
+    They are the best of each kind of policy, if it has not diverged, and then the best of the others.
+    """
+    best = ordered(entries, prospects)
+    kinds: dict[tuple[str, bool], Entry] = {}
+    for entry in best:
+        if prospects[entry.name] > -math.inf:
+            kinds.setdefault(entry.kind, entry)
+    chosen = [*kinds.values()][:count]
+    chosen += [entry for entry in best if entry not in chosen][: count - len(chosen)]
+    return [entry for entry in best if entry in chosen]
+
+
+def ordered(entries: Sequence[Entry], prospects: Mapping[str, float]) -> list[Entry]:
+    """The entries, best first; those with equal prospects keep their order."""
+    return sorted(entries, key=lambda entry: -prospects[entry.name])
+
+
+def check(race: Race) -> None:
+    """Check that the race can be run.
+
+    Raises:
+      ConfigError: no entries, too many, two equal ones, too many rollouts, or too few for the first rung.
+    """
+    if race.rollouts > MOST_ROLLOUTS:
+        raise ConfigError(f"rollouts is {race.rollouts}; expected at most {MOST_ROLLOUTS}")
+    if not 1 <= len(race.entries) <= MOST:
+        raise ConfigError(f"there are {len(race.entries)} entries; expected 1 to {MOST}")
+    seen: dict[str, Entry] = {}
+    for entry in race.entries:
+        other = seen.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
+        if other is not entry:
+            raise ConfigError(f"the entries {other.name} and {entry.name} are the same settings: leave one out")
+    first = race.rungs[0].rollouts
+    largest = max(race.entries, key=lambda entry: entry.per_generation)
+    if first < _LEAST * largest.per_generation:
+        least = -(-_LEAST * largest.per_generation * race.rollouts // max(first, 1))
+        raise ConfigError(
+            f"{race.rollouts} rollouts are {first} for each of {len(race.entries)} entries in the first rung, less "
+            f"than {_LEAST} generations of {largest.name}: give --rollouts {least} or more, or fewer entries"
+        )
+
+
+def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> list[Entry]:
+    """The entries of a portfolio for the task of a configuration: settings that replace some of it, by name.
+
+    Entries that are the same settings as an earlier one are left out.
+
+    Raises:
+      ConfigError: a setting is unknown or invalid, or the task cannot be learnt with it.
+    """
+    made: dict[str, Entry] = {}
+    for name, settings in portfolio.items():
+        with described(name):
+            entry = entry_of(name, configs.changed_by(base, settings))
+        made.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
+    return list(made.values())
+
+
+def entry_of(name: str, config: RunConfig) -> Entry:
+    """An entry with this name; raises ConfigError if the task cannot be learnt with its settings."""
+    keys.checked("run", f"{name}-s{config.seed}")
+    state = problem(config).begin()
+    rows = len(explored(config, state)[0])
+    return Entry(name, config, rows * len(config.algorithm_config.signs()) * config.episodes)
+
+
+@contextmanager
+def described(name: str) -> Iterator[None]:
+    """Let errors about an entry begin with its name."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"entry {name}: {error}") from None
+
+
+def affordable(entries: Sequence[Entry], minutes: float, processes: int) -> int:
+    """Rollouts that this number of processes like this one does in some minutes, from a measurement of each entry.
+
+    Half of the rollouts are the winner's, which is not known yet: the slowest entry counts.
+    """
+    slowest = max(_seconds(entry.config) for entry in entries)
+    return int(60.0 * minutes * processes * _EFFICIENCY / slowest)
+
+
+def _seconds(config: RunConfig) -> float:
+    """Time of one rollout in this process, in batches like those of a worker [s]."""
+    found = problem(config)
+    runner, state = found.runner(), found.begin()
+    theta = np.tile(state.mu, (_BATCH, 1))
+    drawn: list[Seed] = [seeds.trial(0, i) for i in range(_BATCH)]
+    try:
+        runner.rollouts(theta, drawn)  # the first batch prepares the simulator
+        begun = time.perf_counter()
+        runner.rollouts(theta, drawn)
+        return (time.perf_counter() - begun) / _BATCH
+    finally:
+        runner.close()
+
+
+def _score(path: Path) -> float | None:
+    """The score of an entry whose run has ended; None if it diverged."""
+    summary = RunFolder(path).read_summary() or {}
+    return summary.get("robust_return") if summary.get("state") == "finished" else None

@@ -1,0 +1,97 @@
+"""The ways in docs/architecture.md are those of a real run: its functions are called in the order of the page."""
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+import pytest
+from ways import way
+
+import farm
+from farm.net.session import connect, free_endpoint
+from learner.run.config import configure
+from learner.run.launch import Placement, open_run
+from workers.config import WorkerConfig
+from workers.worker import Worker
+
+ROOT = f"{Path(farm.__file__).parents[1]}/"  # of the packages, which may be installed
+PACKAGES = tuple(ROOT + package for package in ("farm/", "workers/", "learner/"))
+Call = tuple[str, str]
+
+
+def calls(folder: Path, generations: int) -> list[Call]:
+    """File and name of each function that a run of the hand calls while it learns, in order; learner and worker."""
+    seen: list[Call] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(PACKAGES):
+            seen.append((code.co_filename.removeprefix(ROOT), code.co_qualname))
+
+    config, endpoint = configure("finger-gait", pairs=2, generations=generations), free_endpoint()
+    with profiled(note), open_run(config, folder, Placement(listen=endpoint)) as run, working(endpoint):
+        seen.clear()
+        for _ in run.learn():
+            pass
+    return seen
+
+
+@contextmanager
+def profiled(note: Callable[[FrameType, str, object], None]) -> Iterator[None]:
+    """Call a function at each call, in this thread and those that start meanwhile."""
+    threading.setprofile(note)
+    sys.setprofile(note)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+
+
+@contextmanager
+def working(endpoint: str) -> Iterator[None]:
+    """A worker on a thread of this process."""
+    stop = threading.Event()
+
+    def serve() -> None:
+        with connect((endpoint,), None, stop.is_set) as session:
+            worker = Worker(WorkerConfig(connect=(endpoint,), name="w"), session)
+            worker.join()
+            while not stop.is_set():
+                worker.turn()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(20)
+
+
+def station(call: Call) -> tuple[str, str]:
+    """A function as the page names it: a class stands for its check."""
+    return call[0], call[1].removesuffix(".__post_init__")
+
+
+# In the first generation the worker builds the task, which takes some of a perturbation's ways for itself; in later
+# ones reports of the generation before are on their way.
+@pytest.mark.parametrize(("of", "generations", "most"), [("a perturbation", 2, 12), ("a trace", 1, 12)])
+def test_a_way_is_the_pages(tmp_path: Path, of: str, generations: int, most: int) -> None:
+    pytest.importorskip("rerun")
+    page = way(of)
+    assert len(page.stations) >= 8
+    assert len(page.files) <= most
+    seen = [station(call) for call in calls(tmp_path / "r", generations)]
+    begins = [at for at, call in enumerate(seen) if call == ("learner/run/learner.py", "explored")]
+    assert len(begins) == generations
+    first: dict[Call, int] = {}
+    for at, call in enumerate(seen[begins[-1] :]):
+        first.setdefault(call, at)
+    missing = [each for each in page.stations if each not in first]
+    assert not missing
+    once = list(dict.fromkeys(page.stations))  # a function at both ends counts where it is called first
+    assert once == sorted(once, key=lambda each: first[each])

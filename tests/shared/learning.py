@@ -1,0 +1,75 @@
+"""A learner with workers on threads of this process, over a real session on loopback."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from farm.errors import MessageError
+from farm.net import codec
+from farm.net.session import Session, connect, free_endpoint
+from farm.net.work import Results
+from learner.run.config import RunConfig
+from learner.run.launch import Placement, open_run
+from learner.scheduler.scheduler import SchedulerConfig
+from workers.config import WorkerConfig
+from workers.worker import Worker
+
+
+class Lying:
+    """A session through which returns go out too high by their last bit."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._session, name)
+
+    def publish(self, key: str, payload: bytes, **how: bool) -> None:
+        with suppress(MessageError):
+            results = codec.decode(payload, Results)
+            payload = codec.encode(replace(results, returns=np.nextafter(results.returns, np.inf)))
+        self._session.publish(key, payload, **how)
+
+
+@contextmanager
+def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
+    """Workers on threads of this process, some of which lie; ended by an event."""
+    stop = threading.Event()
+    configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
+
+    def serve(config: WorkerConfig, lies: bool) -> None:
+        with connect(config.connect, None, stop.is_set) as session:
+            worker = Worker(config, Lying(session) if lies else session)  # type: ignore[arg-type]
+            worker.join()
+            while not stop.is_set():
+                worker.turn()
+            worker.close()
+
+    threads = [threading.Thread(target=serve, args=(config, i < liars)) for i, config in enumerate(configs)]
+    try:
+        for thread in threads:
+            thread.start()
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(20)
+
+
+def learnt(
+    config: RunConfig, path: Path, count: int, *files: Path, resume: bool = False, liars: int = 0, audit: float = 0.02
+) -> dict[str, Any]:
+    """The summary of a run by this number of workers."""
+    place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
+    with (
+        open_run(config, path, place, resume=resume) as run,
+        workers(place.listen, count, *files, liars=liars),
+    ):
+        for _ in run.learn():
+            pass
+    return run.summary

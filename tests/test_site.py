@@ -1,0 +1,96 @@
+"""The site shows all pages and public names; the examples of their descriptions run."""
+
+import importlib.util
+import inspect
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import farm
+
+ROOT = Path(__file__).parent.parent
+SPEC = importlib.util.spec_from_file_location("docs_pages", ROOT / "docs/pages.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+PAGES = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(PAGES)
+
+
+def test_each_page_is_in_the_navigation() -> None:
+    groups = PAGES.navigation((ROOT / "docs/README.md").read_text("utf-8"))
+    shown = [page for group in groups for pages in group.values() for page in pages]
+    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} - {"docs/README.md"} <= set(shown)
+    assert "examples/README.md" in shown
+    assert "Start here" in groups[0]
+
+
+@pytest.mark.parametrize(
+    ("link", "led"),
+    [
+        ("[a](method.md#sources)", "[a](method.md#sources)"),
+        ("[a](../farm/seeds.py)", "[a](https://x.example/y/blob/HEAD/farm/seeds.py)"),
+        ("[a](../examples)", "[a](https://x.example/y/blob/HEAD/examples)"),
+        ("[a](https://mujoco.org)", "[a](https://mujoco.org)"),
+        ("![a](pictures/hand.png)", "![a](pictures/hand.png)"),
+        ("values[i](nothing)", "values[i](nothing)"),
+    ],
+)
+def test_a_link_to_a_file_that_is_no_page_leads_to_the_repository(link: str, led: str) -> None:
+    assert PAGES.relinked(link, "docs/task.md", {"docs/method.md"}, "https://x.example/y/") == led
+
+
+def test_without_an_address_of_the_repository_such_a_link_is_text() -> None:
+    assert PAGES.relinked("see [a](../farm/seeds.py).", "docs/task.md", set(), "") == "see a."
+
+
+def test_the_reference_has_the_public_names() -> None:
+    page = (ROOT / "docs/api.md").read_text("utf-8")
+    assert sorted(re.findall(r"^`farm\.(\w+)`$", page, re.M)) == sorted(set(farm.__all__) - {"__version__"})
+
+
+@pytest.mark.parametrize(("name", "where"), [("Farm", "learner.farm"), ("SearchState", "learner.algorithms.state")])
+def test_the_reference_finds_a_name_where_it_is_defined(name: str, where: str) -> None:
+    assert f"::: {where}.{name}\n" in PAGES.located(f"# Reference\n\n`farm.{name}`\n")
+
+
+def example(name: str) -> str:
+    """The program in a public name's description; empty if there is none."""
+    described = inspect.getdoc(getattr(farm, name)) or ""
+    [shown] = re.findall(r"^Example:\n  ```python\n(.*?)^  ```$", described, re.S | re.M) or [""]
+    return textwrap.dedent(shown)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder where the example of `farm.learn` has run: others look at its run."""
+    folder = tmp_path_factory.mktemp("examples")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(compile(example("learn"), "farm.learn", "exec"), {"__name__": "example"})
+        yield folder
+
+
+APART = {"__version__", "learn", "tune"}
+"""Without an example, or with one that runs otherwise."""
+ERRORS = {"ConfigError", "CheckpointError", "RunError", "TaskError"}
+"""Their example is that of FarmError."""
+
+
+@pytest.mark.parametrize("name", [each for each in farm.__all__ if each not in APART | ERRORS])
+def test_the_example_of_a_public_name_runs(name: str, place: Path) -> None:
+    program = example(name)
+    assert f"farm.{name}" in program or name in {"Backend", "Algorithm", "Record", "FarmError"}
+    exec(compile(program, f"farm.{name}", "exec"), {"__name__": "example"})
+
+
+@pytest.mark.slow
+def test_the_example_of_tune_runs(place: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", example("tune")], cwd=place, check=True, capture_output=True, text=True
+    )
+    assert "tunes/gait/" in done.stdout

@@ -1,0 +1,84 @@
+"""One policy for several objects: each rollout is the one with its object alone, and names that make no sense."""
+
+import numpy as np
+import pytest
+
+from farm import settings
+from farm.errors import ConfigError
+from farm.policies.fourier import Direct, FeaturesConfig
+from farm.rollouts import Runner
+from farm.tasks.finger_gait.env import FingerGaitEnv
+from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
+from farm.tasks.probe import tried
+
+OBJECTS = ("bar", "bolt")
+"""The second has more geometries."""
+
+
+class Undrawn(FingerGait):
+    """Draws its object from its seed without taking a number of the generator: the others are those of one object."""
+
+    def which(self, rng):
+        """By the generator's state."""
+        return int(rng.bit_generator.state["state"]["state"] % len(self.simulated))
+
+
+def runner(kind, names):
+    task = kind(FingerGaitConfig(object=names, state="joints+tactile", motion=0.3, steps=5))
+    config = FeaturesConfig(features=10)
+    return Runner(task, Direct(config, task.spec(), Direct.draw(config, task.spec(), np.random.default_rng(0))))
+
+
+def test_each_rollout_has_the_bits_of_its_object_alone():
+    seeds = [None, (0,), (1,), (2,)]
+    made = runner(Undrawn, OBJECTS)
+    theta = np.random.default_rng(1).normal(0.0, 0.1, (len(seeds), made.policy.size))
+    found = made.rollouts(theta, seeds)
+    assert found.which[0] == 0
+    assert set(found.which.tolist()) == {0, 1}
+    for which, name in enumerate(OBJECTS):
+        rows = np.flatnonzero(found.which == which)
+        alone = runner(FingerGait, name).rollouts(theta[rows], [seeds[row] for row in rows.tolist()])
+        for array in ("returns", "success", "terms", "actions"):
+            assert getattr(found, array)[rows].tobytes() == getattr(alone, array).tobytes()
+        for array, values in alone.frames.items():
+            assert found.frames[array][rows].tobytes() == values.tobytes()
+
+
+def test_one_name_is_a_text_and_several_are_flags():
+    assert FingerGaitConfig(object=("bolt",)) == FingerGaitConfig(object="bolt")
+    for words, expected in (
+        ((), "bar"),
+        (("--object", "bolt"), "bolt"),
+        (("--object", "bolt", "--object", "bar"), ("bolt", "bar")),
+    ):
+        parsed = settings.parse(FingerGaitConfig, words, "farm run", FingerGaitConfig())
+        assert parsed.object == expected
+        told = settings.to_dict(parsed)
+        assert settings.from_dict(FingerGaitConfig, told, "task") == parsed
+    two = FingerGaitConfig(object=("bolt", "bar"))
+    assert settings.parse(FingerGaitConfig, ("--object", "thin-bar"), "farm replay", two).object == "thin-bar"
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("bar", "bolt", "bar"), "object is bar, bolt, bar; expected one name, or several different ones"),
+        ((), "object is empty; expected one name"),
+        (("bar", "spoon"), "unknown object 'spoon'; known are .*bar"),
+    ],
+)
+def test_names_that_make_no_sense_are_one_line(names, words):
+    with pytest.raises(ConfigError, match=words):
+        FingerGait(FingerGaitConfig(object=names))
+
+
+def test_an_environment_has_one_object():
+    with pytest.raises(ConfigError, match="object is bar, bolt; an environment has one"):
+        FingerGaitEnv(object=("bar", "bolt"))
+
+
+def test_an_object_that_a_grip_does_not_hold_is_named():
+    task = FingerGait(FingerGaitConfig(object=("bar", "bolt"), start_grip="middle+thumb"))
+    with pytest.raises(ConfigError, match="'middle.thumb' does not hold object 'bar'"):
+        tried(task, 1, lambda sim: None)

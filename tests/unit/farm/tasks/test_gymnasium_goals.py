@@ -1,0 +1,129 @@
+"""Environments of Gymnasium whose observations are dictionaries, as those with goals: a tiny one of the test's own."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, Tuple, flatdim, flatten
+
+from farm.errors import ConfigError, TaskError
+from farm.policies.networks import Linear, LinearConfig
+from farm.rollouts import Runner
+from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
+from farm.tasks.loop import Batch
+from farm.tasks.standard import standard
+
+XML = """<mujoco><option timestep="0.01"/><worldbody><body name="cart">
+  <joint name="x" type="slide" axis="1 0 0" range="-1 1" limited="true"/><geom size="0.1" mass="1"/></body></worldbody>
+  <actuator><motor joint="x"/></actuator></mujoco>"""
+NUMBERS = Box(-np.inf, np.inf, (2,))
+
+
+class Goal(gymnasium.Env[Any, Any]):
+    """A cart with a goal. Its reset leaves applied forces and the solver's state, as those of some environments do."""
+
+    dt = 0.05
+
+    def __init__(self, part: str = "") -> None:
+        """`part` is what makes it unusable."""
+        self.model = mujoco.MjModel.from_xml_string(XML)
+        self.data = mujoco.MjData(self.model)
+        odd = {"mode": Discrete(4), "eye": Box(0, 255, (8, 8, 3), np.uint8), "cube": Box(-1.0, 1.0, (2, 2, 2))}
+        self.observation_space = Dict(
+            {
+                "observation": NUMBERS,
+                "goals": Tuple((Box(-1.0, 1.0, (1,)), Box(-1.0, 1.0, (1, 1), np.float64))),
+                **({part: odd[part]} if part else {}),
+            }
+        )
+        self.action_space = Box(-1.0, 1.0, (2,))  # of which the model knows one
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Draw a goal and a place."""
+        super().reset(seed=seed)
+        self.goal = self.np_random.uniform(-1.0, 1.0, 1)
+        self.data.qpos[:], self.data.qvel[:] = self.np_random.uniform(-0.1, 0.1, 1), 0.0
+        mujoco.mj_forward(self.model, self.data)
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """It is pushed by a force that adds up."""
+        self.data.xfrc_applied[1, 0] += action[1]
+        self.data.ctrl[:] = action[0]
+        mujoco.mj_step(self.model, self.data, 5)
+        gap = abs(float(self.data.qpos[0] - self.goal[0]))
+        return self._seen(), -gap, gap < 0.01, False, {}
+
+    def _seen(self) -> dict[str, Any]:
+        own = np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
+        return {"observation": own, "goals": (self.data.qpos.astype(np.float32), self.goal[None].copy())}
+
+
+@pytest.fixture(autouse=True)
+def registered() -> Iterator[None]:
+    """Only during a test."""
+    gymnasium.register("Goal-v0", Goal, max_episode_steps=12)
+    yield
+    del gymnasium.registry["Goal-v0"]
+
+
+def runner() -> Runner:
+    task = Environment(EnvironmentConfig(), "Goal-v0")
+    return Runner(task, Linear(LinearConfig(), task.spec(), standard(task, 0.5)))
+
+
+def test_a_goal_environment_is_a_plain_loop_with_gymnasiums_own_flatten() -> None:
+    made = runner()
+    theta = np.random.default_rng(0).normal(size=(1, made.size))
+    env: Any = gymnasium.make("Goal-v0")
+    assert made.spec.observation == flatdim(env.observation_space) == 4
+    found = made.rollouts(theta, [(3,)])
+    x, _ = env.reset(seed=reset_seed(np.random.default_rng((3,))))
+    prepared, rewards, over = made.policy.prepare(theta), [], False
+    while not over:
+        flat = flatten(env.observation_space, x)
+        assert isinstance(flat, np.ndarray)
+        action = np.clip(made.policy.act(prepared, flat[None])[0], -1.0, 1.0).astype(np.float32)
+        x, reward, terminated, truncated, _ = env.step(action)
+        rewards.append(reward)
+        over = terminated or truncated
+    assert found.terms[0, : len(rewards), 0].tolist() == rewards
+    assert found.frames["qpos"][0, len(rewards) - 1].tolist() == env.unwrapped.data.qpos.tolist()
+
+
+def test_what_a_reset_leaves_does_not_reach_later_rollouts() -> None:
+    made, seeds = runner(), [(1,), None, (2,), (3,)]
+    theta = np.random.default_rng(0).normal(size=(4, made.size))
+    first, again = made.rollouts(theta, seeds), made.rollouts(theta[::-1], seeds[::-1])
+    assert first.frames["qpos"].tobytes() == again.frames["qpos"][::-1].tobytes()
+    assert first.returns.tobytes() == again.returns[::-1].tobytes()
+
+
+def test_an_environments_state_is_its_own() -> None:
+    class Moves(Environment):
+        def act(self, sim: Any, action: np.ndarray) -> np.ndarray:
+            sim.qpos[:] = 0.0
+            return super().act(sim, action)
+
+    batch = Batch(Moves(EnvironmentConfig(), "Goal-v0"), runner().sim, [None])
+    with pytest.raises(TaskError, match=r"sim.qpos can be written in .*, and in no environment of Gymnasium"):
+        batch.step(np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("part", "line"),
+    [
+        (
+            "mode",
+            r"task gym:Goal-v0: observation\['mode'\] is Discrete\(4\); expected numbers: a box, or a dict of boxes",
+        ),
+        ("eye", r"observation\['eye'\] is Box\(0, 255, \(8, 8, 3\), uint8\), a picture; expected numbers"),
+        ("cube", r"observation\['cube'\] is Box\(-1.0, 1.0, \(2, 2, 2\), float32\), a picture; expected numbers"),
+    ],
+)
+def test_parts_that_are_no_numbers_are_named(part: str, line: str) -> None:
+    with pytest.raises(ConfigError, match=line):
+        Environment(EnvironmentConfig(env_arg=(f'part="{part}"',)), "Goal-v0")

@@ -1,0 +1,34 @@
+"""Commands that draw choose how before MuJoCo is imported, which looks once."""
+
+import ctypes.util
+import os
+import subprocess
+import sys
+
+import pytest
+
+from farm.commands import screen
+
+
+@pytest.mark.parametrize("command", ["check", "replay", "chain"])
+def test_a_command_that_draws_does_not_import_mujoco_before_it_has_chosen(command: str) -> None:
+    code = f"import sys, learner.commands.{command}; sys.exit('mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("installed", "own", "chosen"),
+    [
+        (["OSMesa", "EGL"], None, "osmesa"),
+        (["EGL"], None, "egl"),
+        ([], None, None),
+        (["OSMesa", "EGL"], "egl", "egl"),
+    ],
+)
+def test_what_mujoco_draws_with_when_there_is_no_screen(
+    installed: list[str], own: str | None, chosen: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "environ", {} if own is None else {"MUJOCO_GL": own})
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: name if name in installed else None)
+    screen.draw_offscreen()
+    assert os.environ.get("MUJOCO_GL") == chosen

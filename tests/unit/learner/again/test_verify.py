@@ -1,0 +1,173 @@
+"""Verifying runs: whatever was altered, cut or exchanged in a folder is named with its first generation."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from alone import POLE, Alone
+
+from farm.__main__ import main
+from learner.again.verify import Differs, chosen, stored, verify_some
+from learner.run import checkpoint as checkpoints
+from learner.run import setup
+from learner.run.config import configure
+from learner.run.folder import RunFolder
+from learner.run.learner import Learner
+
+GENERATIONS = 6
+SETTINGS = (
+    {},
+    {"policy": "linear", "algorithm": "snes", "normalise": True},
+    {"policy": "linear", "algorithm": "cma-es", "population": 6, "episodes": 2},
+)
+
+
+def learnt(path: Path, seed: int = 0, **settings: object) -> RunFolder:
+    (path.parent / "pole.py").write_text(POLE)
+    config = configure(f"{path.parent / 'pole.py'}:Pole", generations=GENERATIONS, seed=seed, **settings)
+    problem, at = setup.start(config, path.name)
+    learner = Learner(problem, RunFolder.create(path, config), at)
+    for _ in learner.learn(Alone(problem)):  # type: ignore[arg-type]
+        pass
+    learner.folder.write_summary(learner.summary("interrupted", 1, None))
+    return learner.folder
+
+
+def verified(folder: RunFolder, generations: Sequence[int] = range(1, GENERATIONS + 1)) -> list[int]:
+    return [generation for generation, _ in verify_some(stored(folder), generations)]
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: each.get("algorithm", "default"))
+def test_an_honest_run_is_verified(tmp_path: Path, settings: dict[str, object]) -> None:
+    folder = learnt(tmp_path / "r", **settings)
+    assert verified(folder) == list(range(1, GENERATIONS + 1))
+
+
+def test_as_many_generations_as_asked_for_are_chosen_and_none_twice(tmp_path: Path) -> None:
+    run, rng = stored(learnt(tmp_path / "r")), np.random.default_rng(1)
+    assert chosen(run, 1.0, rng) == [1, 2, 3, 4, 5, 6]
+    assert len(chosen(run, 0.01, rng)) == 1
+    assert len({tuple(chosen(run, 0.5, rng)) for _ in range(50)}) > 5
+
+
+def one_digit(folder: RunFolder) -> None:
+    lines = (folder.path / "progress.jsonl").read_text().splitlines()
+    line = json.loads(lines[3])
+    line["return_max"] = float(np.nextafter(line["return_max"], np.inf))
+    lines[3] = json.dumps(line)
+    (folder.path / "progress.jsonl").write_text("\n".join(lines) + "\n")
+
+
+def cut(folder: RunFolder) -> None:
+    lines = (folder.path / "progress.jsonl").read_text().splitlines(keepends=True)
+    (folder.path / "progress.jsonl").write_text("".join(lines[:3] + lines[4:]))
+
+
+def exchanged(folder: RunFolder) -> None:
+    lines = (folder.path / "progress.jsonl").read_text().splitlines(keepends=True)
+    (folder.path / "progress.jsonl").write_text("".join([*lines[:3], lines[4], lines[3], lines[5]]))
+
+
+def of_another_run(folder: RunFolder) -> None:
+    other = learnt(folder.path.with_name("other"), seed=1)
+    (folder.path / "progress.jsonl").write_bytes((other.path / "progress.jsonl").read_bytes())
+
+
+def in_parameters(folder: RunFolder) -> None:
+    """The mean after generation 3, from which generation 4 explored."""
+    content = bytearray((folder.path / "parameters").read_bytes())
+    row = folder.parameters.rows().dtype.itemsize
+    at = len(content) - (GENERATIONS - 2) * row + 8 * 2  # the second number of the third row's mean
+    content[at] ^= 1
+    (folder.path / "parameters").write_bytes(content)
+
+
+def a_row_of_parameters(folder: RunFolder) -> None:
+    content, row = (folder.path / "parameters").read_bytes(), folder.parameters.rows().dtype.itemsize
+    (folder.path / "parameters").write_bytes(content[:-row])
+
+
+def in_the_checkpoint(folder: RunFolder) -> None:
+    at = checkpoints.load(folder.checkpoint)
+    mu = at.state["mu"].copy()
+    mu[1] = np.nextafter(mu[1], np.inf)
+    checkpoints.save(folder.checkpoint, replace(at, state=at.state | {"mu": mu}))
+
+
+def in_the_configuration(folder: RunFolder) -> None:
+    config = json.loads((folder.path / "config.json").read_text())
+    config["seed"] = 7
+    (folder.path / "config.json").write_text(json.dumps(config))
+
+
+def in_the_summary(folder: RunFolder) -> None:
+    summary = folder.read_summary()
+    assert summary is not None
+    folder.write_summary(summary | {"parameters_sha256": "0" * 64})
+
+
+ALTERED: dict[Callable[[RunFolder], None], str] = {
+    one_digit: "generation 4 differs: return_max is .* in progress.jsonl, and .* when it is repeated",
+    cut: "generation 4 differs: progress.jsonl has no line of it",
+    exchanged: "generation [45] differs: progress.jsonl has no line of it",
+    of_another_run: "generation 1 differs: ",
+    in_parameters: "generation 4 differs: .* in progress.jsonl, and .* when it is repeated",
+    a_row_of_parameters: "generation 6 differs: parameters has no row of it",
+    in_the_checkpoint: r"generation 6 differs: mu\[1\] is .* in parameters, and .* in checkpoint",
+    in_the_configuration: "generation 1 differs: .* when it is repeated",
+    in_the_summary: "summary.json says that the parameters are 0000",
+}
+
+
+@pytest.mark.parametrize("alter", ALTERED, ids=lambda each: each.__name__)
+def test_what_was_altered_is_named(tmp_path: Path, alter: Callable[[RunFolder], None]) -> None:
+    folder = learnt(tmp_path / "r")
+    alter(folder)
+    with pytest.raises(Differs, match=ALTERED[alter]):
+        verified(folder)
+
+
+def test_the_command_says_it_and_writes_a_receipt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = learnt(tmp_path / "r")
+    rollouts = folder.progress()[-1].rollouts
+    assert main(["verify", "r", "--share", "1", "--receipt", "receipt.json"]) == 0
+    assert f"verified to the bit: 6 of 6 generations of r, {rollouts} rollouts" in capsys.readouterr().out
+    receipt = json.loads(Path("receipt.json").read_text())
+    assert (receipt["generations"], receipt["rollouts"], receipt["difference"]) == ([1, 2, 3, 4, 5, 6], rollouts, None)
+    assert receipt["parameters_sha256"] == (folder.read_summary() or {})["parameters_sha256"]
+    one_digit(folder)
+    assert main(["verify", "r", "--share", "1", "--receipt", "receipt.json"]) == 1
+    assert "generation 4 differs: return_max is" in capsys.readouterr().err
+    receipt = json.loads(Path("receipt.json").read_text())
+    assert receipt["generations"] == [1, 2, 3]
+    assert "generation 4 differs" in receipt["difference"]
+
+
+def test_other_code_is_said_before_anything_is_computed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = learnt(tmp_path / "r")
+    (tmp_path / "pole.py").write_text(POLE + "\n# changed\n")
+    main(["verify", str(folder.path)])
+    assert "the code of its task has changed since the run began" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--workers", "2"), "--workers and --connect are for --all"),
+        (("--all", "--workers", "0"), "--workers 0 without --connect"),
+        (("--all", "--workers", "1", "--connect", "tcp/127.0.0.1:1"), "--workers with --connect"),
+        (("--share", "0"), "share is 0"),
+    ],
+)
+def test_what_it_cannot_do(
+    words: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = learnt(tmp_path / "r")
+    assert main(["verify", str(folder.path), *words]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,138 @@
+"""An exported policy, played by the example, gives the return of our own rollout to the last bit."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from covering import any_two
+from robot import robot
+
+from farm.errors import ConfigError
+from farm.policies.normalised import Normalised
+from farm.sim import model_files
+from farm.tasks.finger_gait.observations import STATES
+from learner.again.replay import LoadedPolicy
+from learner.export import npz as export
+from learner.run.config import configure
+from learner.run.setup import start
+
+EXAMPLE = Path(__file__).parents[4] / "examples" / "play_policy.py"
+SETTINGS: dict[str, dict[str, Any]] = {
+    "direct": {"features": 30},
+    "projected": {"features": 30},
+    "cosine": {"features": 30},
+    "direct, single": {"features": 30, "precision": "single"},
+    "projected, single": {"features": 30, "precision": "single"},
+    "cosine, single": {"features": 30, "precision": "single"},
+    "kernel": {},
+    "constant": {"pose": "between", "motion": 0.3},
+    "linear": {},
+    "mlp": {"layers": (5, 3)},
+    "rbf": {"centres": 4},
+    "weighted-kernel": {},
+    "rnn": {"units": 5},
+    "cpg": {},
+}
+
+
+def played(path: Path) -> float:
+    """What the example says a policy returns."""
+    spec = importlib.util.spec_from_file_location("play_policy", EXAMPLE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    policy = module.Policy(path)
+    policy.reset()
+    total, held, t = 0.0, True, 0
+    while held and t < policy.p["steps"]:
+        reward, held = policy.step()
+        total += policy.p["gamma"] ** t * reward
+        t += 1
+    return float(policy.p["return_scale"] * total)
+
+
+@pytest.mark.parametrize(
+    *any_two(policy=SETTINGS, normalise=(False, True), state=("joints+contacts", "joints+tactile"))
+)
+def test_the_example_plays_every_policy(policy: str, normalise: bool, state: str, tmp_path: Path) -> None:
+    config = configure(policy=policy.partition(",")[0], state=state, normalise=normalise, **SETTINGS[policy])
+    found, _ = start(config, "r")
+    if normalise:
+        seen = np.random.default_rng(2).uniform(0.5, 1.0, (2, found.spec.observation))
+        found = replace(found, policy=Normalised(found.policy, seen))
+    assert_played_alike(LoadedPolicy(found, 0, np.random.default_rng(1).normal(0.3, 0.2, found.policy.size)), tmp_path)
+
+
+def assert_played_alike(learnt: LoadedPolicy, folder: Path) -> None:
+    export.write(folder / "p.npz", learnt)
+    assert played(folder / "p.npz") == learnt.rollout().trajectory.value
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *({"state": state} for state in STATES),
+        {"action": "increment", "clip": False},
+        {"action": "absolute", "reward": "basic"},
+        {"state": "joints+contacts", "contacts_scale": 0.5, "joints_scale": 2.0, "weights": "direct"},
+        {"policy": "direct", "features": 20, "reward": "limited", "return_scale": 0.3},
+    ],
+    ids=str,
+)
+def test_the_example_plays_every_state_and_other_settings(settings: dict[str, Any], tmp_path: Path) -> None:
+    found, _ = start(configure(**settings), "r")
+    assert_played_alike(LoadedPolicy(found, 0, np.random.default_rng(1).normal(0.3, 0.2, found.policy.size)), tmp_path)
+
+
+def test_the_example_ends_where_the_object_is_dropped(tmp_path: Path) -> None:
+    found, _ = start(configure(policy="direct", features=20), "r")
+    learnt = LoadedPolicy(found, 0, np.random.default_rng(1).normal(3.0, 0.1, found.policy.size))
+    assert learnt.rollout().rollouts.ended[0]
+    assert_played_alike(learnt, tmp_path)
+
+
+BUILT = """import mujoco
+from farm import Task
+
+
+class Built(Task):
+    def compiled(self):
+        return mujoco.MjModel.from_xml_string(
+            "<mujoco><worldbody><body><joint name='j'/><geom size='1'/></body></worldbody>"
+            "<actuator><motor joint='j'/></actuator></mujoco>"
+        )
+
+    def reward(self, sim, action):
+        return sim.qpos[:, 0]
+"""
+
+
+def test_a_refused_export_says_why_and_leaves_the_file_that_was_there(tmp_path: Path) -> None:
+    (tmp_path / "built.py").write_text(BUILT)
+    found, _ = start(configure(f"{tmp_path}/built.py:Built"), "r")
+    path = tmp_path / "p.npz"
+    for before in (None, b"an earlier one"):
+        if before is not None:
+            path.write_bytes(before)
+        with pytest.raises(ConfigError, match=r"task Built makes its model by compiled\(\): without mjcf\(\)"):
+            export.write(path, LoadedPolicy(found, 0, np.zeros(found.policy.size)))
+        assert (path.read_bytes() if path.exists() else None) == before
+    assert {each.name for each in tmp_path.iterdir()} <= {"built.py", "p.npz"}
+
+
+def test_a_model_in_files_comes_with_all_of_them(tmp_path: Path) -> None:
+    found, _ = start(configure(f"{robot(tmp_path / 'mine')}:Reach", policy="linear"), "r")
+    export.write(tmp_path / "p.npz", LoadedPolicy(found, 0, np.zeros(found.policy.size)))
+    with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
+        own = {name.removeprefix("file/"): file[name].tobytes() for name in file.files if name.startswith("file/")}
+        main, mjcf = file["model"].item(), file["mjcf"].item()
+    assert own[main].decode() == mjcf
+    model_files.write(tmp_path / "elsewhere", own)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "elsewhere" / main))
+    np.testing.assert_array_equal(model.mesh_vert, found.task.model.mesh_vert)
+    assert (model.nhfield, model.ntex) == (1, 1)

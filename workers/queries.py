@@ -1,0 +1,40 @@
+"""Queries to learners: those that do not answer must not stop a worker's other runs."""
+
+import time
+from typing import Final
+
+from farm.net.session import Session
+
+ASK: Final = 1.0
+"""Time for an answer [s]."""
+_MUTE: Final = 9.0  # after an unanswered query, the next is sent this many times its duration later
+
+
+class Queries:
+    """Asks learners; waiting for missing answers takes at most a tenth of the worker's time."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._mute: dict[str, float] = {}  # by run whose learner is there: no queries before this time [s]
+        self._others = 0.0  # the same for all other runs together
+
+    def came(self, run: str) -> None:
+        """A run's learner is there."""
+        self._mute.setdefault(run, 0.0)
+
+    def left(self, run: str) -> None:
+        """A run's learner is gone."""
+        self._mute.pop(run, None)
+
+    def ask(self, run: str, key: str, seconds: float = ASK) -> bytes | None:
+        """The answer of a run's learner, or None."""
+        begun = time.monotonic()
+        if begun < self._mute.get(run, self._others):
+            return None
+        payload = self._session.ask(key, seconds)
+        if payload is None:
+            now = time.monotonic()
+            self._others = now + _MUTE * (now - begun)
+            if run in self._mute:
+                self._mute[run] = self._others
+        return payload
