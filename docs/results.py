@@ -72,7 +72,7 @@ Results with pages of their own:
 | [Is touch needed?](results/touch.md) | {touch} |
 | [How often can a chain of gaits be repeated?](results/chain-of-gaits.md) | at least ten times, with all five seeds |
 | [Can an object be turned?](results/turning.md) | a plate, by a script and by 14 of 16 learnt policies |
-| [Can one policy hold several objects?](results/several-objects.md) | five, two of them untrained; so can one that knows the bar |
+| [Can one policy hold several objects?](results/several-objects.md) | five; so can one trained on the bar alone |
 | [How reliably do the presets learn?](results/seeds.md) | `default` with ten of ten seeds, `thesis` with eight of ten |
 | [How do the learners compare with published scores?](results/learners.md) | a table per environment |
 
