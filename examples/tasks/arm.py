@@ -13,6 +13,7 @@ class Arm(Task):
       <option timestep="0.005"/>
       <worldbody>
         <light pos="0 0 2"/>
+        <camera pos="0.15 -0.35 1" xyaxes="1 0 0 0 0.9 0.44"/>
         <geom type="plane" size="0.5 0.5 0.1" pos="0 0 -0.05" rgba="0.85 0.85 0.85 1"/>
         <body name="ball" mocap="true" pos="0.3 0 0">
           <geom type="sphere" size="0.02" rgba="0.9 0.5 0.1 1" contype="0" conaffinity="0"/>

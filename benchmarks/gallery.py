@@ -1,0 +1,149 @@
+"""Learns the tasks of examples/tasks, measures them beside trivial policies, films them, and writes docs/gallery.md.
+
+    python benchmarks/gallery.py [--only arm,cart] [--seed 0] [--runs runs/gallery] [--docs docs]
+
+Each task is learnt by the command that the page shows; a run that is there is not repeated. The scores are mean returns
+from 100 perturbed starts that no learning has seen:
+
+    learnt      the run's last mean policy
+    constant    the best of 300 random constant actions, each tried on 10 starts
+    still       the policy whose parameters are all 0
+
+Rows are kept in docs/results/tables/gallery.jsonl, films in docs/pictures/gallery. Needs the extras `gym` and `video`.
+"""
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from own_tasks import SEED, STARTS, constant, still
+from PIL import Image
+from running import script
+
+from learner.again.replay import LoadedPolicy, load
+from learner.run.evaluation import evaluation_jobs
+
+ROOT: Final = Path(__file__).parents[1]
+SECONDS: Final = 5.0  # of a film
+SIZE: Final = (320, 240)  # of a film [pixels]
+COLOURS: Final = 64
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A task of the gallery."""
+
+    task: str
+    what: str
+    flags: str = ""
+    """Of `farm run`, beside the task."""
+
+    @property
+    def name(self) -> str:
+        """The module's name."""
+        return self.task.partition(".py")[0]
+
+    @property
+    def words(self) -> list[str]:
+        """The command that learns it."""
+        return ["run", "--task", f"examples/tasks/{self.task}", *shlex.split(self.flags)]
+
+
+PIECES: Final = (
+    Piece("pendulum.py:Pendulum", "A motor that is too weak to lift a pendulum swings it up.", "--generations 150"),
+    Piece("cart.py:Cart", "A cart balances a pole of random mass."),
+    Piece("arm.py:Arm", "An arm follows a ball; the circle and its speed are random.", "--generations 400"),
+    Piece("hopper.py:Hopper", "A planar hopper of random weight hops on random ground."),
+    Piece("jaco.py:Jaco", "A Kinova arm with its meshes follows a ball.", "--generations 60"),
+    Piece(
+        "gripper.py:Gripper", "A gripper lifts a box of unknown weight by touch.",
+        "--policy linear --normalise --algorithm ars --learning-rate-mu 0.1 --initial-sigma 0.1 --touch-noise 0.05 "
+        "--touch-delay 1",
+    ),
+    Piece("grips.py:Grips", "The Allegro hand adds its middle finger to a grip."),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Compute the rows that are missing, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default=",".join(piece.name for piece in PIECES))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--runs", type=Path, default=Path("runs/gallery"))
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs")
+    given = parser.parse_args()
+    films = given.docs / "pictures/gallery"
+    films.mkdir(parents=True, exist_ok=True)
+    file = given.docs / "results/tables/gallery.jsonl"
+    rows = {row["task"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
+    for piece in PIECES:
+        if piece.name in given.only.split(","):
+            run = given.runs / f"{piece.name}-s{given.seed}"
+            rows[piece.task] = measured(piece, run, given.seed)
+            film(run, films / f"{piece.name}.gif", load(run))
+            file.write_text("".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows))
+    (given.docs / "gallery.md").write_text(page(rows), "utf-8")
+
+
+def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
+    """A row: what the run cost, and its score beside trivial policies."""
+    if not run.exists():
+        _farm(*piece.words, "--seed", str(seed), "--out", str(run.parent), "--name", run.name, "--no-record")
+    summary, policy = json.loads((run / "summary.json").read_text()), load(run)
+    returns = policy.runner.run(policy.mu, evaluation_jobs(STARTS, SEED)).returns[:STARTS]
+    task = f"{ROOT}/examples/tasks/{piece.task}"
+    scores = {"learnt": float(returns.mean()), "constant": constant(task, 0, 0), "still": still(task, 0, 0)}
+    row = {"task": piece.task, "seed": seed, "rollouts": summary["rollouts"], "seconds": round(summary["seconds"])}
+    return row | {name: round(score, 3) for name, score in scores.items()}
+
+
+def film(run: Path, path: Path, policy: LoadedPolicy) -> None:
+    """The last policy's rollout from the nominal start, in a small file."""
+    task = policy.problem.task
+    speed = task.steps * task.period / SECONDS
+    _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"))
+    with Image.open(path) as large:
+        frames = []
+        for at in range(0, large.n_frames, 2):
+            large.seek(at)
+            frames.append(large.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
+        duration = 2 * large.info["duration"]
+    palette = frames[len(frames) // 2].quantize(COLOURS, dither=Image.Dither.NONE)
+    first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
+
+
+def page(rows: dict[str, Any]) -> str:
+    """docs/gallery.md."""
+    lines = [
+        "# Gallery", "",
+        "Each task is one file in `examples/tasks`. The command below its film learnt it on two cores. Scores are mean",
+        "returns from 100 perturbed starts that no learning has seen; *constant* is the best of 300 random constant",
+        "actions, and *still* the policy whose parameters are all 0. `python benchmarks/gallery.py` repeats all of it.",
+    ]  # fmt: skip
+    for piece in PIECES:
+        if (row := rows.get(piece.task)) is None:
+            continue
+        scores = ", ".join(f"{name} {_short(row[name])}" for name in ("learnt", "constant", "still"))
+        title = piece.name.replace("_", " ").capitalize()
+        lines += ["", f"## {title}", "", f"![{piece.what}](pictures/gallery/{piece.name}.gif)", ""]
+        lines += [f"{piece.what} **{scores}** after {row['rollouts']} rollouts, {row['seconds']} s.", ""]
+        lines += [f"    farm {shlex.join(piece.words)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _short(score: float) -> str:
+    return f"{score:.3g}" if abs(score) < 100 else f"{score:.0f}"
+
+
+def _farm(*words: str) -> None:
+    subprocess.run([sys.executable, "-m", "farm", *words], check=True, stdout=subprocess.DEVNULL)
+
+
+if __name__ == "__main__":
+    script(main)
