@@ -14,7 +14,8 @@ import numpy as np
 
 from farm.policies.networks import Linear
 from farm.rollouts import Runner
-from farm.tasks.gymnasium import Environment, EnvironmentConfig, make, reset_seed
+from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
+from farm.tasks.gymnasium_engine import make
 
 NAMES = (
     *("Swimmer-v5", "Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5"),

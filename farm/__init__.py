@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from farm.sim.channels import Camera as Camera
     from farm.sim.channels import Channel as Channel
     from farm.sim.channels import Measure as Measure
+    from farm.sim.channels import Quantity as Quantity
     from farm.sim.interfaces import Backend as Backend
     from farm.sim.sim import Sim as Sim
     from farm.tasks.base import Record as Record
@@ -36,6 +37,7 @@ _WHERE: Final = {
     "RunConfig": "learner.run.config", "configure": "learner.run.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
     "Channel": "farm.sim.channels", "Camera": "farm.sim.channels", "Measure": "farm.sim.channels",
+    "Quantity": "farm.sim.channels",
     "Touch": "farm.tasks.touch", "TouchConfig": "farm.tasks.touch",
     "Record": "farm.tasks.base", "Score": "farm.tasks.base",
     "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError, UnservedError
 from farm.settings import Settings
 from farm.tasks.base import TaskSpec
@@ -34,6 +34,18 @@ class PolicyConfig(Settings):
 
     normalise: bool = False
     """Standardise each number of the observation by its mean and spread over all previous generations."""
+
+
+class Graph(Protocol):
+    """Operators of an ONNX model, one after another."""
+
+    def put(self, operator: str, *values: str | AnyArray | float, **attributes: Any) -> str:  # noqa: ANN401
+        """Apply an operator of opset 17 to values by name, or to constants in double precision.
+
+        Returns:
+          The name of the result.
+        """
+        ...
 
 
 class Policy:
@@ -127,6 +139,20 @@ class Policy:
 
         Returns:
           (B, A), of any magnitude; the task defines their meaning.
+        """
+        raise NotImplementedError
+
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str | tuple[str, str]:
+        """Put into a graph what `act` computes, for `farm export`, which compares both.
+
+        Args:
+          graph: `graph.put("MatMul", x, weights)` is the name of a product.
+          theta: the parameters (P,), as for `prepare`.
+          x: name of the observations, (N, d).
+          memory: name of the memories, (N, m).
+
+        Returns:
+          The name of the actions, (N, A); with memory a pair of it and the name of the next memories, (N, m).
         """
         raise NotImplementedError
 

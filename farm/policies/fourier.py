@@ -22,7 +22,7 @@ import numpy as np
 
 from farm import elementary
 from farm.arrays import AnyArray, FloatArray
-from farm.policies.base import Policy, PolicyConfig, check_constants
+from farm.policies.base import Graph, Policy, PolicyConfig, check_constants
 from farm.settings import setting
 from farm.tasks.base import TaskSpec
 
@@ -65,6 +65,10 @@ class Kernel(Policy):
         # Number by number: a step has only a few, for which the numpy calls of `elementary.exp` would take longer.
         return np.fromiter(map(math.exp, exponents.ravel().tolist()), float, exponents.size).reshape(exponents.shape)
 
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
+        """Its Gaussians."""
+        return gaussians(graph, x, self.prepare(theta[None])[0], self.config.bandwidth)
+
 
 class Direct(Policy):
     """Weights of random features: a_i = theta_i . z(x) (thesis 3.7)."""
@@ -106,6 +110,13 @@ class Direct(Policy):
         with np.errstate(over="ignore", invalid="ignore"):
             rows = [(w * self.features(row)).sum(axis=-1) for w, row in zip(weights, x, strict=True)]
             return np.stack(rows).astype(np.float64, copy=False)
+
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
+        """Its features and their weights, also in double precision if it works in single."""
+        rows, phases = (self.constants["frequencies"] / self.config.bandwidth).T.copy(), self.constants["phases"]
+        features = graph.put("Cos", graph.put("Add", graph.put("MatMul", x, rows), phases))
+        weights = self.prepare(theta[None])[0].astype(float)
+        return graph.put("MatMul", features, np.sqrt(2.0 / len(phases)) * weights.T)
 
     def features(self, x: FloatArray) -> AnyArray:
         """z(x) of one observation, (d,) -> (D,), in their precision."""
@@ -151,6 +162,13 @@ def gaussian_exponents(centres: FloatArray, x: FloatArray, bandwidth: float) -> 
         difference = np.ascontiguousarray(centres) - np.ascontiguousarray(x)[:, None, :]
         squares = (difference * difference).sum(axis=-1)
     return squares * (-0.5 / bandwidth**2)
+
+
+def gaussians(graph: Graph, x: str, centres: FloatArray, bandwidth: float) -> str:
+    """Name of exp(-|c - x|^2 / (2 h^2)) of centres (K, d) in a graph, (N, K)."""
+    difference = graph.put("Sub", graph.put("Unsqueeze", x, np.array([1])), centres)
+    squares = graph.put("ReduceSum", graph.put("Mul", difference, difference), np.array([2]), keepdims=0)
+    return graph.put("Exp", graph.put("Mul", squares, -0.5 / bandwidth**2))
 
 
 def _by_action(theta: FloatArray, actions: int) -> FloatArray:

@@ -23,7 +23,7 @@ import numpy as np
 from farm import elementary
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.policies.base import Policy, PolicyConfig
+from farm.policies.base import Graph, Policy, PolicyConfig
 
 _LAYERS: Final = 20
 _UNITS: Final = 10_000  # of a layer
@@ -84,6 +84,19 @@ class Linear(Policy):
                     out = elementary.tanh(out)
         return out
 
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str | tuple[str, str]:  # noqa: ARG002
+        """Its layers."""
+        return self._layers(graph, theta, x)[-1]
+
+    def _layers(self, graph: Graph, theta: FloatArray, x: str) -> list[str]:
+        """Names of what each layer puts out; tanh is of the next one."""
+        out: list[str] = []
+        for weights, bias in self._matrices(theta[None]):
+            x = graph.put("MatMul", graph.put("Tanh", x) if out else x, weights[0].T.copy())
+            x = x if bias is None else graph.put("Add", x, bias[0])
+            out.append(x)
+        return out
+
     def _matrices(self, theta: FloatArray) -> Iterator[tuple[FloatArray, FloatArray | None]]:
         """Weights (B, units, inputs) and biases (B, units) or None of each layer, from parameters (B, P)."""
         first = 0
@@ -107,6 +120,10 @@ class Constant(Linear):
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions: the parameters."""
         return super().act(prepared, x[:, :0])
+
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
+        """The parameters, once for each observation."""
+        return graph.put("Add", graph.put("MatMul", x, np.zeros((self.spec.observation, self.spec.action))), theta)
 
 
 class Mlp(Linear):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from farm.arrays import FloatArray
-from farm.policies.base import Policy
+from farm.policies.base import Graph, Policy
 
 
 class Normalised(Policy):
@@ -38,3 +38,8 @@ class Normalised(Policy):
         """What the wrapped policy gives."""
         with np.errstate(over="ignore", invalid="ignore"):
             return self._policy.act(prepared, (x - self._mean) / self._deviation, *memory)
+
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str | tuple[str, str]:
+        """That of the wrapped policy, behind the standardisation."""
+        standard = graph.put("Div", graph.put("Sub", x, self._mean), self._deviation)
+        return self._policy.onnx(graph, theta, standard, memory)

@@ -20,8 +20,8 @@ import numpy as np
 
 from farm import elementary
 from farm.arrays import FloatArray
-from farm.policies.base import Policy, PolicyConfig, check_constants
-from farm.policies.fourier import gaussian_exponents
+from farm.policies.base import Graph, Policy, PolicyConfig, check_constants
+from farm.policies.fourier import gaussian_exponents, gaussians
 from farm.settings import setting
 from farm.tasks.base import TaskSpec
 
@@ -64,6 +64,12 @@ class Rbf(Policy):
         with np.errstate(over="ignore", invalid="ignore"):
             return (weights * values[:, None, :]).sum(axis=-1)
 
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
+        """Its functions and their weights."""
+        centres, weights = np.split(theta, [self.config.centres * self.spec.observation])
+        values = gaussians(graph, x, centres.reshape(-1, self.spec.observation), self.config.bandwidth)
+        return graph.put("MatMul", values, weights.reshape(self.spec.action, -1).T.copy())
+
 
 class WeightedKernel(Policy):
     """Signed Gaussian kernel of the standardised observation: a_i = w_i exp(-|theta_i - y|^2 / (2 h^2))."""
@@ -92,6 +98,13 @@ class WeightedKernel(Policy):
             y = (x - self.constants["origin"]) / self.constants["spread"]
             weights: FloatArray = self.config.weight_scale * prepared[:, :, -1]
             return weights * _gaussians(prepared[:, :, :-1], y, self._bandwidth)
+
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
+        """Its Gaussians of the standardised observation, and their weights."""
+        y = graph.put("Div", graph.put("Sub", x, self.constants["origin"]), self.constants["spread"])
+        rows = self.prepare(theta[None])[0]
+        values = gaussians(graph, y, rows[:, :-1].copy(), float(self._bandwidth))
+        return graph.put("Mul", values, self.config.weight_scale * rows[:, -1])
 
 
 def _gaussians(centres: FloatArray, x: FloatArray, bandwidth: float) -> FloatArray:

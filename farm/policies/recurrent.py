@@ -17,7 +17,7 @@ import numpy as np
 
 from farm import elementary
 from farm.arrays import FloatArray
-from farm.policies.base import Policy, PolicyConfig
+from farm.policies.base import Graph, Policy, PolicyConfig
 from farm.policies.networks import Mlp, affine
 from farm.settings import setting
 
@@ -68,6 +68,11 @@ class Rnn(Mlp):
             after = elementary.tanh(affine(*hidden, np.concatenate([x, memory], axis=1)))
             return affine(*output, after), after
 
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> tuple[str, str]:
+        """Its layers, the first of which also sees the memory."""
+        hidden, out = self._layers(graph, theta, graph.put("Concat", x, memory, axis=1))
+        return out, graph.put("Tanh", hidden)
+
 
 class Cpg(Policy):
     """A sine oscillator for each action, without feedback.
@@ -112,3 +117,11 @@ class Cpg(Policy):
             action = offset + amplitude * elementary.sin(2.0 * np.pi * memory + shift)
             turns = memory + frequency * self.spec.period
             return action, turns - np.floor(turns)
+
+    def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> tuple[str, str]:  # noqa: ARG002
+        """Its oscillators."""
+        frequency, amplitude, shift, offset = self.prepare(theta[None])[0].T.copy()
+        angle = graph.put("Add", graph.put("Mul", memory, 2.0 * np.pi), shift)
+        action = graph.put("Add", graph.put("Mul", graph.put("Sin", angle), amplitude), offset)
+        turns = graph.put("Add", memory, frequency * self.spec.period)
+        return action, graph.put("Sub", turns, graph.put("Floor", turns))

@@ -1,13 +1,13 @@
 """Channels, the data that a rollout shows in addition to its bodies, measures and cameras. Pure data."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm.arrays import AnyArray, FloatArray
 from farm.errors import ConfigError
 
 Kind = Literal["scalars", "flags", "images", "arrows", "points"]
@@ -120,6 +120,12 @@ class Channel:
         return self.labels or tuple(str(i + 1) for i in range(self.shape[0]))
 
 
+def flat(channels: Sequence[Channel], values: Mapping[str, AnyArray]) -> AnyArray:
+    """Concatenate the channels' values (..., *shape) as float32, (..., K): a trace."""
+    parts = [values[c.name].reshape(*values[c.name].shape[: -len(c.shape)], -1) for c in channels]
+    return np.concatenate(parts, axis=-1).astype("<f4")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measure:
     """A number that describes a whole rollout beside its return: a height, a distance, a share of steps.
@@ -154,6 +160,43 @@ class Measure:
         bounds: tuple[object, ...] = (self.low, self.high)
         if not all(isinstance(each, int | float) for each in bounds) or not -math.inf < self.low < self.high < math.inf:
             raise ConfigError(f"measure {self.name}: bounds {self.low!r} to {self.high!r}; expected rising numbers")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What one number of an observation or an action is; exported policies say it.
+
+    Raises:
+      ConfigError: a text or the range is invalid.
+
+    Example:
+      ```python
+      import numpy as np
+
+      import farm
+
+      class Hinge(farm.Task):
+          observations = (farm.Quantity("height", low=-1.0, high=1.0), farm.Quantity("speed", "rad/s"))
+
+          def observe(self, sim):  # (B, 2)
+              return np.concatenate([np.cos(sim.qpos), sim.qvel], axis=1)
+      ```
+    """
+
+    name: str
+    unit: str = ""
+    low: float = -math.inf
+    """Smallest value; -inf if it is unknown."""
+    high: float = math.inf
+    """Largest value; inf if it is unknown."""
+
+    def __post_init__(self) -> None:
+        texts: tuple[object, ...] = (self.name, self.unit)
+        if not all(isinstance(each, str) for each in texts) or not self.name:
+            raise ConfigError(f"quantity {self.name!r} [{self.unit!r}]: expected a name and a unit as texts")
+        bounds: tuple[object, ...] = (self.low, self.high)
+        if not all(isinstance(each, int | float) for each in bounds) or not self.low <= self.high:
+            raise ConfigError(f"quantity {self.name}: {self.low!r} to {self.high!r}; expected rising numbers")
 
 
 @dataclass(frozen=True, kw_only=True)

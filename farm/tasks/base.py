@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
-from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from farm.sim.channels import Camera, Channel, Measure
+from farm.sim.channels import Camera, Channel, Measure, Quantity
 
 if TYPE_CHECKING:
     import mujoco
@@ -216,6 +216,10 @@ class Task:
     """Factor of the return."""
     parts: tuple[int, ...] = ()
     """Sizes of the observation's parts if they differ in kind; empty: one part."""
+    observations: tuple[Quantity, ...] = ()
+    """What the observation's numbers are, for exports; empty: numbered, or qpos and qvel if those are observed."""
+    actions: tuple[Quantity, ...] = ()
+    """The same of the action's; empty: the actuators' names, with -1 to 1 unless `act` is overridden."""
     ends: tuple[str, str] | None = None
     """Names of the states in which rollouts begin and should end; with `reached` and `lost` policies can be chained."""
     ending: ClassVar[str] = "ended"
@@ -392,9 +396,3 @@ def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArra
     part = np.minimum(np.maximum(action, -1.0), 1.0)
     part[np.isnan(part)] = 0.0
     return low + (high - low) * (0.5 * (part + 1.0))
-
-
-def flat(channels: Sequence[Channel], values: Mapping[str, AnyArray]) -> AnyArray:
-    """Concatenate the channels' values (..., *shape) as float32, (..., K): a trace."""
-    parts = [values[c.name].reshape(*values[c.name].shape[: -len(c.shape)], -1) for c in channels]
-    return np.concatenate(parts, axis=-1).astype("<f4")

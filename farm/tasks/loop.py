@@ -16,12 +16,13 @@ import numpy as np
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
 from farm.moments import Moments
+from farm.sim.channels import flat
 from farm.sim.interfaces import Rebound
 from farm.sim.scene import Scene
 from farm.sim.sim import Sim, unwritable
 from farm.sim.trajectory import Trajectory
 from farm.tasks.acting import Acting, Acts, shaped
-from farm.tasks.base import Record, Task, TaskSpec, flat
+from farm.tasks.base import Record, Task, TaskSpec
 from farm.tasks.outcomes import measured
 
 P = ParamSpec("P")

@@ -11,7 +11,7 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import ConfigError, TaskError
 from farm.sim import mixed
-from farm.sim.channels import Camera, Channel, Measure
+from farm.sim.channels import Camera, Channel, Measure, Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
@@ -41,8 +41,19 @@ def specification(task: Task) -> TaskSpec:
     names = [each.name for each in task.measures]
     if len(set(names)) < len(names):
         raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
+    for what, count in (("observations", found.observation), ("actions", found.action)):
+        _check_quantities(task, what, count)
     several = (_models(task),) if len(task.simulated) > 1 else ()
     return replace(found, measures=tuple(task.measures), channels=(*found.channels, *several))
+
+
+def _check_quantities(task: Task, what: str, count: int) -> None:
+    """Check the quantities that a task names in an attribute, if it names any."""
+    given: object = getattr(task, what)
+    if not isinstance(given, tuple | list) or not all(isinstance(each, Quantity) for each in given):
+        raise ConfigError(f"task {type(task).__name__}: {what} is {given!r:.60}; expected a tuple of farm.Quantity")
+    if given and len(given) != count:
+        raise ConfigError(f"task {type(task).__name__}: {what} names {len(given)} numbers; there are {count}")
 
 
 def _models(task: Task) -> Channel:

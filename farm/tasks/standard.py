@@ -12,6 +12,7 @@ from farm.tasks.loop import Batch
 from farm.tasks.probe import tried
 
 _ROLLOUTS: Final = 32
+_FEW: Final = 2
 _QUARTILES: Final = 1.349  # between those of a normal distribution, in standard deviations
 _FLOOR: Final = 1.0 / 3.0  # of a part's mean spread
 
@@ -53,6 +54,19 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
         mean = part.mean()
         np.maximum(part, _FLOOR * mean if mean > 0.0 else 1.0, out=part)
     return {"origin": seen[0].copy(), "spread": spread}
+
+
+def observed(task: Task, count: int) -> FloatArray:
+    """Observations of rollouts with random constant actions from the nominal start, (N, d).
+
+    There are about `count` of them; fewer if rollouts end early.
+
+    Raises:
+      ConfigError: the task cannot start.
+      TaskError: an observation is not finite.
+    """
+    rollouts = max(_FEW, -(-count // task.steps))
+    return _observed(task, np.random.default_rng(0).normal(0.0, 0.5, (rollouts, len(task.limits[0]))))
 
 
 def _observed(task: Task, actions: FloatArray) -> FloatArray:

@@ -16,9 +16,10 @@ from farm.sim.sim import Sim
 from farm.tasks.base import Task
 from farm.tasks.loop import Batch
 from learner.again.replay import LoadedPolicy
+from learner.export.interface import interface
 from learner.run import checkpoint
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Version of the file."""
 
 
@@ -48,6 +49,7 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
         "steps": task.steps,
         "substeps": task.substeps,
         "control_period": task.period,
+        "interface": json.dumps(interface(policy)),
         "gamma": task.config.gamma,
         "return_scale": task.return_scale,
         **found.policy.constants,

@@ -1,21 +1,22 @@
 """Exports a learnt policy as an ONNX model: observation in, action out, and a memory both ways; see docs/export.md.
 
 Double precision throughout, with the operators of opset 17. The runtime computes sums and functions, so that the last
-bits differ from the farm's.
+bits differ from the farm's. `Policy.onnx` says what a policy computes; here it is compared with `Policy.act`.
 """
 
 import json
-from collections.abc import Callable, Mapping
-from itertools import pairwise
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from farm import settings
-from farm.arrays import AnyArray
-from farm.errors import ConfigError, writing
+from farm import plugins, settings
+from farm.arrays import AnyArray, FloatArray
+from farm.errors import ConfigError, FarmError, brief, writing
+from farm.tasks.standard import observed
 from learner.again.replay import LoadedPolicy
+from learner.export.interface import interface
 from learner.run import checkpoint
 
 OPSET: Final = 17
@@ -23,21 +24,30 @@ OPSET: Final = 17
 IR: Final = 8
 """Version of the file's format for these operators."""
 
+_STATES: Final = 1000  # on which both are compared
+_SEEN: Final = 200  # observations around which these are drawn, about
+_TURNS: Final = 3  # in which a policy with memory acts on each of them
+_NOISE: Final = 0.1  # added to observations, in their standard deviations
+_DOUBLE, _SINGLE = 1e-9, 1e-4  # largest difference, relative where actions are above 1; by the policy's own precision
+_NUMBERS: Final = 4_000_000  # of parameters in one call of the policy
+
+
+def library() -> Any:  # noqa: ANN401  a module
+    """The package onnx; a ConfigError if it is not installed."""
+    try:
+        import onnx
+        import onnx.reference
+    except ImportError:
+        raise ConfigError("an .onnx file needs onnx: pip install onnx") from None
+    return onnx
+
 
 class Graph:
     """Operators one after another; each value is known by its name, and N is the size of a batch."""
 
     def __init__(self) -> None:
-        """Begin empty.
-
-        Raises:
-          ConfigError: onnx is not installed.
-        """
-        try:
-            import onnx
-        except ImportError:
-            raise ConfigError("an .onnx file needs onnx: pip install onnx") from None
-        self._onnx: Any = onnx
+        """Begin empty; a ConfigError if onnx is not installed."""
+        self._onnx = library()
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
@@ -73,40 +83,60 @@ def contents(policy: LoadedPolicy) -> bytes:
     """The file.
 
     Raises:
-      ConfigError: onnx is not installed, or the policy is not a built-in one.
+      ConfigError: onnx is not installed, or the policy has no form in ONNX, or one that acts differently.
     """
-    problem, graph = policy.problem, Graph()
-    config, constants = problem.config, problem.policy.constants
-    if config.policy not in _FORMS:
-        raise ConfigError(f"policy {config.policy} has no form in ONNX; these have: {', '.join(_FORMS)}")
-    x = "observation"
-    if "observation_mean" in constants:
-        x = graph.put("Sub", x, constants["observation_mean"])
-        x = graph.put("Div", x, constants["observation_deviation"])
-    out = _FORMS[config.policy](graph, policy, x)
-    graph.put("Identity", out, to="action")
-    first = problem.policy.memory
+    problem = policy.problem
+    config, first = problem.config, problem.policy.memory
     memories = ({}, {}) if first is None else ({"memory": len(first)}, {"next_memory": len(first)})
-    return graph.model(
-        {"observation": problem.spec.observation, **memories[0]},
-        {"action": problem.spec.action, **memories[1]},
-        {
-            "task": config.task.rpartition("/")[2],
-            "policy": config.policy,
-            "generation": str(policy.generation),
-            "control_period": repr(problem.spec.period),
-            "task_config": json.dumps(settings.to_dict(config.task_config)),
-            "policy_config": json.dumps(settings.to_dict(config.policy_config)),
-            **({} if first is None else {"memory": json.dumps(first.tolist())}),
-        },
-    )
+    graph = _graph(policy)
+    try:
+        content = graph.model(
+            {"observation": problem.spec.observation, **memories[0]},
+            {"action": problem.spec.action, **memories[1]},
+            {
+                "task": config.task.rpartition("/")[2],
+                "policy": config.policy.rpartition("/")[2],
+                "generation": str(policy.generation),
+                "control_period": repr(problem.spec.period),
+                "task_config": json.dumps(settings.to_dict(config.task_config)),
+                "policy_config": json.dumps(settings.to_dict(config.policy_config)),
+                "interface": json.dumps(interface(policy)),
+                **({} if first is None else {"memory": json.dumps(first.tolist())}),
+            },
+        )
+        _compare(policy, content)
+    except FarmError:
+        raise
+    except Exception as error:  # onnx has many kinds of errors, and a policy of one's own may cause any
+        raise ConfigError(f"onnx of {config.policy} makes no model: {brief(str(error))}") from None
+    return content
+
+
+def listed(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """The properties of an .onnx, and lines about what goes in and comes out.
+
+    Raises:
+      ConfigError: onnx is not installed, or it cannot be read.
+    """
+    onnx = library()
+    try:
+        model = onnx.load(path)
+    except Exception as error:  # protobuf's errors have no common class
+        raise ConfigError(f"{path} is no ONNX model: {brief(str(error))}") from None
+    ends = {"takes": model.graph.input, "gives": model.graph.output}
+    sizes = {
+        word: [f"{each.name} (N, {each.type.tensor_type.shape.dim[1].dim_value})" for each in ends[word]]
+        for word in ends
+    }
+    said = {each.key: each.value for each in model.metadata_props}
+    return said, [f"{word} {', '.join(each)}" for word, each in sizes.items()]
 
 
 def write(path: Path, policy: LoadedPolicy) -> None:
     """Write the file, or leave an existing one.
 
     Raises:
-      ConfigError: onnx is not installed, or the policy is not a built-in one.
+      ConfigError: onnx is not installed, or the policy has no form in ONNX, or one that acts differently.
       RunError: it cannot be written.
     """
     content = contents(policy)
@@ -114,83 +144,61 @@ def write(path: Path, policy: LoadedPolicy) -> None:
         checkpoint.replace(path, content)
 
 
-def _layers(graph: Graph, policy: LoadedPolicy, x: str, layers: tuple[int, ...] = (), memory: int = 0) -> str:
-    """Networks: `linear`, `mlp`, and `rnn`, whose hidden layer is its next memory."""
-    spec, config = policy.problem.spec, policy.problem.config.policy_config
-    sizes = (spec.observation + memory, *getattr(config, "layers", layers), spec.action)
-    bias: bool = getattr(config, "bias", True)
-    first = 0
-    for layer, (inputs, units) in enumerate(pairwise(sizes)):
-        if layer:
-            x = graph.put("Tanh", x, to="next_memory" if memory else "")
-        end = first + units * (inputs + bias)
-        rows, first = policy.parameters[first:end].reshape(units, inputs + bias), end
-        x = graph.put("MatMul", x, rows[:, :inputs].T.copy())
-        if bias:
-            x = graph.put("Add", x, rows[:, -1])
-    return x
+@plugins.no_exit
+def _graph(policy: LoadedPolicy) -> Graph:
+    """What the policy puts."""
+    own, graph, name = policy.problem.policy, Graph(), policy.problem.config.policy
+    try:
+        given: object = own.onnx(graph, policy.parameters, "observation", "" if own.memory is None else "memory")
+    except NotImplementedError:
+        raise ConfigError(
+            f"policy {name} has no form in ONNX: give it a method onnx(self, graph, theta, x, memory)"
+        ) from None
+    names = (given,) if own.memory is None else given
+    ends = ("action",) if own.memory is None else ("action", "next_memory")
+    if not isinstance(names, tuple) or len(names) != len(ends) or not all(isinstance(each, str) for each in names):
+        raise ConfigError(f"onnx of {name} gave {given!r:.60}; expected the name of {' and that of '.join(ends)}")
+    for each, end in zip(names, ends, strict=True):
+        graph.put("Identity", str(each), to=end)
+    return graph
 
 
-def _rnn(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    units: int = policy.problem.config.policy_config.units  # type: ignore[attr-defined]
-    return _layers(graph, policy, graph.put("Concat", x, "memory", axis=1), (units,), units)
+def _compare(policy: LoadedPolicy, content: bytes) -> None:
+    """Compare both on states of the task, in a few turns if there is a memory.
+
+    Raises:
+      ConfigError: an action or memory differs.
+    """
+    own, name, rng = policy.problem.policy, policy.problem.config.policy, np.random.default_rng(0)
+    session = library().reference.ReferenceEvaluator(content)
+    seen = observed(policy.problem.task, _SEEN)
+    first, turns = (np.zeros(0), 1) if own.memory is None else (own.memory, _TURNS)
+    allowed = _SINGLE if own.prepare(policy.parameters[None]).dtype == np.float32 else _DOUBLE
+    at_once = max(1, min(_STATES, _NUMBERS // own.size))
+    for begin in range(0, _STATES, at_once):
+        count = min(at_once, _STATES - begin)
+        acting, memory = policy.acting(count), np.tile(first, (count, 1))
+        for _ in range(turns):
+            x = seen[rng.integers(len(seen), size=count)]
+            x = x + _NOISE * seen.std(axis=0) * rng.standard_normal(x.shape)
+            given: list[FloatArray] = session.run(
+                None, {"observation": x, **({"memory": memory} if first.size else {})}
+            )
+            wanted = np.asarray(acting.act(x), dtype=float)
+            _same(name, given[0], wanted, begin, allowed)
+            if first.size:
+                memory = given[1]
 
 
-def _cpg(graph: Graph, policy: LoadedPolicy, x: str) -> str:  # noqa: ARG001
-    frequency, amplitude, shift, offset = policy.parameters.reshape(-1, 4).T.copy()
-    turns = graph.put("Add", "memory", frequency * policy.problem.spec.period)
-    graph.put("Sub", turns, graph.put("Floor", turns), to="next_memory")
-    angle = graph.put("Add", graph.put("Mul", "memory", 2.0 * np.pi), shift)
-    return graph.put("Add", graph.put("Mul", graph.put("Sin", angle), amplitude), offset)
-
-
-def _constant(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    return graph.put(
-        "Add",
-        graph.put("MatMul", x, np.zeros((policy.problem.spec.observation, len(policy.parameters)))),
-        policy.parameters,
-    )
-
-
-def _gaussians(graph: Graph, x: str, centres: AnyArray, bandwidth: float) -> str:
-    """exp(-|c - x|^2 / (2 h^2)) of centres (K, d), (N, K)."""
-    difference = graph.put("Sub", graph.put("Unsqueeze", x, np.array([1])), centres)
-    squares = graph.put("ReduceSum", graph.put("Mul", difference, difference), np.array([2]), keepdims=0)
-    return graph.put("Exp", graph.put("Mul", squares, -0.5 / bandwidth**2))
-
-
-def _kernel(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    config: Any = policy.problem.config.policy_config
-    return _gaussians(graph, x, policy.parameters.reshape(policy.problem.spec.action, -1), config.bandwidth)
-
-
-def _rbf(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    spec, config = policy.problem.spec, policy.problem.config.policy_config
-    centres, weights = np.split(policy.parameters, [config.centres * spec.observation])  # type: ignore[attr-defined]
-    values = _gaussians(graph, x, centres.reshape(-1, spec.observation), config.bandwidth)  # type: ignore[attr-defined]
-    return graph.put("MatMul", values, weights.reshape(spec.action, -1).T.copy())
-
-
-def _weighted_kernel(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    spec, config = policy.problem.spec, policy.problem.config.policy_config
-    constants, rows = policy.problem.policy.constants, policy.parameters.reshape(spec.action, -1)
-    y = graph.put("Div", graph.put("Sub", x, constants["origin"]), constants["spread"])
-    bandwidth = config.width * float(np.sqrt(spec.observation))  # type: ignore[attr-defined]
-    values = _gaussians(graph, y, rows[:, :-1].copy(), bandwidth)
-    return graph.put("Mul", values, config.weight_scale * rows[:, -1])  # type: ignore[attr-defined]
-
-
-def _features(graph: Graph, policy: LoadedPolicy, x: str) -> str:
-    """Random features: `direct`, and policies that can be converted to it."""
-    found, config = policy.problem.policy, policy.problem.config.policy_config
-    rows = (found.constants["frequencies"] / config.bandwidth).T.copy()  # type: ignore[attr-defined]
-    weights = found.prepare(policy.parameters[None])[0]
-    angle = graph.put("Add", graph.put("MatMul", x, rows), found.constants["phases"])
-    return graph.put("MatMul", graph.put("Cos", angle), np.sqrt(2.0 / len(rows.T)) * weights.T)
-
-
-_FORMS: Final[Mapping[str, Callable[[Graph, LoadedPolicy, str], str]]] = {
-    "direct": _features, "projected": _features, "cosine": _features, "kernel": _kernel, "linear": _layers,
-    "mlp": _layers, "constant": _constant, "rbf": _rbf, "weighted-kernel": _weighted_kernel,
-    "rnn": _rnn, "cpg": _cpg,
-}  # fmt: skip
+def _same(name: str, given: FloatArray, wanted: FloatArray, begin: int, allowed: float) -> None:
+    if given.shape != wanted.shape:
+        raise ConfigError(f"onnx of {name} gives actions of shape {given.shape}; expected {wanted.shape}, as act")
+    most = allowed * np.maximum(1.0, np.abs(wanted))
+    with np.errstate(invalid="ignore"):
+        differs = ~((np.abs(given - wanted) <= most) | (given == wanted) | (np.isnan(given) & np.isnan(wanted)))
+    if differs.any():
+        row, column = np.argwhere(differs)[0].tolist()
+        raise ConfigError(
+            f"onnx of {name} gives action {column} as {given[row, column]:.9g} in state {begin + row} of {_STATES}; "
+            f"act gives {wanted[row, column]:.9g}"
+        )

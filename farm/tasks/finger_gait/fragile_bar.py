@@ -27,11 +27,11 @@ from farm.tasks.finger_gait.holding import (
     SUCCESS_STEPS,
     HandTask,
     Perturbation,
-    cut,
     distance,
     stayed,
 )
 from farm.tasks.finger_gait.observations import STATES
+from farm.tasks.finger_gait.rewards import cut
 
 TERMS: Final = ("force", "grip", "crush", "pose", "action", "drop")
 """Names of the reward's terms."""

@@ -14,8 +14,9 @@ import numpy as np
 from farm import elementary
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
+from farm.sim.channels import Quantity
 from farm.sim.sim import Sim
-from farm.tasks.base import Camera, Channel, Record, Task, TaskSpec
+from farm.tasks.base import Camera, Channel, Task, TaskSpec
 from farm.tasks.finger_gait import model, touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, POSES, TIP_RADIUS, UPPER
@@ -133,6 +134,7 @@ class HandTask(Task):
     scales: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of joint positions, contact points and taxels in the state."""
     substeps = SUBSTEPS
+    actions = tuple(Quantity(joint, "rad") for joint in JOINTS)
     ending = "dropped"
     camera = Camera(lookat=(0.035, 0.014, 0.01), distance=0.34, azimuth=150.0, elevation=-14.0)
     start_commands: FloatArray
@@ -175,6 +177,11 @@ class HandTask(Task):
     def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
         """Sizes of the state base's parts."""
         return STATES[self.config.state].sizes
+
+    @property
+    def observations(self) -> tuple[Quantity, ...]:  # type: ignore[override]  # a setting's
+        """The state base's numbers."""
+        return STATES[self.config.state].quantities(self.scales)
 
     def spec(self) -> TaskSpec:
         """The task's specification, found without closing a grip."""
@@ -379,14 +386,6 @@ def distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArra
     difference = pose[..., :3] - start[..., :3]
     shift = np.sqrt((difference * difference).sum(axis=-1))
     return shift, np.abs((pose[..., 3:] * start[..., 3:]).sum(axis=-1))
-
-
-def cut(terms: FloatArray, record: Record, worst: float) -> FloatArray:
-    """Terms (B, T, K) with only the penalty `worst`, in the last of them, after each rollout's end."""
-    over = np.arange(terms.shape[1]) >= record.steps[:, None]
-    terms[over], terms[over, -1] = 0.0, -worst
-    terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)
-    return terms
 
 
 def _joint_colours() -> tuple[tuple[int, int, int], ...]:

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from farm.arrays import FloatArray
-from farm.tasks.finger_gait.hand import FINGERS, JOINTS
+from farm.sim.channels import Quantity
+from farm.tasks.finger_gait.hand import FINGERS, JOINTS, LOWER, UPPER
 from farm.tasks.finger_gait.touch import TAXELS
 
 _COUNT: Final = len(FINGERS)
@@ -50,6 +51,24 @@ class StateBase:
         """Lengths of its parts."""
         return tuple(_SIZES[part] for part in self.parts)
 
+    def quantities(self, scales: tuple[float, float, float]) -> tuple[Quantity, ...]:
+        """What its numbers are, with the factors of joint positions, contact points and forces."""
+        joints, points, force = scales
+        angles = zip(JOINTS, LOWER * joints, UPPER * joints, strict=True)
+        taxels, axes = [f"taxel {i}" for i in range(TAXELS)], [f"contact {axis}" for axis in "xyz"]
+        forces = _times(force, "N"), 0.0
+        known = {
+            "joints": [Quantity(name, _times(joints, "rad"), *map(float, bounds)) for name, *bounds in angles],
+            "images": [Quantity(f"{finger} {name}", *forces) for finger in FINGERS for name in taxels],
+            "points": [
+                Quantity(f"{finger} {axis}", _times(points, "radii"), -points, points)
+                for finger in FINGERS
+                for axis in axes
+            ],
+            "forces": [Quantity(f"{finger} force", *forces) for finger in FINGERS],
+        }
+        return tuple(each for part in self.parts for each in known[part])
+
     @property
     def touch(self) -> bool:
         """Whether it needs taxels or contact points, which take time to compute."""
@@ -59,6 +78,11 @@ class StateBase:
         """The observation x at B times, (B, d)."""
         count = len(felt.joints)
         return np.concatenate([getattr(felt, part).reshape(count, -1) for part in self.parts], axis=1)
+
+
+def _times(factor: float, unit: str) -> str:
+    """What a number is if it is scaled."""
+    return unit if factor == 1.0 else f"{1.0 / factor:g} {unit}"
 
 
 STATES: Final[dict[str, StateBase]] = {

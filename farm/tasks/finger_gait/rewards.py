@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from farm.arrays import BoolArray, FloatArray, IntArray
+from farm.tasks.base import Record
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import Felt
 
@@ -108,3 +109,11 @@ def factors(reward: str, weights: Weights, goal: Felt) -> FloatArray:
     touch = full * weights.tactile / float(_squares(goal.images.reshape(-1)))
     near = weights.joints / float(_squares(goal.joints))
     return np.array([touch, near, weights.action, full * weights.contact_points])
+
+
+def cut(terms: FloatArray, record: Record, worst: float) -> FloatArray:
+    """Terms (B, T, K) with only the penalty `worst`, in the last of them, after each rollout's end."""
+    over = np.arange(terms.shape[1]) >= record.steps[:, None]
+    terms[over], terms[over, -1] = 0.0, -worst
+    terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)
+    return terms

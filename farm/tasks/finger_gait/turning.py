@@ -13,11 +13,12 @@ import numpy as np
 from farm import elementary
 from farm.arrays import BoolArray, FloatArray
 from farm.settings import setting
-from farm.sim.channels import Camera
+from farm.sim.channels import Camera, Quantity
 from farm.sim.sim import Sim
 from farm.tasks.base import Record, Score, TaskConfig
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
-from farm.tasks.finger_gait.holding import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, HandTask, cut, distance
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, HandTask, distance
+from farm.tasks.finger_gait.rewards import cut
 
 TERMS: Final = ("turn", "speed", "pose", "action", "drop")
 """Names of the reward terms."""
@@ -64,6 +65,15 @@ class Turning(HandTask):
     def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
         """Sizes of the observation's parts."""
         return tuple(_SIZES[part] for part in self.config.state.split("+"))
+
+    @property
+    def observations(self) -> tuple[Quantity, ...]:  # type: ignore[override]  # a setting's
+        """Phase, and what the setting says."""
+        waves = [f"{wave} {n:g}" for wave in ("sine", "1 - cosine") for n in _HARMONICS]
+        names = {"joints": (JOINTS, "rad"), "forces": (FINGERS, f"{1 / _FORCE:g} N")}
+        parts = [names[part] for part in self.config.state.split("+") if part in names]
+        felt = (Quantity(name, unit) for each, unit in parts for name in each)
+        return (*(Quantity(wave) for wave in waves), *felt)
 
     def observe(self, sim: Sim) -> FloatArray:
         """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d)."""

@@ -13,7 +13,8 @@ from farm.errors import ConfigError
 from farm.net.work import Jobs
 from farm.policies.fourier import Direct, FeaturesConfig
 from farm.rollouts import Runner
-from farm.tasks.gymnasium import NOMINAL, Environment, EnvironmentConfig, make, reset_seed
+from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
+from farm.tasks.gymnasium_engine import NOMINAL, make
 from farm.tasks.loop import RETURN_FLOOR
 
 SEED = seeds.training(0, 3, 4)

@@ -13,8 +13,9 @@ from farm.tasks.loop import RETURN_FLOOR, Batch, again
 
 gymnasium = pytest.importorskip("gymnasium")
 
-from farm.tasks.gymnasium import Environment, EnvironmentConfig, EnvironmentEngine, make, reset_seed  # noqa: E402
+from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed  # noqa: E402
 from farm.tasks.gymnasium_batched import batched  # noqa: E402
+from farm.tasks.gymnasium_engine import EnvironmentEngine, make  # noqa: E402
 
 ARGUMENTS = {
     "Swimmer-v5": ("exclude_current_positions_from_observation=false", "ctrl_cost_weight=0.3", "frame_skip=2"),

@@ -1,6 +1,7 @@
 """Environments of Gymnasium whose observations are dictionaries, as those with goals: a tiny one of the test's own."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -127,3 +128,76 @@ def test_an_environments_state_is_its_own() -> None:
 def test_parts_that_are_no_numbers_are_named(part: str, line: str) -> None:
     with pytest.raises(ConfigError, match=line):
         Environment(EnvironmentConfig(env_arg=(f'part="{part}"',)), "Goal-v0")
+
+
+class Wrapped:
+    """A thing of dm_control's, around one of MuJoCo's."""
+
+    def __init__(self, ptr: Any) -> None:
+        self.ptr = ptr
+
+
+class Physics:
+    """dm_control's: it raises an exception where MuJoCo only warns, unless it is told not to."""
+
+    def __init__(self) -> None:
+        self._own = mujoco.MjModel.from_xml_string(XML)
+        self._data, self._quiet = mujoco.MjData(self._own), False
+        self.model, self.data = Wrapped(self._own), Wrapped(self._data)
+
+    @contextmanager
+    def suppress_physics_errors(self) -> Iterator[None]:
+        """For a block."""
+        self._quiet = True
+        yield
+        self._quiet = False
+
+    def step(self) -> None:
+        """As dm_control's."""
+        before = [each.number for each in self._data.warning]
+        mujoco.mj_step(self._own, self._data)
+        if before != [each.number for each in self._data.warning] and not self._quiet:
+            raise ArithmeticError("physics")
+
+
+class Suite(gymnasium.Env[Any, Any]):
+    """As shimmy gives dm_control's environments: without a model of its own, with an old generator and a limit."""
+
+    dt = 0.05
+    observation_space, action_space = Box(-np.inf, np.inf, (2,)), Box(-1.0, 1.0, (1,))
+
+    def __init__(self) -> None:
+        self.physics, self._left = Physics(), 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """From a seed of 32 bits."""
+        data = self.physics.data.ptr
+        data.qpos[:], data.qvel[:], self._left = np.random.RandomState(seed).uniform(-0.1, 0.1), 0.0, 7
+        return np.concatenate([data.qpos, data.qvel]), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """It ends itself after 7 steps, and may not be stepped on."""
+        assert self._left
+        self._left -= 1
+        data = self.physics.data.ptr
+        data.ctrl[:] = action
+        if data.qpos[0] > 0.05:
+            data.qvel[:] = 1e12
+        self.physics.step()
+        return np.concatenate([data.qpos, data.qvel]), 1.0, False, not self._left, {}
+
+
+@pytest.mark.parametrize("steps", [5, 7, 9])
+def test_dm_controls_physics_seeds_and_limit(steps: int) -> None:
+    gymnasium.register("suite/push-v0", Suite)
+    try:
+        task = Environment(EnvironmentConfig(steps=steps), "suite/push-v0")
+        made = Runner(task, Linear(LinearConfig(), task.spec(), {}))
+        found = made.rollouts(np.zeros((20, made.size)), [(each,) for each in range(20)])
+    finally:
+        del gymnasium.registry["suite/push-v0"]
+    assert 0 < found.failed.sum() < 20
+    fine = ~found.failed
+    assert set(found.steps[fine].tolist()) == {min(steps, 7)}
+    assert found.returns[fine].tolist() == [min(steps, 7)] * fine.sum()
+    assert found.ended[fine].all() == found.ended[fine].any() == (steps > 7)

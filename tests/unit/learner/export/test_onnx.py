@@ -16,6 +16,7 @@ from learner.export import onnx
 from learner.run.config import configure
 from learner.run.setup import start
 
+HOPPER = f"{Path(__file__).parents[4]}/examples/tasks/hopper.py:Hopper"
 SETTINGS: dict[str, dict[str, Any]] = {
     "direct": {"features": 300},
     "projected": {"features": 300},
@@ -31,7 +32,7 @@ MEMORY: dict[str, dict[str, Any]] = {"rnn": {"units": 5}, "cpg": {}}
 
 
 def learnt(policy: str, normalise: bool = False) -> LoadedPolicy:
-    config = configure(policy=policy, state="joints+contacts", normalise=normalise, **(SETTINGS | MEMORY)[policy])
+    config = configure(HOPPER, policy=policy, normalise=normalise, **(SETTINGS | MEMORY)[policy])
     found, _ = start(config, "r")
     if normalise:
         seen = np.random.default_rng(2).uniform(0.5, 1.0, (2, found.spec.observation))
@@ -53,7 +54,7 @@ def test_a_runtime_acts_as_the_policy_does(policy: str, normalise: bool, tmp_pat
     np.testing.assert_allclose(given, wanted, rtol=1e-11, atol=1e-12)
     assert policy == "constant" or np.ptp(wanted, axis=0).min() > 1e-6
     said = session.get_modelmeta().custom_metadata_map
-    assert (said["policy"], said["generation"], said["task"]) == (policy, "7", "finger-gait")
+    assert (said["policy"], said["generation"], said["task"]) == (policy, "7", "hopper.py:Hopper")
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -98,15 +99,73 @@ def test_a_policy_for_an_environment_of_gymnasium() -> None:
     np.testing.assert_allclose(given, wanted, rtol=1e-11, atol=1e-12)
 
 
-def test_other_policies_have_no_form() -> None:
-    pytest.importorskip("onnx")
-    loaded = learnt("linear")
-    object.__setattr__(loaded.problem.config, "policy", "/home/me/own.py:Own")
-    with pytest.raises(ConfigError, match=r"policy /home/me/own.py:Own has no form in ONNX; these have: direct, "):
-        onnx.contents(loaded)
-
-
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ConfigError, match=r"an .onnx file needs onnx: pip install onnx$"):
         onnx.contents(learnt("linear"))
+
+
+OWN = """import numpy as np
+
+from farm import Policy
+
+
+class {name}(Policy):
+    @property
+    def size(self):
+        return self.spec.action * self.spec.observation
+
+    @property
+    def memory(self):
+        return np.zeros(self.spec.action)
+
+    def act(self, prepared, x, memory):
+        pull = (prepared.reshape(len(x), self.spec.action, -1) * np.maximum(x, 0.0)[:, None]).sum(axis=-1)
+        return pull - 0.5 * memory, pull
+
+    def onnx(self, graph, theta, x, memory):
+        {body}
+"""
+GOOD = """pull = graph.put("MatMul", graph.put("{operator}", x), theta.reshape(self.spec.action, -1).T.copy())
+        return graph.put("Sub", pull, graph.put("Mul", memory, 0.5)), pull
+"""
+
+
+def own(folder: Path, body: str) -> LoadedPolicy:
+    (folder / "own.py").write_text(OWN.format(name="Own", body=body))
+    found, _ = start(configure(HOPPER, policy=f"{folder}/own.py:Own"), "r")
+    return LoadedPolicy(found, 0, np.random.default_rng(1).normal(size=found.policy.size))
+
+
+def test_a_policy_of_ones_own_has_a_method(tmp_path: Path) -> None:
+    runtime, loaded = pytest.importorskip("onnxruntime"), own(tmp_path, GOOD.format(operator="Relu"))
+    session = runtime.InferenceSession(onnx.contents(loaded), providers=["CPUExecutionProvider"])
+    x, memory = np.random.default_rng(3).normal(size=(2, 5, 11)), np.zeros((5, 3))
+    acting = loaded.acting(5)
+    for each in x:
+        action, memory = session.run(["action", "next_memory"], {"observation": each, "memory": memory})
+        np.testing.assert_allclose(action, acting.act(each), rtol=1e-11, atol=1e-12)
+    assert session.get_modelmeta().custom_metadata_map["policy"] == "own.py:Own"
+
+
+@pytest.mark.parametrize(
+    ("body", "line"),
+    [
+        (
+            GOOD.format(operator="Tanh"),
+            r"onnx of .*own.py:Own gives action 0 as -?[\d.]+ in state 0 of 1000; act gives ",
+        ),
+        (GOOD.format(operator="Twist"), r"onnx of .*own.py:Own makes no model: No Op registered for Twist"),
+        ('return "pull"', r"onnx of .*own.py:Own gave 'pull'; expected the name of action and that of next_memory"),
+        ('return "pull", "pull"', r"onnx of .*own.py:Own makes no model: .*pull"),
+        ("return x, memory", r"own.py:Own gives actions of shape \(1000, 11\); expected \(1000, 3\), as act"),
+        ("raise NotImplementedError", r"own.py:Own has no form in ONNX: give it a method onnx\(self, graph, theta, x"),
+    ],
+)
+def test_a_wrong_form_is_refused(body: str, line: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    loaded = own(tmp_path, body)
+    (tmp_path / "p.onnx").write_bytes(b"an earlier one")
+    with pytest.raises(ConfigError, match=line):
+        onnx.write(tmp_path / "p.onnx", loaded)
+    assert (tmp_path / "p.onnx").read_bytes() == b"an earlier one"

@@ -10,10 +10,11 @@ import pytest
 from rerun.chunk import RrdReader
 
 from farm.arrays import AnyArray
+from farm.sim.channels import flat
 from farm.sim.model_files import compiled
 from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
-from farm.tasks.base import Channel, TaskSpec, flat
+from farm.tasks.base import Channel, TaskSpec
 from learner.recording.drawing import Drawing
 from learner.recording.recorder import Recorder
 

@@ -1,0 +1,116 @@
+"""What an exported policy says of its robot: its numbers' names, units and ranges, the joints' order, its code."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm.errors import ConfigError
+from farm.sim import quantities
+from farm.sim.channels import Quantity
+from farm.tasks.base import Task
+from learner.again.replay import LoadedPolicy
+
+_NAMES: Final = ("task", "policy", "generation", "control_period")
+
+
+def interface(policy: LoadedPolicy) -> dict[str, Any]:
+    """What is known of a policy's numbers, as data for JSON; None where a range is unknown."""
+    problem, constants = policy.problem, policy.problem.policy.constants
+    task, model, spec = problem.task, problem.task.model, problem.spec
+    mean = constants.get("observation_mean")
+    moved = [quantities.moved(model, i) for i in range(model.nu)]
+    return {
+        "observations": _rows(task.observations or _observations(task, spec.observation)),
+        "actions": _rows(task.actions or _actions(task, spec.action)),
+        "controls": [row | {"moves": name} for row, name in zip(_rows(quantities.controls(model)), moved, strict=True)],
+        "joints": quantities.joints(model),
+        "normaliser": None
+        if mean is None
+        else {"mean": mean.tolist(), "deviation": constants["observation_deviation"].tolist()},
+        "code": problem.code,
+    }
+
+
+def _observations(task: Task, count: int) -> tuple[Quantity, ...]:
+    """Those of a task that does not name its own."""
+    if type(task).observe is Task.observe:
+        return quantities.states(task.model)
+    return tuple(Quantity(f"observation {i}") for i in range(count))
+
+
+def _actions(task: Task, count: int) -> tuple[Quantity, ...]:
+    bounds = (-1.0, 1.0) if type(task).act is Task.act else ()
+    controls = quantities.controls(task.model)
+    names = [each.name for each in controls] if len(controls) == count else [f"action {i}" for i in range(count)]
+    return tuple(Quantity(name, "", *bounds) for name in names)
+
+
+def _rows(given: Sequence[Quantity]) -> list[dict[str, Any]]:
+    """Quantities as data."""
+    bounds = [[value if math.isfinite(value) else None for value in (each.low, each.high)] for each in given]
+    return [
+        {"name": each.name, "unit": each.unit, "low": low, "high": high}
+        for each, (low, high) in zip(given, bounds, strict=True)
+    ]
+
+
+def lines(path: Path, of: Mapping[str, Any]) -> Iterator[str]:
+    """What an exported policy says of itself, for people.
+
+    Args:
+      path: where it is.
+      of: texts and numbers by name, with the interface as JSON.
+
+    Raises:
+      ConfigError: it says nothing of its interface.
+    """
+    if not all(name in of for name in (*_NAMES, "interface")):
+        raise ConfigError(f"{path} does not name its numbers: it is no file of this release's farm export")
+    known = json.loads(str(of["interface"]))
+    period = f"{float(of['control_period']):g} s"
+    yield f"{of['policy']} for {of['task']} after generation {of['generation']}; a control step takes {period}"
+    for what in ("observations", "actions", "controls", "joints"):
+        rows = [_row(i, each) for i, each in enumerate(known[what])]
+        widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
+        yield f"{what}: {len(rows)}"
+        for row in rows:
+            yield "  ".join(["", *(f"{text:<{width}}" for text, width in zip(row, widths, strict=True))]).rstrip()
+    yield "normaliser: " + ("none" if known["normaliser"] is None else "mean and deviation of each observation")
+    yield "code: " + ", ".join(f"{name} {digest[:16]}" for name, digest in known["code"].items())
+
+
+def _row(i: int, of: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    low, high = (end if of[name] is None else f"{of[name]:g}" for name, end in (("low", "-inf"), ("high", "inf")))
+    more = {"moves": "moves ", "kind": ""}
+    last = next((f"{word}{of[name]}" for name, word in more.items() if of.get(name)), "")
+    bounds = "any" if (low, high) == ("-inf", "inf") else f"{low} to {high}"
+    return f"{i} {of['name']}", of["unit"] and f"[{of['unit']}]", bounds, last
+
+
+def of_run(policy: LoadedPolicy) -> dict[str, Any]:
+    """Texts and numbers of a run's policy."""
+    config = policy.problem.config
+    return {
+        "task": config.task.rpartition("/")[2], "policy": config.policy.rpartition("/")[2],
+        "generation": policy.generation, "control_period": policy.problem.spec.period,
+        "interface": json.dumps(interface(policy)),
+    }  # fmt: skip
+
+
+def of_npz(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Texts and numbers in an .npz, and lines about its arrays.
+
+    Raises:
+      ConfigError: it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            each = {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise ConfigError(f"{path} is no .npz of farm export: {error}") from None
+    arrays = ", ".join(f"{name} {array.shape}" for name, array in each.items() if array.ndim)
+    return {name: array.item() for name, array in each.items() if not array.ndim}, [f"arrays: {arrays}"]
