@@ -25,6 +25,7 @@ from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
 from farm.tasks.outcomes import shares
 from farm.tasks.probe import specification
+from farm.tasks.standard import standard
 
 SIMULATION = "farm.tasks.loop"
 """The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
@@ -209,6 +210,24 @@ def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Files |
     """A task from its class, the settings in a table, and the run's files."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
     return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
+
+
+def draw_constants(
+    plugin: plugins.Plugin,
+    config: Any,  # noqa: ANN401  the policy's own settings
+    task: Task,
+    spec: TaskSpec,
+    rng: np.random.Generator,
+) -> dict[str, FloatArray]:
+    """New constants of a policy, from its class and its settings; a ConfigError if they are invalid."""
+    constants: object = plugin.target.draw(config, spec, rng)
+    if not isinstance(constants, dict) or not all(_is_constant(values) for values in constants.values()):
+        raise ConfigError(f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name")
+    return constants | standard(task, config.weight_scale) if plugin.target.standardised else constants
+
+
+def _is_constant(values: object) -> bool:
+    return isinstance(values, np.ndarray) and values.dtype == np.float64 and bool(np.isfinite(values).all())
 
 
 def build_policy(plugin: plugins.Plugin, config: Any, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> Policy:  # noqa: ANN401

@@ -40,6 +40,7 @@ DOORS = {
     "rich": ("farm/commands/", "learner/commands/"),
     "cryptography": ("farm/commands/certificates.py",),
     "onnx": ("learner/export/onnx.py",),
+    "pytest": ("farm/pytest_plugin.py",),
     "cmaes": ("learner/algorithms/cma.py",),
     "PIL": ("farm/sim/video.py", "learner/commands/check.py"),
     "tensorboardX": ("learner/loggers/tensorboard.py",),
