@@ -23,7 +23,7 @@ from farm.sim.sim import Sim
 from farm.sim.trajectory import Trajectory
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
-from farm.tasks.outcomes import shares
+from farm.tasks.outcomes import shares, stepped, whole
 from farm.tasks.probe import specification
 from farm.tasks.standard import standard
 
@@ -96,18 +96,21 @@ class Runner:
                 continue
             some = (theta, seeds) if chosen.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
             moments = bool(wanted) and not every
-            rollouts = loop.run(self.task, policy, sim, *some, every, moments=moments)
+            rollouts = loop.run(
+                self.task, policy, sim, *some, every, moments=moments, observed=traces == "steps" and not every
+            )  # fmt: skip
             for job in np.flatnonzero(jobs.seen & chosen).tolist():
                 first = int(jobs.rollouts[:job].sum())
                 seen[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
             done.append((rows, rollouts))
         returns = _placed(done, lambda part: part.returns)
-        chosen = traced(traces if self.spec.traced else "none", returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        wanted_traces = traces if self.spec.traced or traces == "steps" else "none"
+        chosen = traced(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
             returns=returns,
             flags=_placed(done, lambda part: part.flags),
             steps=_placed(done, lambda part: part.steps),
-            traces=self._traces(done, chosen),
+            traces=self._traces(done, chosen, steps=traces == "steps"),
             trajectories=tuple(seen[job] for job in sorted(seen)),
             measures=_placed(done, lambda part: part.measures) if self.spec.measures else np.empty((0, 0)),
             terms=_placed(done, lambda part: shares(self.task, part.terms, part.clamped))
@@ -119,13 +122,14 @@ class Runner:
     def _shares(self, rollouts: loop.Rollouts) -> FloatArray:
         return shares(self.task, rollouts.terms, rollouts.clamped)
 
-    def _traces(self, done: "list[_Part]", chosen: IntArray) -> AnyArray:
-        """Traces of the chosen rollouts, (K, T, N)."""
-        values = np.zeros((len(chosen), *self.spec.trace), dtype="<f4")
+    def _traces(self, done: "list[_Part]", chosen: IntArray, *, steps: bool) -> AnyArray:
+        """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
+        values = np.zeros((len(chosen), *(whole(self.spec) if steps else self.spec.trace)), dtype="<f4")
+        traces = stepped if steps else loop.traces
         for rows, rollouts in done if len(chosen) else ():
             mine = np.isin(chosen, rows)
             if mine.any():
-                values[mine] = loop.traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
+                values[mine] = traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
         return values
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy]:

@@ -45,7 +45,7 @@ DOORS = {
     "PIL": ("farm/sim/video.py", "learner/commands/check.py"),
     "tensorboardX": ("learner/loggers/tensorboard.py",),
     "wandb": ("learner/loggers/wandb.py",),
-    "pyarrow": ("learner/sweep/outcomes.py",),
+    "pyarrow": ("learner/parquet.py",),
     "mujoco_warp": ("workers/backends/warp.py",),
     "warp": ("workers/backends/warp.py",),
     "imageio_ffmpeg": ("farm/sim/video.py",),

@@ -138,8 +138,8 @@ def test_a_plain_pytest_elsewhere_has_the_fixture(tmp_path: Path, pole: str) -> 
 
 @pytest.mark.slow
 def test_the_example_of_the_page(tmp_path: Path) -> None:
-    [text] = re.findall(r"`test_pendulum\.py`:\n\n```python\n(.*?)```", PAGE, re.S)
-    (tmp_path / "test_pendulum.py").write_text(text)
+    [text] = re.findall(r"`pendulum_test\.py`:\n\n```python\n(.*?)```", PAGE, re.S)
+    (tmp_path / "pendulum_test.py").write_text(text)
     subprocess.run([sys.executable, "-P", "-m", "farm", "new-task", "pendulum"], cwd=tmp_path, check=True)
     assert plain_pytest(tmp_path, "--golden-update")[0] == 0
     assert plain_pytest(tmp_path)[0] == 0
