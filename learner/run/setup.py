@@ -22,6 +22,7 @@ from farm.tasks.probe import specification
 from farm.tasks.standard import nominal
 from learner import algorithms
 from learner.algorithms import SearchState
+from learner.run import chain
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
@@ -194,7 +195,7 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
         solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True, code=begun.code,
         files=texts, assets=assets, constants=dict(begun.policy.constants),
-        moments=other.moments if other else moments,
+        moments=other.moments if other else moments, chain=chain.first(config),
     )  # fmt: skip
     return begun, checkpoint
 
