@@ -35,6 +35,7 @@ COMMANDS: Final = {
     "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
     "evaluate": "tries the learnt mean policy on perturbed starts",
     "verify": "repeats a run, and compares its numbers to the last bit",
+    "dataset": "writes episodes of the learnt policy as a data set, in LeRobot's format",
     "replay": "simulates any policy or rollout of a run again, into a recording or a video",
     "chain": "runs learnt policies one after another, and counts the cycles",
     "compare": "puts several runs into one recording: curves together, scenes side by side",
@@ -265,8 +266,7 @@ def _where(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
     lines = [each.lineno for each in traceback.extract_tb(error.__traceback__) if each.filename == str(path)]
-    place = f"line {lines[-1]}: " if lines else ""
-    return f"{place}{type(error).__name__}: {error}"
+    return (f"line {lines[-1]}: " if lines else "") + f"{type(error).__name__}: {error}"
 
 
 def author_frames(error: BaseException) -> traceback.StackSummary:

@@ -23,8 +23,9 @@ from farm.sim.sim import Sim
 from farm.sim.trajectory import Trajectory
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
-from farm.tasks.outcomes import shares
+from farm.tasks.outcomes import shares, stepped, whole
 from farm.tasks.probe import specification
+from farm.tasks.standard import standard
 
 SIMULATION = "farm.tasks.loop"
 """The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
@@ -95,18 +96,21 @@ class Runner:
                 continue
             some = (theta, seeds) if chosen.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
             moments = bool(wanted) and not every
-            rollouts = loop.run(self.task, policy, sim, *some, every, moments=moments)
+            rollouts = loop.run(
+                self.task, policy, sim, *some, every, moments=moments, observed=traces == "steps" and not every
+            )  # fmt: skip
             for job in np.flatnonzero(jobs.seen & chosen).tolist():
                 first = int(jobs.rollouts[:job].sum())
                 seen[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
             done.append((rows, rollouts))
         returns = _placed(done, lambda part: part.returns)
-        chosen = traced(traces if self.spec.traced else "none", returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        wanted_traces = traces if self.spec.traced or traces == "steps" else "none"
+        chosen = traced(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
             returns=returns,
             flags=_placed(done, lambda part: part.flags),
             steps=_placed(done, lambda part: part.steps),
-            traces=self._traces(done, chosen),
+            traces=self._traces(done, chosen, steps=traces == "steps"),
             trajectories=tuple(seen[job] for job in sorted(seen)),
             measures=_placed(done, lambda part: part.measures) if self.spec.measures else np.empty((0, 0)),
             terms=_placed(done, lambda part: shares(self.task, part.terms, part.clamped))
@@ -118,13 +122,14 @@ class Runner:
     def _shares(self, rollouts: loop.Rollouts) -> FloatArray:
         return shares(self.task, rollouts.terms, rollouts.clamped)
 
-    def _traces(self, done: "list[_Part]", chosen: IntArray) -> AnyArray:
-        """Traces of the chosen rollouts, (K, T, N)."""
-        values = np.zeros((len(chosen), *self.spec.trace), dtype="<f4")
+    def _traces(self, done: "list[_Part]", chosen: IntArray, *, steps: bool) -> AnyArray:
+        """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
+        values = np.zeros((len(chosen), *(whole(self.spec) if steps else self.spec.trace)), dtype="<f4")
+        traces = stepped if steps else loop.traces
         for rows, rollouts in done if len(chosen) else ():
             mine = np.isin(chosen, rows)
             if mine.any():
-                values[mine] = loop.traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
+                values[mine] = traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
         return values
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy]:
@@ -209,6 +214,24 @@ def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Files |
     """A task from its class, the settings in a table, and the run's files."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
     return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
+
+
+def draw_constants(
+    plugin: plugins.Plugin,
+    config: Any,  # noqa: ANN401  the policy's own settings
+    task: Task,
+    spec: TaskSpec,
+    rng: np.random.Generator,
+) -> dict[str, FloatArray]:
+    """New constants of a policy, from its class and its settings; a ConfigError if they are invalid."""
+    constants: object = plugin.target.draw(config, spec, rng)
+    if not isinstance(constants, dict) or not all(_is_constant(values) for values in constants.values()):
+        raise ConfigError(f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name")
+    return constants | standard(task, config.weight_scale) if plugin.target.standardised else constants
+
+
+def _is_constant(values: object) -> bool:
+    return isinstance(values, np.ndarray) and values.dtype == np.float64 and bool(np.isfinite(values).all())
 
 
 def build_policy(plugin: plugins.Plugin, config: Any, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> Policy:  # noqa: ANN401

@@ -58,6 +58,7 @@ def anchors(text: str) -> set[str]:
 SCRIPTS = "\n".join(path.read_text("utf-8") for name in ("benchmarks", "docs") for path in (ROOT / name).rglob("*.py"))
 FLAGS = {name.replace("_", "-") for name in re.findall(r"^    (\w+): .*$", SOURCE, re.M)}
 FLAGS |= set(re.findall(r'"--([a-z-]+)"', SCRIPTS)) | {"help", "version", "measurements"}
+FLAGS |= set(re.findall(r"arg\(name=\"([a-z-]+)\"", SOURCE))
 FLAGS |= {"dropped", "ended", "fell", "torque", "goals", "elite"}
 """Of commands, of scripts and tests, and those that tasks and algorithms of the pages bring."""
 

@@ -260,6 +260,22 @@ class _Authority:
         (folder / "identity.json").write_text(json.dumps({"role": role, "name": name, "hosts": hosts}) + "\n", "utf-8")
 
 
+def signed(folder: Path, content: bytes) -> bytes:
+    """Sign a content with the key in a machine's folder: ECDSA over SHA-256, in DER, as openssl dgst has it.
+
+    Raises:
+      ConfigError: cryptography is missing, or the key is damaged.
+    """
+    if not _THERE:
+        raise ConfigError("a signature needs cryptography: pip install cryptography")
+    try:
+        key: Any = serialization.load_pem_private_key((folder / "key.pem").read_bytes(), None)
+        signature: bytes = key.sign(content, ec.ECDSA(hashes.SHA256()))
+        return signature
+    except (OSError, ValueError, AttributeError, TypeError):
+        raise ConfigError(f"{folder / 'key.pem'} is no key that farm certificates made") from None
+
+
 def _certificate(
     name: str,
     key: "ec.EllipticCurvePrivateKey",

@@ -14,8 +14,9 @@ from farm.sim.trajectory import Trajectory
 RATES: Final = ("none", "control", "physics")
 """What a job returns besides its numbers: nothing, or a trajectory at that rate."""
 
-TRACES: Final = ("none", "extremes", "all")
-"""Traces in results: none, those of the best and the worst exploring rollout of each message, or all.
+TRACES: Final = ("none", "extremes", "all", "steps")
+"""Traces in results: none, those of the best and the worst exploring rollout of each message, or all. With `steps` they
+are of all, and hold each control step's observation, action and reward terms, and all channels.
 
 The best rollout of a round (the first of equal ones) is also the best of its message: with `extremes` its trace is
 always included, however jobs are grouped.
@@ -284,7 +285,7 @@ def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
       exploring: which rollouts explore, that is belong to jobs without a trajectory, (S,).
     """
     among = np.flatnonzero(exploring)
-    if traces == "all":
+    if traces in ("all", "steps"):
         return among
     if traces == "none" or not among.size:
         return among[:0]

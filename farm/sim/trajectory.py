@@ -51,8 +51,8 @@ class Trajectory:
     def of(cls, *, channels: Mapping[str, FloatArray], times: FloatArray, value: float, success: bool | None,
            **arrays: FloatArray) -> "Trajectory":  # fmt: skip
         """Make one of numbers in double precision; those that are not finite become large."""
-        shown = {name: _shrunk(values) for name, values in channels.items()}
-        made = {name: _shrunk(values) for name, values in arrays.items()}
+        shown = {name: single(values) for name, values in channels.items()}
+        made = {name: single(values) for name, values in arrays.items()}
         return cls(value=value, success=success, channels=shown, times=times, **made)
 
     def arrays(self) -> dict[str, AnyArray]:
@@ -79,5 +79,6 @@ def joined(rollouts: Sequence[Trajectory]) -> Trajectory:
     return out
 
 
-def _shrunk(values: FloatArray) -> AnyArray:
+def single(values: AnyArray) -> AnyArray:
+    """Numbers in single precision; those that are not finite become large."""
     return np.clip(np.nan_to_num(values, nan=-1e30), -1e30, 1e30).astype("<f4")

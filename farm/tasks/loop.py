@@ -20,10 +20,10 @@ from farm.sim.channels import flat
 from farm.sim.interfaces import Rebound
 from farm.sim.scene import Scene
 from farm.sim.sim import Sim, unwritable
-from farm.sim.trajectory import Trajectory
+from farm.sim.trajectory import Trajectory, single
 from farm.tasks.acting import Acting, Acts, shaped
 from farm.tasks.base import Record, Task, TaskSpec
-from farm.tasks.outcomes import measured
+from farm.tasks.outcomes import drawn, measured
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -65,6 +65,8 @@ class Rollouts:
     """Of the task's measures, in their order (B, M)"""
     moments: FloatArray
     """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) if not requested."""
+    observations: AnyArray
+    """Before each control step, zero after the end, (B, T, d) in single precision; (B, 0) if not requested."""
 
     @property
     def flags(self) -> BoolArray:
@@ -254,6 +256,7 @@ class Batch:
             ended=self._ended, failed=self._failed, clamped=clamped, steps=self._steps, terms=terms,
             actions=record.actions, start=self.start, frames=self.frames, which=self.which,
             measures=measured(self.task, record), moments=np.empty((len(returns), 0)),
+            observations=np.empty((len(returns), 0), "<f4"),
         )  # fmt: skip
 
 
@@ -266,13 +269,16 @@ def run(
     every: int = 0,
     *,
     moments: bool = False,
+    observed: bool = False,
 ) -> Rollouts:
     """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes; perhaps with the
-    moments of their observations."""  # noqa: D205, D209
+    moments of their observations, or with these themselves."""  # noqa: D205, D209
     size, parts = sim.engine.size, []
     for first in range(0, len(theta), size):
         rows = slice(first, first + size)
-        parts.append(again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every, moments)))
+        parts.append(
+            again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every, moments, observed))
+        )
     return Rollouts.joined(parts)
 
 
@@ -284,32 +290,24 @@ def _run(
     seeds: Sequence[Seed],
     every: int,
     moments: bool,
+    observed: bool,
 ) -> Rollouts:
     batch, seen = Batch(task, sim, seeds, every), None
+    kept: AnyArray = np.empty((len(seeds), 0), "<f4")
     acting = Acting(policy, theta)
     while not batch.over:
         x = batch.observe()
         if moments:
             seen = seen or Moments(len(seeds), x.shape[1])
             seen.add(batch.active, x)
+        if observed:
+            kept = kept if kept.ndim > 2 else np.zeros((len(seeds), task.steps, x.shape[1]), "<f4")
+            kept[batch.active, sim.t] = single(x)
         action = acting.act(x, batch.active)
         columns = np.shape(action)[1:2] or (sim.model.nu,)
         batch.step(shaped("act of the policy", action, (len(batch.active), *columns)))
-    return batch.rollouts() if seen is None else replace(batch.rollouts(), moments=seen.table)
-
-
-def drawn(task: Task, rngs: Sequence[np.random.Generator | None]) -> IntArray:
-    """Which of its models a task draws for each rollout, (B,).
-
-    Raises:
-      TaskError: it draws one that there is not.
-    """
-    count = len(task.simulated)
-    found = [0 if rng is None else task.which(rng) for rng in rngs]
-    for each in found:
-        if isinstance(each, bool) or not isinstance(each, int | np.integer) or not 0 <= each < count:
-            raise TaskError(f"which gave {each!r}; expected the index of a model, 0 to {count - 1}")
-    return np.array(found, dtype=int)
+    table = np.empty((len(seeds), 0)) if seen is None else seen.table
+    return replace(batch.rollouts(), moments=table, observations=kept)
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`

@@ -1,11 +1,33 @@
-"""Results of whole rollouts beside their returns: the task's measures, and what each reward term contributes."""
+"""What is known of whole rollouts beside their returns: models, measures, shares of reward terms, control steps."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from farm.arrays import BoolArray, FloatArray
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
+from farm.sim.scene import MODEL
+from farm.sim.trajectory import single
 from farm.tasks.acting import shaped
-from farm.tasks.base import Record, Task
+from farm.tasks.base import Record, Task, TaskSpec, flat
+
+if TYPE_CHECKING:
+    from farm.tasks.loop import Rollouts
+
+
+def drawn(task: Task, rngs: Sequence[np.random.Generator | None]) -> IntArray:
+    """Which of its models a task draws for each rollout, (B,).
+
+    Raises:
+      TaskError: it draws one that there is not.
+    """
+    count = len(task.simulated)
+    found = [0 if rng is None else task.which(rng) for rng in rngs]
+    for each in found:
+        if isinstance(each, bool) or not isinstance(each, int | np.integer) or not 0 <= each < count:
+            raise TaskError(f"which gave {each!r}; expected the index of a model, 0 to {count - 1}")
+    return np.array(found, dtype=int)
 
 
 def measured(task: Task, record: Record) -> FloatArray:
@@ -45,3 +67,30 @@ def shares(task: Task, terms: FloatArray, clamped: BoolArray) -> FloatArray:
             total += task.config.gamma**t * terms[:, t]
         total *= task.return_scale
     return np.where(clamped[:, None], 0.0, total)
+
+
+def step_shapes(spec: TaskSpec) -> dict[str, tuple[int, ...]]:
+    """Shape of each part of a control step, in the order of a trace of kind `steps`."""
+    own = {"observation": (spec.observation,), "action": (spec.action,), "terms": (len(spec.terms),)}
+    return own | {f"channels/{channel.name}": channel.shape for channel in spec.channels}
+
+
+def whole(spec: TaskSpec) -> tuple[int, int]:
+    """Shape of a rollout's trace of kind `steps`, (T, N)."""
+    return spec.steps, sum(int(np.prod(shape)) for shape in step_shapes(spec).values())
+
+
+def stepped(task: Task, spec: TaskSpec, rollouts: "Rollouts", rows: IntArray) -> AnyArray:
+    """The control steps of some rollouts with observations, parts as in `step_shapes`: (R, T, N), zero after the end.
+
+    Observation and action are those before a step's physics, terms and channels those after it.
+    """
+    shown = task.show({name: frames[rows] for name, frames in rollouts.frames.items()})
+    if len(task.simulated) > 1:
+        which = np.eye(len(task.simulated))[rollouts.which[rows]]
+        shown = shown | {MODEL: np.repeat(which[:, None], task.steps, axis=1)}
+    channels = [flat(spec.channels, shown)] if spec.channels else []
+    parts = [rollouts.observations[rows], rollouts.actions[rows], rollouts.terms[rows], *channels]
+    values = np.concatenate([single(part) for part in parts], axis=2)
+    values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
+    return values

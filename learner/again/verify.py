@@ -1,31 +1,44 @@
 """Verifies a run: repeats its generations, and compares every number with those in its folder, to the last bit."""
 
 import hashlib
+import itertools
+import logging
 import math
+import secrets
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from farm import fingerprint
+from farm.arrays import FloatArray
 from farm.errors import RunError
 from farm.net.stats import GenerationStats
-from farm.net.work import Jobs
+from farm.net.work import Jobs, Simulated
 from learner.again.replay import restored
 from learner.again.rewind import before, pairs_of
+from learner.run import chain
 from learner.run import checkpoint as checkpoints
+from learner.run import config as configs
+from learner.run.chain import Link
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.evaluation import outcome
+from learner.run.files import NONE
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, open_run
+from learner.run.launch import Placement, connected, dispatch, open_run
 from learner.run.learner import explored
 from learner.run.setup import Problem
+from learner.scheduler.membership import Admission
+from learner.scheduler.round import RoundResults
 
-_OF_MACHINES: Final = ("reissued", "workers", "seconds")  # in a line of progress.jsonl, and in no repetition
+log = logging.getLogger(__name__)
+
 _RESULTS: Final = (
     "rollouts", "steps", "best_return", "mean_policy_return", "mean_policy_success", "robust_return",
     "robust_success_rate", "mean_policy_measures", "robust_measures",
@@ -48,12 +61,19 @@ class Stored:
     """Of progress.jsonl, by generation."""
     rows: Mapping[int, Any]
     """Of parameters: mu and sigma after those generations that are kept."""
+    links: Mapping[int, Link]
+    """Of chain, by generation."""
     summary: Mapping[str, Any] | None
 
     @property
     def last(self) -> int:
         """Finished generations."""
         return len(self.lines)
+
+    @property
+    def chain(self) -> str:
+        """The last digest of its chain, which names all its numbers."""
+        return self.at.chain
 
     @property
     def sha256(self) -> str:
@@ -63,7 +83,7 @@ class Stored:
 
 
 def stored(folder: RunFolder) -> Stored:
-    """Read a run, and compare its files with each other.
+    """Read a run, and compare its files with each other, also with its chain of digests.
 
     Raises:
       ConfigError: the folder has no run that can be simulated here.
@@ -71,12 +91,17 @@ def stored(folder: RunFolder) -> Stored:
     """
     at = checkpoints.load(folder.checkpoint)
     last, config = int(at.state["generation"]), folder.read_config()
+    for name, old, new in configs.other(configs.from_dict(at.config, str(folder.checkpoint)), config):
+        raise Differs(f"{folder.path}: generation 1 differs: --{name} is {new} in config.json, and {old} in checkpoint")
     problem = restored(folder, at)
+    if at.code.get("simulation") != problem.code["simulation"]:
+        log.warning("%s: the simulation's code (farm/) is of another release than when the run began", folder.path)
     lines = {line.generation: line for line in folder.progress() if line.generation <= last}
     kept = folder.parameters.rows() if folder.parameters.path.exists() else np.empty(0, [("generation", "<i8")])
     rows = {int(row["generation"]): row for row in kept if row["generation"] <= last}
     seen = problem.spec.observation if config.policy_config.normalise else 0
     every = folder.parameters.every(len(at.state["mu"]), config.generations, seen)
+    links, before = folder.chain.read(), chain.first(config)
     for generation in range(1, last + 1):
         if generation not in lines:
             raise Differs(f"{folder.path}: generation {generation} differs: progress.jsonl has no line of it")
@@ -84,9 +109,12 @@ def stored(folder: RunFolder) -> Stored:
             raise Differs(f"{folder.path}: generation {generation} differs: parameters has no row of it")
         if generation in rows:
             _agree(folder, generation, lines[generation], _of_parameters(rows[generation]), "parameters")
+        before = _linked(folder, generation, before, lines[generation], rows.get(generation), links)
     if last in rows:
         _agree_bits(folder, last, rows[last], at.state, "checkpoint")
-    run = Stored(folder, config, at, problem, lines, rows, folder.read_summary())
+    if last and (before, links[last].state) != (at.chain, chain.state_of(at)):
+        raise Differs(f"{folder.path}: generation {last} differs: checkpoint is not the one that chain says")
+    run = Stored(folder, config, at, problem, lines, rows, links, folder.read_summary())
     if run.summary and (said := run.summary.get("parameters_sha256")) != run.sha256:
         raise Differs(f"{folder.path}: summary.json says that the parameters are {said}, they are {run.sha256}")
     return run
@@ -98,46 +126,79 @@ def chosen(run: Stored, share: float, rng: np.random.Generator) -> list[int]:
     return sorted(int(each) + 1 for each in rng.choice(run.last, count, replace=False))
 
 
-def verify_some(run: Stored, generations: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Repeat the rollouts of some generations in this process; yield each generation and its number of rollouts.
+Simulate: TypeAlias = Callable[[FloatArray, Jobs, FloatArray], Simulated | RoundResults]
+"""Results of jobs around a mean (P,), with a RoundHeader's normaliser."""
+
+
+@contextmanager
+def workers(run: Stored, place: Placement | None, stopped: Callable[[], bool]) -> Iterator[Simulate]:
+    """What simulates: this process, or workers at that place."""
+    with ExitStack() as stack:
+        if place is None:
+            runner = stack.enter_context(closing(run.problem.runner()))
+            yield lambda mu, jobs, seen: runner.run(mu, jobs, "none", seen)
+            return
+        link, name = stack.enter_context(connected(place, stopped)), f"verify-{secrets.token_hex(4)}"
+        admission, count = Admission(fingerprint.digest()), itertools.count()
+        dispatcher, _ = dispatch(stack, link, place, run.problem, name, admission, run.last, stopped)
+
+        def simulate(mu: FloatArray, jobs: Jobs, seen: FloatArray) -> RoundResults:
+            dispatcher.begin(next(count), mu, jobs, normaliser=seen)
+            return dispatcher.collect()
+
+        yield simulate
+
+
+def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> Iterator[tuple[int, int]]:
+    """Repeat the rollouts of some generations; yield each generation and its number of rollouts.
 
     Each begins with the stored mean and sigma before it: their update itself is not repeated.
 
     Raises:
       Differs: a generation has other numbers.
+      Stopped: it was asked to stop.
     """
     for generation in generations:
         state, seen = before(run.folder, run.at, run.problem, generation)
         jobs = explored(run.config, state, pairs_of(run.folder, generation))[1]
         jobs = Jobs.joined([jobs, Jobs.mean("none", [None])])
-        with closing(run.problem.runner()) as runner:
-            found = runner.run(state.mu, jobs, "none", np.stack([seen, seen]))
+        found = simulate(state.mu, jobs, np.stack([seen, seen]))
         rollouts = len(found.returns) - 1
         _agree(run.folder, generation, run.lines[generation], outcome(run.problem.spec, found, rollouts), "repeated")
         yield generation, rollouts
 
 
-def verify_all(run: Stored, place: Placement, stopped: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+def verify_all(
+    run: Stored, place: Placement, stopped: Callable[[], bool], kept: Path | None
+) -> Iterator[tuple[int, int]]:
     """Learn the run again on workers; yield each generation and its number of rollouts.
+
+    Args:
+      run: to repeat.
+      place: where the workers are.
+      stopped: whether to end before the last generation.
+      kept: folder in which an interrupted repetition is continued; it is removed at the end.
 
     Raises:
       Differs: a generation has other numbers, or the results have.
     """
     config = replace(run.config, generations=run.last)
     finished = run.summary is not None and run.summary.get("state") == "finished"
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        open_run(config, Path(folder) / run.folder.name, place, stopped=stopped) as again,
-    ):
-        done = 0
+    with ExitStack() as stack:
+        path = (kept or Path(stack.enter_context(tempfile.TemporaryDirectory()))) / run.folder.name
+        again = stack.enter_context(open_run(config, path, place, resume=path.exists(), stopped=stopped))
+        done = again.learner.at.rollouts
         for report in again.learn():
-            given = {name: value for name, value in vars(report.progress).items() if name not in _OF_MACHINES}
+            given = {name: value for name, value in vars(report.progress).items() if name not in chain.OF_MACHINES}
             _agree(run.folder, report.generation, run.lines[report.generation], given, "repeated")
             if report.generation in run.rows:
                 state = again.learner.state
                 _agree_bits(
                     run.folder, report.generation, run.rows[report.generation], vars(state), "the repetition"
                 )  # fmt: skip
+            if again.learner.at.chain != run.links[report.generation].digest:
+                where = f"{run.folder.path}: generation {report.generation} differs"
+                raise Differs(f"{where}: the state after it has another digest in chain")
             yield report.generation, report.progress.rollouts - done
             done = report.progress.rollouts
         if again.summary["state"] == "finished" and finished:
@@ -148,6 +209,28 @@ def verify_all(run: Stored, place: Placement, stopped: Callable[[], bool]) -> It
                         f"{run.folder.path}: {name} is {run.summary[name]!r} in summary.json, and "
                         f"{again.summary.get(name)!r} when it is repeated"
                     )
+        if kept is not None and not stopped():
+            shutil.rmtree(kept)
+
+
+def _linked(
+    folder: RunFolder,
+    generation: int,
+    before: str,
+    line: GenerationStats,
+    row: Any,  # noqa: ANN401  an array's row, or None
+    links: Mapping[int, Link],
+) -> str:
+    """The digest of a generation in chain, if it is that of its line, its row and the generation before it."""
+    where = f"{folder.path}: generation {generation} differs"
+    if generation not in links:
+        raise Differs(f"{where}: chain has no line of it")
+    link = links[generation]
+    if row is not None:  # of others there is only what chain says
+        seen = row["normaliser"] if "normaliser" in row.dtype.names else NONE
+        if chain.following(before, line, row["mu"], row["sigma"], seen, link.state) != link.digest:
+            raise Differs(f"{where}: progress.jsonl or parameters, or what is before it, have another digest in chain")
+    return link.digest
 
 
 def _of_parameters(row: Any) -> dict[str, float]:  # noqa: ANN401  an array's row

@@ -14,6 +14,7 @@ from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
 from farm.settings import Settings
+from learner import parquet
 from learner.commands.options import flag, parse
 from learner.run import config as configs
 from learner.run.config import RunConfig
@@ -64,7 +65,7 @@ def main(words: Sequence[str]) -> int:
             complete = sweep.run(chosen.runs, command.sharing, shown, stop.is_set)
         table = outcomes.rows(chosen)
         outcomes.write_csv(chosen.path / "table.csv", chosen, table)
-        if outcomes.available():
+        if parquet.available():
             outcomes.write_parquet(chosen.path / "table.parquet", chosen, table)
         if stop.is_set():
             say(f"{len(sweep.todo(chosen.runs))} runs are left; the same command continues with them")
@@ -131,8 +132,8 @@ def _print(chosen: Sweep, table: Sequence[dict[str, Any]]) -> None:
         shown.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")
     wide().print(shown)
     say(f"mean ± standard deviation over seeds; untrained: the mean policy before learning; {chosen.path}/table.csv")
-    if not outcomes.available():
-        say(f"no table.parquet: {outcomes.INSTALL}")
+    if not parquet.available():
+        say(f"no table.parquet: {parquet.INSTALL}")
 
 
 def _spread(found: tuple[float, float] | None, *, percent: bool) -> str:

@@ -4,6 +4,7 @@ import json
 import os
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,17 +16,20 @@ from rich.progress import track
 
 from farm import __version__, fingerprint, settings
 from farm.commands import logs
+from farm.commands.certificates import signed
 from farm.commands.logs import say
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
 from farm.link import Link
 from farm.net.session import free_endpoint
+from farm.net.tls import Bundle
 from farm.settings import setting
-from learner.again.verify import Differs, chosen, stored, verify_all, verify_some
+from learner.again.verify import Differs, chosen, stored, verify_all, verify_some, workers
 from learner.run import checkpoint as checkpoints
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
 from learner.run.launch import MOST_WORKERS, Placement
+from learner.scheduler.dispatcher import Stopped
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,48 +46,62 @@ class VerifyCommand(Link):
     all: bool = False
     """Learn the run again from its start: also checks the updates and the results."""
     workers: int | None = setting(None, least=0, most=MOST_WORKERS)
-    """Local worker processes for --all; by default one per core, with --connect none."""
+    """Local worker processes; by default a share is repeated in this process, and --all on one per core."""
     receipt: Path | None = None
-    """Write what was verified to this file, as JSON."""
+    """Write what was verified to this file, as JSON; with --tls also a signature of it, FILE.sig. If the command is
+    interrupted, it continues there when it is repeated."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.all and (self.connect or self.workers is not None):
-            raise ConfigError("--workers and --connect are for --all: some generations are repeated in this process")
         if self.connect and self.workers:
             raise ConfigError("--workers with --connect: a farm has workers of its own")
-        if self.workers == 0 and not self.connect:
-            raise ConfigError("--workers 0 without --connect: there would be no workers")
-        if self.tls is not None and not self.connect:
-            raise ConfigError("--tls is for a farm to --connect to: without one everything stays on this machine")
+        if self.all and self.workers == 0 and not self.connect:
+            raise ConfigError("--all with --workers 0, without --connect: there would be no workers")
+        if self.tls is not None and not self.connect and self.receipt is None:
+            raise ConfigError("--tls is for a farm to --connect to, or to sign a --receipt")
 
     @property
-    def place(self) -> Placement:
-        """Where the whole run is repeated."""
-        count = self.workers if self.workers is not None else 0 if self.connect else os.cpu_count() or 1
+    def place(self) -> Placement | None:
+        """Where the workers are; None for this process."""
+        count = self.workers if self.workers is not None else (os.cpu_count() or 1) if self.all else 0
+        if not count and not self.connect:
+            return None
         return Placement(
-            workers=count, listen=free_endpoint(), connect=self.connect, farm=self.farm, tls=self.bundle, record=False
-        )
+            workers=0 if self.connect else count, listen=free_endpoint(), connect=self.connect, farm=self.farm,
+            tls=self.bundle if self.connect else None, record=False,
+        )  # fmt: skip
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(VerifyCommand, words, "farm verify")
     logs.set_up("WARNING")
-    folder = RunFolder.open(command.run)
+    folder, bundle = RunFolder.open(command.run), command.bundle
+    if bundle is not None and command.receipt is not None:
+        signed(bundle.folder, b"")  # says now what would fail at the end
     receipt: dict[str, Any] = {
-        "run": folder.name, "release": __version__, "numbers": fingerprint.digest(), "generations": [], "rollouts": 0,
-        "difference": None,
+        "run": folder.name, "release": __version__, "numbers": fingerprint.digest(), "all": command.all,
+        "generations": [], "rollouts": 0, "verdict": "interrupted", "difference": None,
     }  # fmt: skip
     try:
         return _verify(command, folder, receipt)
     except Differs as error:
-        receipt["difference"] = str(error)
+        receipt |= {"verdict": "different", "difference": str(error)}
         raise
     finally:
         if command.receipt is not None and "code" in receipt:
-            with writing(f"to {command.receipt}"):
-                replace_text(command.receipt, json.dumps(receipt, indent=2) + "\n")
+            _write(command.receipt, receipt, bundle)
+
+
+def _write(path: Path, receipt: dict[str, Any], bundle: Bundle | None) -> None:
+    """Write a receipt, and its signature if there is a certificate."""
+    if bundle is not None:
+        receipt["certificate"] = (bundle.folder / "cert.pem").read_text("utf-8")
+    content = json.dumps(receipt, indent=2) + "\n"
+    with writing(f"to {path}"):
+        replace_text(path, content)
+        if bundle is not None:
+            path.with_name(path.name + ".sig").write_bytes(signed(bundle.folder, content.encode()))
 
 
 def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) -> int:
@@ -91,24 +109,46 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
     run = stored(folder)
     if not run.last:
         raise ConfigError(f"the run in {folder.path} has done no generation: there is nothing to verify")
-    receipt["parameters_sha256"] = run.sha256
-    some = range(1, run.last + 1)
-    if not command.all:
-        some = chosen(run, command.share, np.random.default_rng(secrets.randbits(64)))
-    done: list[int] = receipt["generations"]
-    with stop_flag("ending") as stop:
-        repeated = verify_all(run, command.place, stop.is_set) if command.all else verify_some(run, some)
-        for generation, rollouts in _shown(repeated, len(some)):
+    receipt |= {"chain": run.chain, "parameters_sha256": run.sha256}
+    whole, rng = range(1, run.last + 1), np.random.default_rng(secrets.randbits(64))
+    receipt["chosen"] = [*whole] if command.all else chosen(run, command.share, rng)
+    if command.receipt is not None and (begun := _interrupted(command.receipt, receipt)):
+        receipt |= begun
+    some, done = receipt["chosen"], receipt["generations"]
+    kept = command.receipt.with_name(command.receipt.name + ".run") if command.receipt is not None else None
+    with stop_flag("ending") as stop, suppress(Stopped), ExitStack() as stack:
+        if command.all:
+            place = command.place
+            assert place is not None
+            repeated = verify_all(run, place, stop.is_set, kept)
+        else:
+            simulate = stack.enter_context(workers(run, command.place, stop.is_set))
+            repeated = verify_some(run, [each for each in some if each not in done], simulate)
+        for generation, rollouts in _shown(repeated, len(some) - len(done)):
             done.append(generation)
             receipt["rollouts"] += rollouts
             if stop.is_set():
                 break
     said = f"{len(done)} of {run.last} generations of {folder.path}, {receipt['rollouts']} rollouts"
     if len(done) < len(some):
-        say(f"stopped; no difference in {said}")
+        more = "" if command.receipt is None else "; the same command continues"
+        say(f"stopped; no difference in {said}{more}")
         return INTERRUPTED
+    receipt["verdict"] = "the same"
     say(f"verified to the bit: {said}" + (", and the results" if command.all else "; --all also repeats the updates"))
     return 0
+
+
+def _interrupted(path: Path, wanted: dict[str, Any]) -> dict[str, Any] | None:
+    """What an interrupted verification of the same run has done, as its receipt says."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        same = all(found[name] == wanted[name] for name in ("chain", "code", "numbers", "all", "release", "verdict"))
+        of_run = {*wanted["chosen"]} if wanted["all"] else {*found["chosen"]}
+        sound = same and {*found["generations"]} <= of_run and type(found["rollouts"]) is int
+        return {name: found[name] for name in ("chosen", "generations", "rollouts")} if sound else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
 
 
 def _shown(repeated: Iterator[tuple[int, int]], count: int) -> Iterable[tuple[int, int]]:

@@ -16,8 +16,9 @@ from farm.net import codec
 log = logging.getLogger(__name__)
 
 _MAGIC: Final = b"rolloutfarm checkpoint 2\n"
-_SCHEMA: Final = 2  # of what follows, whichever version messages have
 _DIGEST: Final = hashlib.sha256().digest_size
+SCHEMA: Final = 2
+"""Version of what follows, whichever one messages have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +74,8 @@ class Checkpoint:
     """Number of spot checks that each host has passed."""
     first: dict[str, int] = field(default_factory=dict)
     """Finished generations when each host answered for the first time."""
+    chain: str = ""
+    """Digest of the last generation in the run's chain, or of its settings."""
     undone: int = 0
     """Generations that were repeated because a host in them was expelled."""
     moments: FloatArray = array("<f8", 1, np.empty(0))
@@ -85,7 +88,7 @@ def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
     A killed process loses nothing. A power failure may truncate the file; `durable` keeps a copy that survives it,
     `FILE.safe`, but waits for the disk, which takes longer than a short generation.
     """
-    body = codec.encode(checkpoint, _SCHEMA)
+    body = codec.encode(checkpoint, SCHEMA)
     content = _MAGIC + hashlib.sha256(body).digest() + body
     if durable:
         replace(_safe(path), content, sync=True)
@@ -151,6 +154,6 @@ def _read(path: Path) -> Checkpoint:
     if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
         raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
     try:
-        return codec.decode(body, Checkpoint, _SCHEMA, most=len(body))
+        return codec.decode(body, Checkpoint, SCHEMA, most=len(body))
     except MessageError as error:
         raise CheckpointError(f"{path}: {error}") from None

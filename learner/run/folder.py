@@ -4,6 +4,7 @@
     checkpoint       everything a resume needs, replaced after every generation
     progress.jsonl   one line per generation
     parameters       mu and sigma of every generation
+    chain            a digest per generation
     summary.json     the results
     run.rrd          the recording;  replay.rrd  the best and the final rollout at physics rate
     log.txt          the messages
@@ -35,6 +36,7 @@ from farm.sim.model_files import Content, Files, by_digest, joined
 from farm.sim.model_files import digest as digest_of
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
+from learner.run.chain import ChainFile, Link
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.files import NONE, ParametersFile, ProgressFile, replace_text
@@ -190,8 +192,11 @@ class RunFolder:
         sigma: FloatArray,
         generations: int,
         normaliser: FloatArray = NONE,
+        link: Link | None = None,
     ) -> None:
-        """Add a generation to progress.jsonl and parameters: mu and sigma (P,), and a normaliser (2, d)."""
+        """Add a generation to progress.jsonl, parameters and chain: mu and sigma (P,), and a normaliser (2, d)."""
+        if link is not None:
+            self.chain.append(progress.generation, link)
         self._progress.append(progress)
         self.parameters.append(progress.generation, mu, sigma, generations, normaliser)
 
@@ -205,13 +210,18 @@ class RunFolder:
         return ParametersFile(self.path / "parameters")
 
     @property
+    def chain(self) -> ChainFile:
+        """Digests of the generations."""
+        return ChainFile(self.path / "chain")
+
+    @property
     def _progress(self) -> ProgressFile:
         return ProgressFile(self.path / "progress.jsonl")
 
     def save(self, checkpoint: Checkpoint, *, durable: bool = True) -> None:
         """Replace the checkpoint; durable: also safe against a power failure."""
         if durable:  # first the files that it relies on
-            for name in ("config.json", "progress.jsonl", "parameters"):
+            for name in ("config.json", "progress.jsonl", "parameters", "chain"):
                 with suppress(FileNotFoundError):
                     checkpoints.flush(self.path / name)
         checkpoints.save(self.checkpoint, checkpoint, durable=durable)
@@ -233,6 +243,7 @@ class RunFolder:
         whole = self.parameters.until(generation, size, self.checkpoint.name)  # raises if unusable
         (self.path / "summary.json").unlink(missing_ok=True)
         self._progress.rewind(generation)
+        self.chain.rewind(generation)
         self.parameters.truncate(whole)
         self.states.forget_after(generation)
 

@@ -19,8 +19,12 @@ class Judge:
         self._problem = problem
         self._runner: Runner | None = None
 
-    def __call__(self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray) -> Simulated | None:
+    def __call__(
+        self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray, *, terms: bool = False
+    ) -> Simulated | None:
         """Results of one job around a mean (P,), as machines with this canary, or one that begins so, compute them.
+
+        With `terms` they have each reward term's part of the returns.
 
         None if this machine rounds differently, or, with a line in the log, if it cannot simulate the task or gets
         other numbers when it does so again.
@@ -29,7 +33,7 @@ class Judge:
             return None
         try:
             self._runner = self._runner or self._problem.runner()
-            first, again = (self._runner.run(mu, job, "none", normaliser) for _ in range(2))
+            first, again = (self._runner.run(mu, job, "none", normaliser, terms=terms) for _ in range(2))
         except Exception as error:  # a task may need what only the workers' machines have
             log.warning("this machine cannot decide which host is right (%s: %s)", type(error).__name__, error)
             return None

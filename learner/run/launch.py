@@ -28,6 +28,7 @@ from farm.net.tls import Bundle
 from farm.processes import LocalWorkers
 from farm.sim.model_files import by_digest
 from farm.sim.trajectory import Trajectory
+from farm.tasks.outcomes import whole
 from learner.algorithms import Diverged
 from learner.loggers.base import Loggers
 from learner.recording.files import set_aside
@@ -266,15 +267,19 @@ def dispatch(
     name: str,
     admission: Admission,
     generations: int,
-    stopped: Callable[[], bool],
-) -> tuple[Dispatcher, LocalWorkers | None]:
-    """Publish a problem on the network under a name, and start its local workers; the stack closes all."""
+    stopped: Callable[[], bool], *, steps: bool = False,
+) -> tuple[Dispatcher, LocalWorkers | None]:  # fmt: skip
+    """Publish a problem on the network under a name, and start its local workers; the stack closes all.
+
+    With `steps` the traces of all rounds are of that kind.
+    """
     tend = _Tending(stopped)
     for digest, source in problem.sources.items() if place.tls else ():
         link.answer(keys.code(place.farm, name, digest), partial(bytes, source))
     for digest, content in by_digest(problem.task.sources).items():
         link.answer(keys.asset(place.farm, name, digest), partial(bytes, content))
-    shapes = problem.spec.trace, problem.spec.shapes(len(problem.scene.bodies))
+    trace = whole(problem.spec) if steps else problem.spec.trace
+    shapes = trace, problem.spec.shapes(len(problem.scene.bodies))
     count = len(problem.spec.measures)
     join = None if place.workers else how_to_join(place, problem)
     spec, judge = problem.specification(name), stack.enter_context(closing(Judge(problem)))

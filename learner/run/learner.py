@@ -23,6 +23,7 @@ from farm.net.work import Jobs
 from farm.tasks.base import Task
 from learner import algorithms
 from learner.algorithms import Algorithm, SearchState
+from learner.run import chain
 from learner.run import config as configs
 from learner.run.checkpoint import BestRollout, Checkpoint
 from learner.run.config import RunConfig
@@ -98,6 +99,11 @@ class Learner:
     def spec(self) -> Spec:
         """The workers' specification, named after the folder, so that copies of a run can continue at the same time."""
         return self.problem.specification(self.folder.name)
+
+    @property
+    def at(self) -> Checkpoint:
+        """What is saved after the last generation."""
+        return self._at
 
     @property
     def canary(self) -> str:
@@ -254,6 +260,7 @@ class Learner:
             "reissued": self._at.reissued,
             "checks": self._at.checks,
             "undone": self._at.undone,
+            "chain": self._at.chain,
             "state": state,
         }
 
@@ -345,7 +352,10 @@ class Learner:
         if self._at.first != last.first:
             self.folder.states.keep(last)
         mu, sigma, seen = self.state.mu, self.state.sigma, normaliser(self._at.moments)
-        self.folder.append(progress, mu, sigma, self.config.generations, seen)
+        state = chain.state_of(self._at)
+        link = chain.Link(chain.following(last.chain, progress, mu, sigma, seen, state), state)
+        self._at = replace(self._at, chain=link.digest)
+        self.folder.append(progress, mu, sigma, self.config.generations, seen, link)
         now = time.monotonic()
         durable = now - self._durable > DURABLE_EVERY
         self._durable = now if durable else self._durable

@@ -14,14 +14,15 @@ from farm.errors import CheckpointError, ConfigError
 from farm.net.messages import Spec
 from farm.policies.base import Policy, check_vector
 from farm.policies.fourier import Kernel, Projected
-from farm.rollouts import Runner, build_policy, build_task
+from farm.rollouts import Runner, build_policy, build_task, draw_constants
 from farm.sim.model_files import Files, split
 from farm.sim.scene import Scene
 from farm.tasks.base import Task, TaskSpec
 from farm.tasks.probe import specification
-from farm.tasks.standard import nominal, standard
+from farm.tasks.standard import nominal
 from learner import algorithms
 from learner.algorithms import SearchState
+from learner.run import chain
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
@@ -110,21 +111,11 @@ def problem(
     if config.stop_when_solved is not None and not spec.success:
         raise ConfigError(f"--stop-when-solved: {config.task} knows returns, but no success")
     plugin = plugins.find("policies", config.policy)
-    kind = plugin.target
     if constants is None:
-        constants = kind.draw(config.policy_config, spec, seeds.features(config.seed))
-        if not isinstance(constants, dict) or not all(_is_constant(values) for values in constants.values()):
-            raise ConfigError(f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name")
-        if kind.standardised:
-            own: Any = config.policy_config
-            constants = constants | standard(task, own.weight_scale)
+        constants = draw_constants(plugin, config.policy_config, task, spec, seeds.features(config.seed))
     found = Problem(config, task, spec, build_policy(plugin, config.policy_config, spec, constants))
     _check_size(found)
     return found
-
-
-def _is_constant(values: object) -> bool:
-    return isinstance(values, np.ndarray) and values.dtype == np.float64 and bool(np.isfinite(values).all())
 
 
 def _check_size(found: Problem) -> None:
@@ -204,7 +195,7 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
         solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True, code=begun.code,
         files=texts, assets=assets, constants=dict(begun.policy.constants),
-        moments=other.moments if other else moments,
+        moments=other.moments if other else moments, chain=chain.first(config),
     )  # fmt: skip
     return begun, checkpoint
 

@@ -1,16 +1,24 @@
 """What the learner's own machine decides: disputes of a round, and checks that no second host could make. Pure."""
 
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Protocol
 
 from farm.arrays import FloatArray
 from farm.net.work import Jobs, RoundHeader, Simulated
 from learner.scheduler.audit import Audit
 from learner.scheduler.round import RoundResults, bits
 
-Judge: TypeAlias = Callable[[str, FloatArray, Jobs, FloatArray], Simulated | None]
-"""Results of one job, as machines with this canary compute them, around a mean (P,), with a RoundHeader's normaliser.
-None if it cannot say."""
+
+class Judge(Protocol):
+    """Answers to jobs that are certain."""
+
+    def __call__(
+        self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray, *, terms: bool
+    ) -> Simulated | None:
+        """Results of one job, as machines with this canary compute them, around a mean (P,).
+
+        `normaliser` and `terms` are as in RoundHeader. None if it cannot say.
+        """
+        ...
 
 
 class _Owed(NamedTuple):
@@ -21,6 +29,7 @@ class _Owed(NamedTuple):
     mu: FloatArray
     job: Jobs
     normaliser: FloatArray
+    terms: bool
     answer: bytes
 
 
@@ -36,13 +45,14 @@ class Judging:
 
     def begin(self, header: RoundHeader, results: RoundResults) -> None:
         """A round starts."""
-        self._mu, self._normaliser, self._generation = header.mu, header.normaliser, header.generation
+        self._mu, self._normaliser, self._terms = header.mu, header.normaliser, header.terms
+        self._generation = header.generation
         self._round = results
         self.decided.clear()
 
     def right(self, index: int, canary: str) -> bytes | None:
         """The judge's answer to a job of this round, as machines with this canary compute it; None without one."""
-        found = self._asked(canary, self._mu, self._round.jobs.take([index]), self._normaliser)
+        found = self._asked(canary, self._mu, self._round.jobs.take([index]), self._normaliser, self._terms)
         if found is not None:
             self.decided.add(index)
         return found
@@ -55,14 +65,14 @@ class Judging:
             job = self._round.jobs.take([index])
             self._owed[name] = _Owed(
                 self._generation, audit.canary_of(index), self._mu, Jobs(table=job.table.copy(), eps=job.eps.copy()),
-                self._normaliser, self._round.answer(index),
+                self._normaliser, self._terms, self._round.answer(index),
             )  # fmt: skip
 
     def settle(self, audit: Audit) -> dict[str, int]:
         """Check the hosts that are owed a check; return those that were wrong, each with the generation."""
         wrong = {}
         for name, owed in self._owed.items():
-            found = self._asked(owed.canary, owed.mu, owed.job, owed.normaliser)
+            found = self._asked(owed.canary, owed.mu, owed.job, owed.normaliser, owed.terms)
             if found == owed.answer:
                 audit.credit(name)
             elif found is not None:
@@ -70,6 +80,6 @@ class Judging:
         self._owed.clear()
         return wrong
 
-    def _asked(self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray) -> bytes | None:
-        found = self._judge(self._canary or canary, mu, job, normaliser) if self._judge else None
+    def _asked(self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray, terms: bool) -> bytes | None:
+        found = self._judge(self._canary or canary, mu, job, normaliser, terms=terms) if self._judge else None
         return None if found is None else bits(found, slice(None))

@@ -1,7 +1,6 @@
 """Results of a sweep's runs: one row per run, means over the seeds, and curves."""
 
 import csv
-import importlib.util
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import writing
 from farm.tasks.loop import RETURN_FLOOR
+from learner import parquet
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
 from learner.sweep.grid import Sweep
@@ -27,9 +27,6 @@ return of the mean policy before learning."""
 
 MEASURE: Final = "measure_"
 """Before the name of a task's measure in a column: its mean over the perturbed starts of the evaluation."""
-
-INSTALL: Final = "it needs pyarrow: pip install pyarrow"
-"""Message if pyarrow is missing."""
 
 
 def rows(sweep: Sweep) -> list[dict[str, Any]]:
@@ -70,23 +67,10 @@ def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None
         replace_text(path, text.getvalue())
 
 
-def available() -> bool:
-    """Whether pyarrow is installed."""
-    return importlib.util.find_spec("pyarrow") is not None
-
-
 def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
     """Write table.parquet, with types, atomically; raises RunError if it cannot be written."""
-    import pyarrow
-    from pyarrow import parquet
-
-    kinds = {"int": pyarrow.int64(), "text": pyarrow.string(), "number": pyarrow.float64(), "truth": pyarrow.bool_()}
     columns = {name: "text" for name in sweep.vary} | COLUMNS | dict.fromkeys(measures(table), "number")
-    schema = pyarrow.schema([(name, kinds[kind]) for name, kind in columns.items()])
-    aside = path.with_name(path.name + ".new")
-    with writing(path):
-        parquet.write_table(pyarrow.Table.from_pylist(list(table), schema), aside)
-        aside.replace(path)
+    parquet.write(path, {name: (kind, [row.get(name) for row in table]) for name, kind in columns.items()})
 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:

@@ -1,18 +1,22 @@
 """Verifying runs: whatever was altered, cut or exchanged in a folder is named with its first generation."""
 
 import json
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from alone import POLE, Alone
 
 from farm.__main__ import main
-from learner.again.verify import Differs, chosen, stored, verify_some
+from learner.again.verify import Differs, chosen, stored, verify_some, workers
+from learner.commands import verify as command
+from learner.run import chain, setup
 from learner.run import checkpoint as checkpoints
-from learner.run import setup
+from learner.run import config as configs
 from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.learner import Learner
@@ -26,6 +30,7 @@ SETTINGS = (
 
 
 def learnt(path: Path, seed: int = 0, **settings: object) -> RunFolder:
+    path.parent.mkdir(exist_ok=True)
     (path.parent / "pole.py").write_text(POLE)
     config = configure(f"{path.parent / 'pole.py'}:Pole", generations=GENERATIONS, seed=seed, **settings)
     problem, at = setup.start(config, path.name)
@@ -37,7 +42,23 @@ def learnt(path: Path, seed: int = 0, **settings: object) -> RunFolder:
 
 
 def verified(folder: RunFolder, generations: Sequence[int] = range(1, GENERATIONS + 1)) -> list[int]:
-    return [generation for generation, _ in verify_some(stored(folder), generations)]
+    run = stored(folder)
+    with workers(run, None, lambda: False) as simulate:
+        return [generation for generation, _ in verify_some(run, generations, simulate)]
+
+
+def forged(folder: RunFolder) -> None:
+    """Give the altered files a chain of their own."""
+    at, config = checkpoints.load(folder.checkpoint), folder.read_config()
+    links, before = folder.chain.read(), chain.first(config)
+    lines = {line.generation: line for line in folder.progress()}
+    rows = {int(row["generation"]): row for row in folder.parameters.rows()}
+    (folder.path / "chain").unlink()
+    for generation, link in links.items():
+        row, state = rows[generation], chain.state_of(at) if generation == len(links) else link.state
+        before = chain.following(before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state)
+        folder.chain.append(generation, chain.Link(before, state))
+    checkpoints.save(folder.checkpoint, replace(at, chain=before, config=configs.to_dict(config)))
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: each.get("algorithm", "default"))
@@ -109,25 +130,72 @@ def in_the_summary(folder: RunFolder) -> None:
     folder.write_summary(summary | {"parameters_sha256": "0" * 64})
 
 
+def another_link(folder: RunFolder) -> None:
+    """Two digests of the chain, exchanged."""
+    lines = (folder.path / "chain").read_text().splitlines()
+    (one, two, a), (four, five, b) = lines[1].split(), lines[3].split()
+    lines[1], lines[3] = f"{one} {five} {b}", f"{four} {two} {a}"
+    (folder.path / "chain").write_text("\n".join(lines) + "\n")
+
+
+def a_cut_chain(folder: RunFolder) -> None:
+    lines = (folder.path / "chain").read_text().splitlines(keepends=True)
+    (folder.path / "chain").write_text("".join(lines[:2]))
+
+
+def another_count(folder: RunFolder) -> None:
+    """In the checkpoint, where neither progress nor parameters have it."""
+    at = checkpoints.load(folder.checkpoint)
+    checkpoints.save(folder.checkpoint, replace(at, steps=at.steps + 1))
+
+
+IN_CHAIN = "generation {} differs: progress.jsonl or parameters, or what is before it, have another digest in chain"
 ALTERED: dict[Callable[[RunFolder], None], str] = {
-    one_digit: "generation 4 differs: return_max is .* in progress.jsonl, and .* when it is repeated",
+    one_digit: IN_CHAIN.format(4),
     cut: "generation 4 differs: progress.jsonl has no line of it",
     exchanged: "generation [45] differs: progress.jsonl has no line of it",
     of_another_run: "generation 1 differs: ",
-    in_parameters: "generation 4 differs: .* in progress.jsonl, and .* when it is repeated",
+    in_parameters: IN_CHAIN.format(3),
     a_row_of_parameters: "generation 6 differs: parameters has no row of it",
     in_the_checkpoint: r"generation 6 differs: mu\[1\] is .* in parameters, and .* in checkpoint",
-    in_the_configuration: "generation 1 differs: .* when it is repeated",
+    another_count: "generation 6 differs: checkpoint is not the one that chain says",
+    in_the_configuration: "generation 1 differs: --seed is 7 in config.json, and 0 in checkpoint",
+    another_link: IN_CHAIN.format(2),
+    a_cut_chain: "generation 3 differs: chain has no line of it",
     in_the_summary: "summary.json says that the parameters are 0000",
+}
+FORGED: dict[Callable[[RunFolder], None], str] = {
+    one_digit: "generation 4 differs: return_max is .* in progress.jsonl, and .* when it is repeated",
+    in_parameters: "generation 4 differs: .* in progress.jsonl, and .* when it is repeated",
+    in_the_configuration: "generation 1 differs: .* when it is repeated",
 }
 
 
 @pytest.mark.parametrize("alter", ALTERED, ids=lambda each: each.__name__)
-def test_what_was_altered_is_named(tmp_path: Path, alter: Callable[[RunFolder], None]) -> None:
+def test_what_was_altered_is_named_before_anything_is_repeated(
+    tmp_path: Path, alter: Callable[[RunFolder], None]
+) -> None:
     folder = learnt(tmp_path / "r")
     alter(folder)
     with pytest.raises(Differs, match=ALTERED[alter]):
+        stored(folder)
+
+
+@pytest.mark.parametrize("alter", FORGED, ids=lambda each: each.__name__)
+def test_what_was_altered_with_its_chain_is_named_when_it_is_repeated(
+    tmp_path: Path, alter: Callable[[RunFolder], None]
+) -> None:
+    folder = learnt(tmp_path / "r")
+    alter(folder)
+    forged(folder)
+    with pytest.raises(Differs, match=FORGED[alter]):
         verified(folder)
+
+
+def test_the_chain_is_of_the_settings_and_not_of_machines(tmp_path: Path) -> None:
+    one, two = learnt(tmp_path / "a" / "r"), learnt(tmp_path / "b" / "other")
+    assert (one.path / "chain").read_bytes() == (two.path / "chain").read_bytes()
+    assert one.chain.read() != learnt(tmp_path / "c", seed=1).chain.read()
 
 
 def test_the_command_says_it_and_writes_a_receipt(
@@ -143,24 +211,77 @@ def test_the_command_says_it_and_writes_a_receipt(
     assert receipt["parameters_sha256"] == (folder.read_summary() or {})["parameters_sha256"]
     one_digit(folder)
     assert main(["verify", "r", "--share", "1", "--receipt", "receipt.json"]) == 1
-    assert "generation 4 differs: return_max is" in capsys.readouterr().err
+    assert "generation 4 differs: progress.jsonl" in capsys.readouterr().err
     receipt = json.loads(Path("receipt.json").read_text())
-    assert receipt["generations"] == [1, 2, 3]
+    assert (receipt["generations"], receipt["verdict"]) == ([], "different")
     assert "generation 4 differs" in receipt["difference"]
+
+
+def test_an_interrupted_verification_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    learnt(tmp_path / "r")
+    words, repeated = ["verify", "r", "--share", "0.8", "--receipt", "r.json"], command.verify_some
+
+    def pressed(*values: Any) -> Iterator[tuple[int, int]]:
+        for count, found in enumerate(repeated(*values), 1):
+            if count == 2:
+                signal.raise_signal(signal.SIGINT)
+            yield found
+
+    with monkeypatch.context() as patched:
+        patched.setattr(command, "verify_some", pressed)
+        assert main(words) == 130
+    assert "stopped; no difference in 2 of 6 generations" in capsys.readouterr().out
+    before = json.loads(Path("r.json").read_text())
+    assert (before["verdict"], len(before["chosen"]), before["generations"]) == ("interrupted", 5, before["chosen"][:2])
+    with monkeypatch.context() as patched:
+        tried: list[int] = []
+        patched.setattr(command, "verify_some", lambda run, some, do: tried.extend(some) or repeated(run, some, do))
+        assert main(words) == 0
+    after = json.loads(Path("r.json").read_text())
+    assert tried == before["chosen"][2:]
+    assert (after["verdict"], after["generations"]) == ("the same", before["chosen"])
+
+
+def test_a_receipt_is_signed_with_a_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    x509 = pytest.importorskip("cryptography.x509")
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    monkeypatch.chdir(tmp_path)
+    learnt(tmp_path / "r")
+    assert main(["certificates", "new", "certs", "--learner", "localhost"]) == 0
+    assert main(["verify", "r", "--receipt", "r.json", "--tls", "certs/learner"]) == 0
+    content, signature = Path("r.json").read_bytes(), Path("r.json.sig").read_bytes()
+    certificate = x509.load_pem_x509_certificate(json.loads(content)["certificate"].encode())
+    certificate.verify_directly_issued_by(x509.load_pem_x509_certificate(Path("certs/learner/ca.pem").read_bytes()))
+    key = certificate.public_key()
+    key.verify(signature, content, ec.ECDSA(hashes.SHA256()))
+    with pytest.raises(InvalidSignature):
+        key.verify(signature, content.replace(b"the same", b"different"), ec.ECDSA(hashes.SHA256()))
 
 
 def test_other_code_is_said_before_anything_is_computed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = learnt(tmp_path / "r")
     (tmp_path / "pole.py").write_text(POLE + "\n# changed\n")
+    at = checkpoints.load(folder.checkpoint)
+    checkpoints.save(folder.checkpoint, replace(at, code=at.code | {"simulation": "0" * 64}))
     main(["verify", str(folder.path)])
-    assert "the code of its task has changed since the run began" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the code of its task has changed since the run began" in said
+    assert "the simulation's code (farm/) is of another release than when the run began" in said
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--workers", "2"), "--workers and --connect are for --all"),
-        (("--all", "--workers", "0"), "--workers 0 without --connect"),
+        (("--tls", "certs"), "--tls is for a farm to --connect to, or to sign a --receipt"),
+        (("--all", "--workers", "0"), "--all with --workers 0, without --connect"),
         (("--all", "--workers", "1", "--connect", "tcp/127.0.0.1:1"), "--workers with --connect"),
         (("--share", "0"), "share is 0"),
     ],

@@ -11,6 +11,7 @@ from farm.rollouts import NOT_NORMALISED
 from learner.run.config import RunConfig
 from learner.run.judge import Judge
 from learner.run.setup import problem
+from learner.scheduler.round import bits
 
 SLIDE = """
 import numpy as np
@@ -45,6 +46,17 @@ def asked(tmp_path: Path, request: pytest.FixtureRequest) -> tuple[object, float
 def test_it_says_what_a_rollout_returns(asked) -> None:
     given, returned = asked
     assert given.returns.tolist() == [returned]
+
+
+def test_its_answer_has_the_terms_that_the_hosts_send(tmp_path: Path) -> None:
+    (tmp_path / "slide.py").write_text(SLIDE % "0.0")
+    found = problem(RunConfig(task=f"{tmp_path / 'slide.py'}:Slide", policy="constant"))
+    job, mu, runner, judge = Jobs.mean("none", [None]), np.full(1, 0.5), found.runner(), Judge(found)
+    given = judge(fingerprint.digest(), mu, job, NOT_NORMALISED, terms=True)
+    sent = runner.run(mu, job, "none", NOT_NORMALISED, terms=True)
+    assert given is not None
+    assert bits(given, slice(None)) == bits(sent, slice(None))
+    assert given.terms.shape == (1, 1)
 
 
 @pytest.mark.parametrize("asked", ["np.random.rand()"], indirect=True)

@@ -1,0 +1,279 @@
+"""Data sets: episodes of a learnt policy on perturbed starts, simulated by workers, written part by part.
+
+    manifest.json     what the data set is of, and SHA-256 of its files; without these it is unfinished
+    run/              what is needed of the run to make the same bytes again
+    unfinished.json   the parts that are written, and whose answers are in them; removed at the end
+    data/, meta/      as in `learner/again/lerobot.py`
+
+Each part is a round of jobs, whose size follows from the task alone. So every farm writes the same files.
+"""
+
+import hashlib
+import json
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from farm import fingerprint, plugins, seeds
+from farm.errors import ConfigError, RunError, writing
+from farm.moments import normaliser
+from farm.net.work import Jobs
+from farm.tasks.outcomes import whole
+from learner import parquet
+from learner.again.lerobot import Episode, Format
+from learner.again.replay import restored
+from learner.run import checkpoint as checkpoints
+from learner.run.checkpoint import Checkpoint
+from learner.run.files import replace_text
+from learner.run.folder import RunFolder
+from learner.run.launch import Placement, connected, dispatch
+from learner.run.setup import Problem
+from learner.scheduler.dispatcher import Dispatcher
+from learner.scheduler.membership import Admission
+from learner.scheduler.round import RoundResults, bits
+
+_PART: Final = 16 << 20  # [bytes] of a part's traces: a round's results are in memory, and two rounds at most
+_MOST: Final = 1000  # episodes of a part
+_REPEATED: Final = 50  # of so many episodes of other machines this one repeats one
+_VERSION: Final = 1
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set in a folder, perhaps unfinished."""
+
+    path: Path
+    episodes: int
+    seed: int
+
+    @property
+    def manifest(self) -> Path:
+        """The file that says what it is of."""
+        return self.path / "manifest.json"
+
+    @property
+    def run(self) -> RunFolder:
+        """Its copy of the run."""
+        return RunFolder(self.path / "run")
+
+    def begin(self, run: RunFolder) -> bool:
+        """Prepare the folder for a run's data set, or find it there; return whether it is finished.
+
+        Raises:
+          ConfigError: another data set or something else is there.
+        """
+        if not self.manifest.exists():
+            if self.path.exists() and any(self.path.iterdir()):
+                raise ConfigError(f"{self.path} is not empty, and has no manifest.json: choose another --out")
+            with writing(self.path):
+                _copy(run, self.run.path)
+                replace_text(self.manifest, json.dumps(self._wanted(self.run), indent=2) + "\n")
+        there = read(self.manifest)
+        wanted = self._wanted(run)
+        for name in (name for name in wanted if there.get(name) != wanted[name]):
+            raise ConfigError(
+                f"{self.path} has another data set: its {name} is {str(there.get(name))[:100]}, not "
+                f"{str(wanted[name])[:100]}: choose another --out"
+            )
+        return "files" in there
+
+    def _wanted(self, run: RunFolder) -> dict[str, Any]:
+        """What the manifest says from its beginning."""
+        config, at = run.read_config(), checkpoints.load(run.checkpoint)
+        return {
+            "version": _VERSION, "format": "LeRobot v3.0", "run": at.run,
+            "task": _wire("tasks", config.task), "policy": _wire("policies", config.policy),
+            "generation": at.state["generation"], "checkpoint": _digest(run.checkpoint),
+            "config": _digest(run.path / "config.json"), "code": at.code, "numbers": fingerprint.digest(),
+            "episodes": self.episodes, "seed": self.seed, "seeds": "episode i: (4, seed, i, 0)",
+            "pyarrow": parquet.release(),
+        }  # fmt: skip
+
+    def make(self, place: Placement, stopped: Callable[[], bool]) -> Iterator[int]:
+        """Simulate and write what is missing; yield the number of finished episodes.
+
+        Raises:
+          RunError: a file cannot be written, or a worker's numbers are wrong.
+          Stopped: it was asked to stop; the parts that are finished stay.
+        """
+        at = checkpoints.load(self.run.checkpoint)
+        work = _Work(self, restored(self.run, at), at, place.connect != ())
+        if work.next < work.parts:
+            with ExitStack() as stack:
+                link = stack.enter_context(connected(place, stopped))
+                admission = Admission(fingerprint.digest(), work.expelled)
+                name = f"dataset-{secrets.token_hex(4)}"
+                dispatcher, _ = dispatch(
+                    stack, link, place, work.problem, name, admission, work.parts, stopped, steps=True
+                )
+                yield from work.learn(dispatcher)
+        work.format.finish(work.parts)
+        files = sorted(each for each in self.path.rglob("*") if each.is_file() and each.parent != self.path)
+        done = {
+            "numbers_sha256": hashlib.sha256("".join(each["numbers"] for each in work.done).encode()).hexdigest(),
+            "files": {str(each.relative_to(self.path)): _digest(each) for each in files},
+        }
+        with writing(self.manifest):
+            replace_text(self.manifest, json.dumps(read(self.manifest) | done, indent=2) + "\n")
+            work.file.unlink(missing_ok=True)
+
+
+class _Work:
+    """The parts of a data set that are written, and the next one."""
+
+    def __init__(self, of: DataSet, problem: Problem, at: Checkpoint, judged: bool) -> None:
+        self.problem, self._of, self._judged = problem, of, judged
+        config, last = of.run.read_config(), int(at.state["generation"])
+        self._mu = of.run.parameters.average(last, at.state["mu"], config.average)
+        self._seen = np.stack([normaliser(at.moments)] * 2)
+        self.format = Format(of.path, problem.spec, _wire("tasks", config.task))
+        self.file = of.path / "unfinished.json"
+        size = int(np.prod(whole(problem.spec))) * 4
+        self._each = max(1, min(_MOST, _PART // size))
+        self.parts = -(-of.episodes // self._each)
+        state = read(self.file) if self.file.exists() else {"done": [], "expelled": {}}
+        self.done: list[dict[str, Any]] = state["done"]
+        """For each finished part its numbers' digest, its control steps, and the hosts that simulated it"""
+        self.expelled: dict[str, str] = state["expelled"]
+        """Hosts that returned wrong numbers, and the reasons."""
+
+    @property
+    def next(self) -> int:
+        """The number of the next part."""
+        return len(self.done)
+
+    def learn(self, dispatcher: Dispatcher) -> Iterator[int]:
+        """Simulate and write the parts that are missing."""
+        jobs = self._begin(dispatcher)
+        while self.next < self.parts:
+            first = self.next * self._each
+            for results in dispatcher.progress():
+                yield first + int(results.done.sum())
+            if self._undone(dispatcher) or (self.next + 1 == self.parts and self._late(dispatcher)):
+                jobs = self._begin(dispatcher)
+                continue
+            results, hosts, done = dispatcher.collect(), dispatcher.hosts, jobs
+            if self.next + 1 < self.parts:  # workers go on while this part is written
+                jobs = self._begin(dispatcher, ahead=1)
+            self._check(results, done, first, hosts)
+            self._write(results, done, first, hosts)
+
+    def _begin(self, dispatcher: Dispatcher, ahead: int = 0) -> Jobs:
+        part = self.next + ahead
+        rows = range(part * self._each, min(self._of.episodes, (part + 1) * self._each))
+        jobs = Jobs.mean("none", [seeds.trial(self._of.seed, row) for row in rows])
+        dispatcher.begin(part, self._mu, jobs, "steps", self._seen, terms=True)
+        return jobs
+
+    def _late(self, dispatcher: Dispatcher) -> bool:
+        """Whether a host is wrong whose last answers no second host could check."""
+        return dispatcher.check_the_rest() and self._undone(dispatcher)
+
+    def _undone(self, dispatcher: Dispatcher) -> bool:
+        """Whether hosts were expelled: the parts from the first one with their answers on are made again."""
+        new = dispatcher.admission.expelled.keys() - self.expelled.keys()
+        if not new:
+            return False
+        self.expelled.update(dispatcher.admission.expelled)
+        kept = next((i for i, part in enumerate(self.done) if new & {*part["hosts"]}), len(self.done))
+        del self.done[kept:]
+        self._save()
+        return True
+
+    def _check(self, results: RoundResults, jobs: Jobs, first: int, hosts: list[str]) -> None:
+        """Repeat some episodes on this machine, if others have simulated them, and compare every number.
+
+        Raises:
+          RunError: one differs.
+        """
+        if not self._judged:
+            return
+        count = -(-len(jobs) // _REPEATED)
+        chosen = sorted(np.random.default_rng(secrets.randbits(64)).choice(len(jobs), count, replace=False).tolist())
+        found = self._runner.run(self._mu, jobs.take(chosen), "steps", self._seen, terms=True)
+        for at, row in enumerate(chosen):
+            alike = bits(found, slice(at, at + 1)) == results.answer(row)
+            if not alike or found.traces[at].tobytes() != results.traces[row].tobytes():
+                raise RunError(
+                    f"episode {first + row} has other numbers here than a worker sent: of {', '.join(hosts)} one "
+                    "lies, or is broken; without it the same command continues"
+                )
+
+    @cached_property
+    def _runner(self) -> Any:  # noqa: ANN401
+        return self.problem.runner()
+
+    def _write(self, results: RoundResults, jobs: Jobs, first: int, hosts: list[str]) -> None:
+        episodes = [
+            Episode(
+                seed=seed or (), steps=results.traces[row][: results.steps[row]], value=float(results.returns[row]),
+                success=bool(results.flags[row, 0]), failed=bool(results.flags[row, 2]),
+            )
+            for row, seed in enumerate(jobs.seeds())
+        ]  # fmt: skip
+        before = sum(part["frames"] for part in self.done)
+        numbers = self.format.write(self.next, first, before, episodes)
+        self.done.append({"numbers": numbers, "frames": sum(len(each.steps) for each in episodes), "hosts": hosts})
+        self._save()
+
+    def _save(self) -> None:
+        with writing(self.file):
+            replace_text(self.file, json.dumps({"done": self.done, "expelled": self.expelled}) + "\n")
+
+
+def _wire(kind: str, name: str) -> str:
+    """A class's name without its folder, which differs between machines."""
+    return plugins.find(kind, name).wire
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A JSON table in a file; a ConfigError if there is none."""
+    try:
+        table = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        table = None
+    if not isinstance(table, dict) or table.get("version", _VERSION) != _VERSION:
+        raise ConfigError(f"{path} is damaged, or of another version: expected what farm dataset writes")
+    return table
+
+
+def difference(old: Path, new: Path) -> str:
+    """What differs between two finished data sets, by their manifests; nothing if all bytes are the same.
+
+    Raises:
+      ConfigError: one cannot be read, or is unfinished.
+    """
+    was, now = read(old), read(new)
+    for path, table in ((old, was), (new, now)):
+        if not isinstance(table.get("files"), dict):
+            raise ConfigError(f"{path} is of an unfinished data set")
+    names = [name for name in now["files"] | was["files"] if now["files"].get(name) != was["files"].get(name)]
+    if not names:
+        return ""
+    if now["numbers_sha256"] == was["numbers_sha256"]:
+        releases = f"pyarrow is {now['pyarrow']}, and was {was['pyarrow']}"
+        return f"the numbers are the same, but the bytes of {len(names)} files are not: {releases}"
+    return f"{names[0]} and {len(names) - 1} more files have other numbers"
+
+
+def _copy(run: RunFolder, to: Path) -> None:
+    """Copy what a data set needs of a run."""
+    to.mkdir(parents=True)
+    for name in ("config.json", "checkpoint", *(["parameters"] if run.read_config().average > 1 else [])):
+        shutil.copyfile(run.path / name, to / name)
+    if (run.path / "assets").is_dir():
+        shutil.copytree(run.path / "assets", to / "assets")
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

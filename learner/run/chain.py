@@ -1,0 +1,101 @@
+"""The chain of a run: a digest per generation, of its numbers, the run's settings and the previous generation's digest.
+
+Two runs with the same settings have the same chain, whichever workers they had, and however often they were resumed:
+what differs between machines (seconds, workers, hosts) is not in it. So its last digest names all numbers of a run.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from farm.arrays import FloatArray
+from farm.net import codec
+from farm.net.stats import GenerationStats
+from learner.run import config as configs
+from learner.run.checkpoint import SCHEMA, Checkpoint
+from learner.run.config import RunConfig
+from learner.run.files import replace_text
+
+OF_MACHINES: Final = ("reissued", "workers", "seconds")
+"""Of a line of progress.jsonl, what another execution has otherwise."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A generation's entry."""
+
+    digest: str
+    """Over its numbers and the previous digest."""
+    state: str
+    """Of the checkpoint after it."""
+
+
+def first(config: RunConfig) -> str:
+    """The digest before the first generation: of all settings but the number of generations, without folders."""
+    table = {name: str(value).rpartition("/")[2] for name, value in configs.flat(config).items()}
+    del table["generations"]
+    return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
+
+
+def state_of(at: Checkpoint) -> str:
+    """Digest of a checkpoint, but for what is of machines, names and code."""
+    bare = replace(
+        at, run="", config={}, reissued=0, seconds=0.0, canary="", replayed=False, code={}, expelled={}, checks={},
+        first={}, undone=0, chain="",
+    )  # fmt: skip
+    return hashlib.sha256(codec.encode(bare, SCHEMA)).hexdigest()
+
+
+def following(
+    before: str, line: GenerationStats, mu: FloatArray, sigma: FloatArray, seen: FloatArray, state: str
+) -> str:
+    """The digest of a generation.
+
+    Args:
+      before: that of the generation before it.
+      line: its line of progress.jsonl.
+      mu: after it, (P,).
+      sigma: after it, (P,).
+      seen: normaliser after it, (2, d) or (2, 0).
+      state: that of `state_of`.
+    """
+    numbers = {name: value for name, value in line.to_dict().items() if name not in OF_MACHINES}
+    hashed = hashlib.sha256(f"{before} {state} {json.dumps(numbers, sort_keys=True)}\n".encode())
+    for values in (mu, sigma, seen):
+        hashed.update(values.astype("<f8").tobytes())
+    return hashed.hexdigest()
+
+
+@dataclass(frozen=True)
+class ChainFile:
+    """The file: a line `GENERATION DIGEST STATE` per generation."""
+
+    path: Path
+
+    def append(self, generation: int, link: Link) -> None:
+        """Add a generation."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(_line(generation, link))
+
+    def read(self) -> Mapping[int, Link]:
+        """Every readable line, by generation; the last one of several."""
+        found: dict[int, Link] = {}
+        with suppress(OSError):
+            for words in map(str.split, self.path.read_text("utf-8", "replace").splitlines()):
+                if len(words) == 3 and words[0].isdecimal() and len(words[0]) < 20:
+                    found[int(words[0])] = Link(*words[1:])
+        return found
+
+    def rewind(self, generation: int) -> None:
+        """Remove what is newer than a generation."""
+        if self.path.exists():
+            kept = ((at, link) for at, link in sorted(self.read().items()) if at <= generation)
+            replace_text(self.path, "".join(_line(at, link) for at, link in kept))
+
+
+def _line(generation: int, link: Link) -> str:
+    return f"{generation} {link.digest} {link.state}\n"
