@@ -7,10 +7,11 @@ import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
+from farm.sim.channels import flat
 from farm.sim.scene import MODEL
 from farm.sim.trajectory import single
 from farm.tasks.acting import shaped
-from farm.tasks.base import Record, Task, TaskSpec, flat
+from farm.tasks.base import Record, Task, TaskSpec
 
 if TYPE_CHECKING:
     from farm.tasks.loop import Rollouts
