@@ -4,6 +4,8 @@ All entries learn from the same starts. After each rung they are ordered by the 
 same perturbed starts, and by its gain since the rung before: many learning curves are straight over the logarithm of
 the rollouts, so an entry that still gains may reach more in the end. The better half goes on, and the last one learns
 with half of all rollouts. The best of each kind of policy goes on first: kinds differ most, and in how soon they learn.
+The winner's policy is the average of its means over the last tenth of its generations (suffix averaging: Rakhlin,
+Shamir & Sridharan 2012), which removes much of the noise of steps that do not shrink.
 
     race.json               the entries, and their scores at the end of each rung that is over
     ENTRY-sSEED/            the folder of each entry's run; an entry that goes on is resumed
@@ -44,6 +46,7 @@ MOST_ROLLOUTS: Final = 100_000_000
 
 _VERSION: Final = 1
 _LEAST: Final = 2  # generations of an entry in the first rung
+_SUFFIX: Final = 10  # one in so many of the winner's generations is averaged, the last ones
 _BATCH: Final = 16  # rollouts that are measured
 _EFFICIENCY: Final = 0.7  # of a worker on a machine that also runs the learners
 
@@ -136,11 +139,12 @@ class Race:
 
     def runs(self, number: int) -> dict[Path, RunConfig]:
         """The runs of a rung, by folder."""
-        total = self.rungs[number].rollouts
-        return {
-            self.folder(entry): replace(entry.config, generations=entry.generations(total))
-            for entry in self.running(number)
-        }
+        last, runs = number == len(self.rungs) - 1, {}
+        for entry in self.running(number):
+            generations = entry.generations(self.rungs[number].rollouts)
+            average = max(entry.config.average, generations // _SUFFIX if last else 1)
+            runs[self.folder(entry)] = replace(entry.config, generations=generations, average=average)
+        return runs
 
     def run(self, site: Site, shown: Watching, stopped: Callable[[], bool], *, record: bool) -> bool:
         """Do what is left of the race; the winner's last rung may be recorded. Return whether the race is over.
