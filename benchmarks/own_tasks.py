@@ -28,6 +28,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,6 +44,7 @@ from learner.again.replay import loaded
 from learner.run.evaluation import evaluation_jobs
 from learner.run.folder import RunFolder
 from learner.run.setup import problem
+from learner.sweep.race import entry_of
 
 HERE: Final = Path(__file__).parent
 SUITE: Final = HERE / "suite.py"
@@ -163,28 +165,35 @@ def pycma(task: str, seed: int, rollouts: int) -> float:
 
 
 def defaults(task: str, seed: int, rollouts: int) -> float:
-    """One entry: the task's own settings."""
-    return _raced(task, seed, rollouts, {"default": {}})
+    """What `farm run` learns."""
+    alone = entry_of("default", farm.RunConfig(task=task, seed=seed))
+    with tempfile.TemporaryDirectory() as folder:
+        config = replace(alone.config, generations=alone.generations(rollouts))
+        for _ in farm.learn(config, Path(folder) / "run", workers=1, record=False):
+            pass
+        return _score(Path(folder) / "run")
 
 
 def tune(task: str, seed: int, rollouts: int) -> float:
     """A race."""
-    return _raced(task, seed, rollouts, None)
+    return _raced(task, seed, rollouts)
 
 
 def winner(task: str, seed: int, rollouts: int) -> float:
     """A race in which the winner has as many rollouts as the others have in all."""
-    return _raced(task, seed, 2 * rollouts, None)
+    return _raced(task, seed, 2 * rollouts)
 
 
-def _raced(task: str, seed: int, rollouts: int, entries: Any) -> float:  # noqa: ANN401
+def _raced(task: str, seed: int, rollouts: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
-        config = farm.RunConfig(task=task, seed=seed)
-        done = farm.tune(config, Path(folder) / "race", rollouts=rollouts, entries=entries, workers=1)
-        policy = loaded(RunFolder.open(done.folder(done.winner)))
-        returned = policy.runner.run(policy.mu, evaluation_jobs(STARTS, SEED)).returns[:STARTS]
+        done = farm.tune(farm.RunConfig(task=task, seed=seed), Path(folder) / "race", rollouts=rollouts, workers=1)
         print(f"{Path(task).name} seed {seed}: {done.winner.name}", file=sys.stderr)
-        return float(returned.mean())
+        return _score(done.folder(done.winner))
+
+
+def _score(run: Path) -> float:
+    policy = loaded(RunFolder.open(run))
+    return float(policy.runner.run(policy.mu, evaluation_jobs(STARTS, SEED)).returns[:STARTS].mean())
 
 
 METHODS: Final[dict[str, Callable[[str, int, int], float]]] = {
