@@ -129,6 +129,27 @@ def test_a_robot_with_meshes_of_a_package(tmp_path: Path) -> None:
     assert policy.rollout().trajectory.value == summary["mean_policy_return"]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("task", "package", "generations", "least"),
+    [
+        pytest.param("shadow_hand.py:Hold", "gymnasium_robotics", 10, 1000.0, id="touch"),  # no action: 824
+        pytest.param("suite.py:Swingup", "dm_control", 6, 100.0, id="dm_control"),  # random actions: 28
+    ],
+)
+def test_environments_of_other_packages_learn(
+    task: str, package: str, generations: int, least: float, tmp_path: Path
+) -> None:
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    flags = ("--generations", str(generations), "--name", "r", "--no-record")
+    command = [sys.executable, "-m", "farm", "run", "--task", str(LEARN.parent / "tasks" / task), *flags]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=True)
+    summary = json.loads((tmp_path / "runs/r/summary.json").read_text())
+    assert summary["robust_return"] > least
+
+
 _SCRIPT = """
 import farm
 

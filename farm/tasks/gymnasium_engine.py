@@ -3,7 +3,7 @@
 import contextlib
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -47,8 +47,8 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # mostly about newer versions
             env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **arguments)
-            if arguments:  # an unusable value may fail only in a step
-                env.reset(seed=NOMINAL)
+            if arguments and isinstance(env.action_space, gymnasium.spaces.Box):
+                env.reset(seed=NOMINAL)  # an unusable value may fail only in a step
                 env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
     except Exception as error:  # an environment may raise anything
         said = " ".join(str(error).split()) or _place(error)
@@ -88,11 +88,12 @@ def _place(error: Exception) -> str:
 
 def leaves(space: Any, where: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401  a space
     """A space's parts that have no parts, each with where it is: "['goal']"."""
-    parts = getattr(space, "spaces", None)  # of a Dict, by name, or of a Tuple
-    if parts is None:
+    from gymnasium.spaces import Dict, Tuple
+
+    if not isinstance(space, Dict | Tuple):
         yield where, space
         return
-    for key, part in parts.items() if isinstance(parts, Mapping) else enumerate(parts):
+    for key, part in space.items() if isinstance(space, Dict) else enumerate(space):
         yield from leaves(part, f"{where}[{key!r}]")
 
 

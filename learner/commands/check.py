@@ -207,8 +207,9 @@ def _still(found: "Problem", runner: "Runner") -> Iterator[str]:
 def _unread(task: type[Task]) -> Iterator[str]:
     """Attributes of a task's own classes that nothing reads, with names like those that a task has."""
     known = [name for name in dir(Task) if not name.startswith("_")]
-    for kind in task.__mro__[: task.__mro__.index(Task)]:
-        source = _source(kind)
+    own = task.__mro__[: task.__mro__.index(Task)]
+    source = "\n".join(map(_source, own))  # a class may read what a subclass says
+    for kind in own:
         for name in vars(kind):
             like = [] if name in known else difflib.get_close_matches(name, known, 1, _LIKE)
             if like and not re.search(rf"(?<!\bsim)\.{name}\b", source):

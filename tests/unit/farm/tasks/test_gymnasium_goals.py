@@ -8,7 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, Tuple, flatdim, flatten
+from gymnasium.spaces import Box, Dict, Discrete, OneOf, Tuple, flatdim, flatten
 
 from farm.errors import ConfigError, TaskError
 from farm.policies.networks import Linear, LinearConfig
@@ -32,7 +32,12 @@ class Goal(gymnasium.Env[Any, Any]):
         """`part` is what makes it unusable."""
         self.model = mujoco.MjModel.from_xml_string(XML)
         self.data = mujoco.MjData(self.model)
-        odd = {"mode": Discrete(4), "eye": Box(0, 255, (8, 8, 3), np.uint8), "cube": Box(-1.0, 1.0, (2, 2, 2))}
+        odd: dict[str, Any] = {
+            "one": OneOf((NUMBERS, NUMBERS)),
+            "mode": Discrete(4),
+            "eye": Box(0, 255, (8, 8, 3), np.uint8),
+            "cube": Box(-1.0, 1.0, (2, 2, 2)),
+        }
         self.observation_space = Dict(
             {
                 "observation": NUMBERS,
@@ -121,6 +126,7 @@ def test_an_environments_state_is_its_own() -> None:
             "mode",
             r"task gym:Goal-v0: observation\['mode'\] is Discrete\(4\); expected numbers: a box, or a dict of boxes",
         ),
+        ("one", r"observation\['one'\] is OneOf\(.*\); expected numbers: a box, or a dict of boxes"),
         ("eye", r"observation\['eye'\] is Box\(0, 255, \(8, 8, 3\), uint8\), a picture; expected numbers"),
         ("cube", r"observation\['cube'\] is Box\(-1.0, 1.0, \(2, 2, 2\), float32\), a picture; expected numbers"),
     ],

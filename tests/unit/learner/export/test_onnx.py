@@ -1,6 +1,7 @@
 """An exported ONNX model acts as the policy does."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -146,6 +147,17 @@ def test_a_policy_of_ones_own_has_a_method(tmp_path: Path) -> None:
         action, memory = session.run(["action", "next_memory"], {"observation": each, "memory": memory})
         np.testing.assert_allclose(action, acting.act(each), rtol=1e-11, atol=1e-12)
     assert session.get_modelmeta().custom_metadata_map["policy"] == "own.py:Own"
+
+
+def test_the_method_on_the_page_suits_the_policy_on_another(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    docs = Path(__file__).parents[4] / "docs"
+    [policy] = re.findall(r"`linear.py`:\n\n```python\n(.*?)```", (docs / "extending.md").read_text("utf-8"), re.S)
+    [method] = re.findall(r"^(    def onnx.*?)\n\n", (docs / "export.md").read_text("utf-8"), re.S | re.M)
+    (tmp_path / "linear.py").write_text(f"{policy}\n{method}\n")
+    found, _ = start(configure(HOPPER, policy=f"{tmp_path}/linear.py:Linear"), "r")
+    loaded = LoadedPolicy(found, 0, np.random.default_rng(1).normal(size=found.policy.size))
+    assert b"linear.py:Linear" in onnx.contents(loaded), "it has been compared with the policy"
 
 
 @pytest.mark.parametrize(
