@@ -64,6 +64,7 @@ def test_a_share_is_repeated_on_workers(tmp_path: Path, capsys: pytest.CaptureFi
     assert "verified to the bit: 4 of 4 generations" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_chain_does_not_tell_workers_or_interruptions(tmp_path: Path) -> None:
     config = farm.configure(f"{pole(tmp_path)}:Pole", generations=5, pairs=3)
     for report in farm.learn(config, tmp_path / "a", workers=1):

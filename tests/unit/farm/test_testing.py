@@ -68,6 +68,7 @@ def test_what_changed_is_named_with_its_first_step(tmp_path: Path, pole: str, ol
     same(pole, "linear", [None, 0, 1], tmp_path / "a.npz")
 
 
+@pytest.mark.slow
 def test_a_learnt_policy_acts_as_it_did(tmp_path: Path, pole: str) -> None:
     for _ in farm.learn(farm.configure(pole, generations=1, normalise=True), tmp_path / "r", workers=1):
         pass
