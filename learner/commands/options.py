@@ -124,10 +124,10 @@ def _value(words: Sequence[str], flag: str) -> str | None:
 
 
 def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
-    """Check that a run can continue with this configuration: only the number of generations may increase."""
+    """Check that a run can continue with this configuration: only its end may change."""
     if changed := list(configs.other(saved, wanted)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
-        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations may increase")
+        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations and --average may change")
     done = max((stats.generation for stats in folder.progress()), default=0)
     if wanted.generations < done:
         raise ConfigError(f"--generations {wanted.generations}: the run has already done {done}")

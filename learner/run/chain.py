@@ -35,9 +35,9 @@ class Link:
 
 
 def first(config: RunConfig) -> str:
-    """The digest before the first generation: of all settings but the number of generations, without folders."""
-    table = {name: str(value).rpartition("/")[2] for name, value in configs.flat(config).items()}
-    del table["generations"]
+    """The digest before the first generation: of all settings but those of the run's end, without folders."""
+    settings = configs.flat(config).items()
+    table = {name: str(value).rpartition("/")[2] for name, value in settings if name not in configs.AT_THE_END}
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
 
 

@@ -276,6 +276,8 @@ def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = Fal
     return replace(config, **parts, **run)
 
 
+AT_THE_END: Final = ("generations", "average")
+"""Settings that say where a run ends and with what policy: a resumed run may change them."""
 _APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved", "stop-after-steps"}
 
 
@@ -346,8 +348,8 @@ def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, objec
 
 
 def other(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Differences that make two configurations different runs: all except the number of generations."""
-    return (change for change in changes(old, new) if change[0] != "generations")
+    """Differences that make two configurations different runs: all except those of AT_THE_END."""
+    return (change for change in changes(old, new) if change[0] not in AT_THE_END)
 
 
 def flat(config: RunConfig) -> dict[str, object]:

@@ -57,6 +57,7 @@ def test_the_same_race_on_one_worker_on_three_that_die_and_after_an_interruption
     words = shlex.split(command.partition("farm run")[2])
     farm.call("run", *words, "--name", "alone", "--no-record", "--workers", "2")
     assert farm.summary("alone")["parameters_sha256"] == found[f"{winner}-s0"], "the race changes no number"
+    assert farm.summary("alone")["robust_return"] == first["scores"][-1][winner], "of the averaged policy"
     own = (farm.folder / "one/result.md").read_text()
     assert own == (farm.folder / "again/result.md").read_text().replace("again/", "one/")
     shown = farm.call("evaluate", f"one/{winner}-s0", "--seed", "1")

@@ -56,6 +56,19 @@ def test_the_better_half_goes_on_and_a_place_in_two_is_for_other_kinds_of_polici
     assert kept([d, c], {"c": 1.0, "d": 1.0}, 1) == [d], "equal ones keep their order"
 
 
+def test_the_winner_ends_with_the_average_of_its_last_tenth(tmp_path):
+    a, b = entry("a"), entry("b", "constant")
+    scores = [{"a": 1.0, "b": 0.0}]
+    first, last = (raced(tmp_path, a, b, scores=scores[:done]).runs(done) for done in (0, 1))
+    assert [config.average for config in first.values()] == [1, 1]
+    [config] = last.values()
+    assert (config.generations, config.average) == (60, 6)
+    assert not list(configs.other(first[tmp_path / "a-s0"], config)), "its run is resumed"
+    own = replace(a, config=replace(a.config, average=9))
+    [config] = raced(tmp_path, own, b, scores=scores).runs(1).values()
+    assert config.average == 9
+
+
 def test_an_entry_that_still_gains_may_go_on_before_a_better_one_that_does_not(tmp_path):
     a, b, c, d = entry("a"), entry("b", "mlp"), entry("c", "constant"), entry("d", "constant", 0.2)
     scores = [{"a": -10.0, "b": -60.0, "c": -70.0, "d": None}, {"a": -9.0, "b": -50.0}]
