@@ -28,7 +28,7 @@ from learner.scheduler.dispatcher import Stopped
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCommand(Link):
-    """Writes episodes of a learnt policy on perturbed starts as a data set in LeRobot's format; see docs/files.md.
+    """Writes episodes of a learnt policy as a data set in LeRobot's format; see docs/files.md.
 
     An interrupted command continues when it is repeated.
     """
