@@ -21,7 +21,7 @@ from typing import Any, Final, TypeVar
 import zenoh
 
 from farm.errors import ConfigError, FarmError, Interrupted
-from farm.net import probe
+from farm.net import keys, probe
 from farm.net.events import Event, Events
 from farm.net.tls import Bundle, access_control
 
@@ -35,6 +35,8 @@ _PORT: Final = re.compile(r"[0-9]{1,5}")
 _FEWEST: Final = 64  # enough files and connections for a run with two workers
 _OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
+_REQUEST: Final = 65_536  # [bytes] of a request for work
+_REQUESTS: Final = 1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
 _REMIND: Final = 60.0  # [s] between two messages about the same problem
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
@@ -249,12 +251,24 @@ def router_settings(
             f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
             "--trust-network if everyone on that network may read everything and pose as a worker"
         )
-    secured = bundle.settings("listen") | {"access_control": access_control(farm, bundle.roster())} if bundle else {}
+    secured: dict[str, object] = {}
+    if bundle:
+        secured = {**bundle.settings("listen"), **_limits(farm)}
+        secured["access_control"] = access_control(farm, bundle.roster())
     settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
     if routers:
         joined = bundle.settings("connect") if bundle else {}
         settings |= {"connect/endpoints": list(routers), **_RETRY, **joined}
     return settings
+
+
+def _limits(farm: str) -> dict[str, object]:
+    """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over one link."""
+    asked, common = keys.want(farm, "**"), {"flows": ["ingress"], "messages": ["put"]}
+    return {
+        "low_pass_filter": [{**common, "key_exprs": [asked], "size_limit": _REQUEST}],
+        "downsampling": [{**common, "rules": [{"key_expr": asked, "freq": _REQUESTS}]}],
+    }
 
 
 def listen(

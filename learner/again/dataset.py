@@ -39,7 +39,8 @@ from learner.scheduler.dispatcher import Dispatcher
 from learner.scheduler.membership import Admission
 from learner.scheduler.round import RoundResults, bits
 
-_PART: Final = 16 << 20  # [bytes] of a part's traces: a round's results are in memory, and two rounds at most
+PART: Final = 16 << 20
+"""Traces of a part [bytes]: a round's results are in memory, and two rounds at most."""
 _MOST: Final = 1000  # episodes of a part
 _REPEATED: Final = 50  # of so many episodes of other machines this one repeats one
 _VERSION: Final = 1
@@ -104,7 +105,7 @@ class DataSet:
           Stopped: it was asked to stop; the parts that are finished stay.
         """
         at = checkpoints.load(self.run.checkpoint)
-        work = _Work(self, restored(self.run, at), at, place.connect != ())
+        work = Work(self, restored(self.run, at), at, place.connect != ())
         if work.next < work.parts:
             with ExitStack() as stack:
                 link = stack.enter_context(connected(place, stopped))
@@ -125,7 +126,7 @@ class DataSet:
             work.file.unlink(missing_ok=True)
 
 
-class _Work:
+class Work:
     """The parts of a data set that are written, and the next one."""
 
     def __init__(self, of: DataSet, problem: Problem, at: Checkpoint, judged: bool) -> None:
@@ -136,7 +137,7 @@ class _Work:
         self.format = Format(of.path, problem.spec, _wire("tasks", config.task))
         self.file = of.path / "unfinished.json"
         size = int(np.prod(whole(problem.spec))) * 4
-        self._each = max(1, min(_MOST, _PART // size))
+        self._each = max(1, min(_MOST, PART // size))
         self.parts = -(-of.episodes // self._each)
         state = read(self.file) if self.file.exists() else {"done": [], "expelled": {}}
         self.done: list[dict[str, Any]] = state["done"]

@@ -28,7 +28,7 @@ from learner.scheduler.dispatcher import Stopped
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCommand(Link):
-    """Writes episodes of a learnt policy on perturbed starts as a data set in LeRobot's format; see docs/files.md.
+    """Writes episodes of a learnt policy as a data set in LeRobot's format; see docs/files.md.
 
     An interrupted command continues when it is repeated.
     """
@@ -37,8 +37,8 @@ class DatasetCommand(Link):
     """Folder of the run."""
     manifest: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Make the data set of this manifest.json again, and compare the bytes."""
-    out: Path
-    """Folder of the data set."""
+    out: Path | None = None
+    """Folder of the data set; needed."""
     episodes: int | None = setting(None, least=1, most=10_000_000)
     """Number of episodes; 1000 by default."""
     seed: int | None = setting(None, least=0, most=SEEDS - 1)
@@ -50,6 +50,8 @@ class DatasetCommand(Link):
         super().__post_init__()
         if (self.run is None) == (self.manifest is None):
             raise ConfigError("expected the folder of a run, or --from with a manifest.json")
+        if self.out is None:
+            raise ConfigError("expected --out with the folder of the data set")
         if self.manifest and (self.episodes or self.seed is not None):
             raise ConfigError("--from: the manifest says how many episodes, and their seed")
         if self.connect and self.workers:
@@ -72,6 +74,7 @@ def main(words: Sequence[str]) -> int:
     if not parquet.available():
         raise ConfigError(f"data sets are Parquet files; {parquet.INSTALL}")
     logs.set_up("WARNING")
+    assert command.out is not None
     if command.manifest is not None:
         of = read(command.manifest)
         data, run = DataSet(command.out, of["episodes"], of["seed"]), command.manifest.parent / "run"

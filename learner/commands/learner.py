@@ -45,7 +45,9 @@ def learn(
         place, connect=chosen.connect, farm=chosen.farm, record=chosen.record, log=chosen.log,
         listen=chosen.listen or place.listen, trusted=chosen.trust_network, mixed=chosen.mixed,
         numbers=chosen.numbers,
-        scheduler=SchedulerConfig(audit=chosen.audit, straggler_seconds=chosen.patience),
+        scheduler=SchedulerConfig(
+            audit=chosen.audit, straggler_seconds=chosen.patience, instances=chosen.instances
+        ),
         tls=chosen.bundle,
         serve=None if chosen.serve is None else options.address(chosen.serve),
     )  # fmt: skip

@@ -37,7 +37,7 @@ class _Party(NamedTuple):
 class _Check:
     answers: dict[_Party, bytes]
     passed: set[str] = field(default_factory=set)
-    """Workers that were asked and did not answer in time."""
+    """Hosts of which a worker was asked and did not answer in time."""
     asked: str = ""
     """The worker that has been asked and may still answer; empty if there is none."""
     since: float = 0.0
@@ -255,7 +255,7 @@ class Audit:
         queue = deque((name, self._party(name)) for name in workers)
         for index, check in list(self._checks.items()):
             if check.asked and now - check.since > patience:
-                check.passed.add(check.asked)
+                check.passed.add(host(check.asked))
                 check.asked = ""
             if check.asked or check.undecidable:
                 continue
@@ -263,7 +263,7 @@ class Audit:
             for _ in range(len(queue)):
                 name, party = queue[0]
                 queue.rotate(-1)
-                if party.canary == canary and party.host not in hosts and name not in check.passed:
+                if party.canary == canary and party.host not in hosts | check.passed:
                     check.asked, check.since = name, now
                     asked.setdefault(name, []).append(index)
                     break

@@ -80,8 +80,8 @@ class Dispatcher:
         self.notices = Notices(log)  # what was ignored, and why
         self._session, self._farm, self._stopped, self._sizes = session, farm, stopped, sizes
         self._measures, self._how_to_join, self._generations = measures, how_to_join, generations
-        self._attendance, self._roster = Attendance(), Roster(admission)
         config = scheduler or SchedulerConfig()
+        self._attendance, self._roster = Attendance(config.instances), Roster(admission)
         secret = np.random.default_rng(secrets.randbits(128))  # decides what is checked, and no number of the run
         self._ledger = Ledger(config, self._roster.canary if admission.mixed else None, secret)
         simulated = codec.encode(spec)

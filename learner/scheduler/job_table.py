@@ -11,6 +11,10 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
+from typing import Final
+
+_AT_FIRST: Final = 8  # workers of a host that are tried before one of them has sent a result
+_LATE: Final = 7  # a worker that is always late is tried once a minute
 
 
 @dataclass
@@ -25,6 +29,12 @@ class Worker:
     """Time of its last message about its jobs [s]."""
     proven: bool = False
     """It has sent a result."""
+    tried: bool = False
+    """It has been given a job."""
+    late: int = 0
+    """Rounds since its last result at whose end it was late."""
+    until: float = -math.inf
+    """While it is benched, its requests do not change that before this time [s]."""
     benched: bool = False
     """It failed at a job, or was late when a round ended: while there are other workers, it gets no jobs until it
     sends a message."""
@@ -38,10 +48,11 @@ class JobTable:
         self.workers: dict[str, Worker] = {}
         self.begin(0)
 
-    def begin(self, jobs: int, late: float = math.inf) -> None:
+    def begin(self, jobs: int, late: float = math.inf, now: float = 0.0) -> None:
         """Forget every job; 0..jobs-1 are pending, and no worker holds anything.
 
-        A worker that still holds a job sent before `late` [s] is benched.
+        A worker that still holds a job sent before `late` [s] is benched: each time that it has been late without a
+        result for twice as long, so that workers that only ask for jobs delay few rounds.
         """
         self.size = jobs
         # Jobs that are not done, and the workers expected to answer, in the order of issue.
@@ -54,7 +65,9 @@ class JobTable:
         self.full: dict[int, float] = {}  # all copies are out
         self.failed: dict[int, float] = {}  # no worker holds it after an error
         for worker in self.workers.values():
-            worker.benched |= min(worker.held.values(), default=math.inf) <= late
+            if min(worker.held.values(), default=math.inf) <= late:
+                worker.benched, worker.late = True, min(worker.late + 1, _LATE)
+                worker.until = now + 2.0 ** (worker.late - 1) - 1.0
             worker.held.clear()
 
     @property
@@ -71,6 +84,7 @@ class JobTable:
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
         taken: list[int] = []
+        self.workers[worker].tried = True
         pending, held, queue = self._pending, self.workers[worker].held, self.full if self.copies == 1 else self.out
         while pending and len(taken) < count:
             index = heapq.heappop(pending)
@@ -89,7 +103,7 @@ class JobTable:
             del holders[0]
         holders.append(worker)
         self.given[worker].add(index)
-        self.workers[worker].held[index] = now
+        self.workers[worker].held[index], self.workers[worker].tried = now, True
         queue = self.full if len(holders) >= self.copies else self.out
         queue[index] = now
 
@@ -105,7 +119,8 @@ class JobTable:
         state = self.workers.get(worker)
         if state is not None:
             held, state.benched = state.held, False
-            state.proven |= bool(indices)
+            if indices:
+                state.proven, state.late = True, 0
         done: list[bool] = []
         for index in indices:
             held.pop(index, None)
@@ -147,33 +162,59 @@ class JobTable:
         return count
 
     def free(self, most: int) -> list[tuple[int, str]]:
-        """Return a heap of (jobs held, worker) of the workers that may hold one more job.
-
-        Benched workers are left out, unless all are benched.
-        """
-        all_benched = all(state.benched for state in self.workers.values())
-        free = [
-            (len(state.held), name)
-            for name, state in self.workers.items()
-            if len(state.held) < min(state.credits, most) and (all_benched or not state.benched)
-        ]
+        """Return a heap of (jobs held, worker) of the workers that may hold one more job."""
+        free = [(held, name) for held, name in self.able() if held < min(self.workers[name].credits, most)]
         heapq.heapify(free)
         return free
 
-    def pick(self, index: int, free: list[tuple[int, str]], avoided: Container[str], most: int) -> str | None:
-        """Take from the heap the worker with the fewest jobs that is neither avoided nor holds this job, if any."""
-        passed: list[tuple[int, str]] = []
+    def able(self) -> list[tuple[int, str]]:
+        """Return (jobs held, worker) of the workers that take jobs at all.
+
+        Benched workers are left out, unless all are benched; and most new workers of a host that has few with results.
+        """
+        all_benched, wait = all(state.benched for state in self.workers.values()), self._waiting()
+        return [
+            (len(state.held), name)
+            for name, state in self.workers.items()
+            if state.credits and (all_benched or not state.benched) and name not in wait
+        ]
+
+    def _waiting(self) -> set[str]:
+        """Workers that are not tried yet, because too many of their host were, and have sent no result."""
+        new = [name for name, state in self.workers.items() if not state.proven]
+        if not new:
+            return set()
+        proven = Counter(name.partition("/")[0] for name, state in self.workers.items() if state.proven)
+        tried = Counter(name.partition("/")[0] for name in new if self.workers[name].tried)
+        wait: set[str] = set()
+        for name in (name for name in new if not self.workers[name].tried):
+            host = name.partition("/")[0]
+            if tried[host] < max(_AT_FIRST, proven[host]):
+                tried[host] += 1
+            else:
+                wait.add(name)
+        return wait
+
+    def spare(self, most: int) -> list[tuple[bool, int, str]]:
+        """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for a silent one."""
+        spare = [(not self.workers[name].proven, held, name) for held, name in self.free(most)]
+        heapq.heapify(spare)
+        return spare
+
+    def pick(self, index: int, spare: list[tuple[bool, int, str]], avoided: Container[str], most: int) -> str | None:
+        """Take from the heap the first worker that is neither avoided nor holds this job, if any."""
+        passed: list[tuple[bool, int, str]] = []
         picked = None
-        while free and picked is None:
-            held, name = heapq.heappop(free)
+        while spare and picked is None:
+            new, held, name = heapq.heappop(spare)
             if name in avoided or index in self.workers[name].held:
-                passed.append((held, name))
+                passed.append((new, held, name))
                 continue
             picked = name
             if held + 1 < min(self.workers[name].credits, most):
-                passed.append((held + 1, name))
+                passed.append((new, held + 1, name))
         for entry in passed:
-            heapq.heappush(free, entry)
+            heapq.heappush(spare, entry)
         return picked
 
     def hopeless(self, index: int, most: int) -> bool:

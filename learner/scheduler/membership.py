@@ -10,7 +10,6 @@ from farm.net.messages import WorkRequest
 from learner.scheduler.audit import host
 
 _MOST: Final = 10_000  # tokens; more workers than one learner can serve
-_MOST_OF_ONE: Final = 1000  # tokens per host name, so that one host cannot use up the limit for all
 _ASKING: Final = 1000  # workers whose request arrived before their token
 _SHOWN: Final = 8  # characters of a canary, as `farm status` shows them
 _SOON: Final = 3.0  # [s] within which the token must follow: token and request travel separately
@@ -58,7 +57,9 @@ class Admission:
 class Attendance:
     """Liveliness tokens of workers, and requests that arrived before their token."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = 1000) -> None:
+        """With at most this number of tokens per host name, so that one host cannot use up the limit for all."""
+        self._most = most
         self._there: set[str] = set()
         self._names: Counter[str] = Counter()
         self._early: dict[str, tuple[WorkRequest, float]] = {}
@@ -71,8 +72,8 @@ class Attendance:
         """
         if worker not in self._there:
             name = worker.partition("/")[0]
-            if len(self._there) >= _MOST or self._names[name] >= _MOST_OF_ONE:
-                raise MessageError(f"there are already {_MOST} workers, or {_MOST_OF_ONE} of its name", "absent")
+            if len(self._there) >= _MOST or self._names[name] >= self._most:
+                raise MessageError(f"there are already {_MOST} workers, or {self._most} of its name", "absent")
             self._there.add(worker)
             self._names[name] += 1
         return self._early.pop(worker, (None, 0.0))[0]

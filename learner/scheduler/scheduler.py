@@ -70,9 +70,8 @@ class Scheduler:
 
     @property
     def willing(self) -> list[str]:
-        """Names of the workers that take jobs, those with the fewest jobs first, then by name."""
-        loads = sorted((len(state.held), name) for name, state in self._table.workers.items() if state.credits)
-        return [name for _, name in loads]
+        """Names of the workers that may be given jobs, those with the fewest jobs first, then by name."""
+        return [name for _, name in sorted(self._table.able())]
 
     @property
     def reissued(self) -> int:
@@ -84,7 +83,7 @@ class Scheduler:
         if jobs < 0:
             raise ValueError(f"jobs is {jobs}, expected 0 or more")
         self._begun = True
-        self._table.begin(jobs, self._now - self._chunking.patience)
+        self._table.begin(jobs, self._now - self._chunking.patience, self._now)
         self._seen = -math.inf
 
     def want(self, worker: str, credits: int, now: float, *, idle: bool = False) -> None:
@@ -101,7 +100,7 @@ class Scheduler:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
         self._tick(now)
         state = self._table.workers.setdefault(worker, Worker(credits))
-        state.credits, state.benched = credits, False
+        state.credits, state.benched = credits, state.benched and self._now < state.until
         if idle:
             state.answered = self._now
             self._reissued += self._table.release(worker, self._now)
@@ -239,12 +238,12 @@ class Scheduler:
     def _again(self, queue: dict[int, float], size: int) -> list[Assignment]:
         """Issue failed or overdue jobs to workers that have room and do not hold them."""
         due = self._due(queue)
-        free = self._table.free(2 * size) if due else []
+        spare = self._table.spare(2 * size) if due else []
         chunks: dict[str, list[int]] = {}
         for index in due:
-            if not free:
+            if not spare:
                 break
-            name = self._table.pick(index, free, self._avoided(index), 2 * size)
+            name = self._table.pick(index, spare, self._avoided(index), 2 * size)
             if name is not None:
                 self._reissued += queue is not self._table.failed  # failed jobs were counted before
                 self._table.give(index, name, self._now)

@@ -75,8 +75,7 @@ def test_early_requests_are_checked_in_turn() -> None:
 
 
 def test_many_tokens_of_one_name_do_not_exclude_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(membership, "_MOST_OF_ONE", 2)
-    known = Attendance()
+    known = Attendance(2)
     for i in range(2):
         known.came(f"many/{i}")
     with pytest.raises(MessageError, match="of its name"):

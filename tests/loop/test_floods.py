@@ -1,0 +1,132 @@
+"""What a host with a certificate can send too much of, over TLS on loopback, and what a learner notices of it."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from made import pole
+
+import farm
+from farm import fingerprint
+from farm.commands import certificates
+from farm.net import codec, keys
+from farm.net.messages import WorkRequest
+from farm.net.session import connect, free_endpoint, listen
+from farm.net.tls import find
+from learner.run.launch import Placement, open_run
+from workers.config import WorkerConfig
+from workers.worker import Worker
+
+pytestmark = pytest.mark.slow
+SILENT = 300
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certificates") / "own"
+    certificates.main(["new", str(folder), "--learner", "127.0.0.1", "--worker", "a", "--worker", "silent"])
+    return folder
+
+
+def tls() -> str:
+    return free_endpoint().replace("tcp/", "tls/")
+
+
+def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> None:
+    endpoint, key = tls(), keys.want("farm", "a/1")
+    with listen(endpoint, "farm", find(certs, "learner")) as learner:
+        learner.subscribe("want", keys.want("farm", "**"))
+        with connect((endpoint,), None, lambda: False, find(certs, "worker", "a")) as host:
+            host.publish(key, b"first")
+            assert learner.events.get(10).payload == b"first"
+            begun, sent = time.monotonic(), 0
+            while time.monotonic() - begun < 1.0:
+                host.publish(key, b"x" * 100)
+                sent += 1
+            taken = time.monotonic() - begun
+            time.sleep(0.01)  # the filter's own pause, so that size alone can be the reason
+            host.publish(key, b"y" * 70_000)
+            time.sleep(0.01)
+            host.publish(key, b"last")
+            got = []
+            while not got or got[-1].payload != b"last":
+                got.append(learner.events.get(10))
+    assert sent > 10_000
+    assert len(got) < 1100 * taken
+    assert max(len(event.payload) for event in got) == 100
+
+
+@contextmanager
+def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
+    """Instances of one certificate that ask for jobs, and answer none."""
+    stop, there = threading.Event(), threading.Event()
+
+    def ask() -> None:
+        with connect((endpoint,), None, stop.is_set, find(certs, "worker", "silent")) as session:
+            names = [f"silent/{i}" for i in range(SILENT)]
+            for name in names:
+                session.token(keys.worker_token("farm", name))
+            while not stop.is_set():
+                for name in names:
+                    request = WorkRequest(
+                        worker=name, credits=128, idle=(), version=farm.__version__, canary=fingerprint.digest(),
+                        host="silent", cores=1,
+                    )  # fmt: skip
+                    session.publish(keys.want("farm", name), codec.encode(request))
+                    stop.wait(0.002)
+                there.set()
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        assert there.wait(60)
+        yield
+    finally:
+        stop.set()
+        thread.join(20)
+
+
+@contextmanager
+def honest(endpoint: str, certs: Path, file: Path) -> Iterator[None]:
+    config = WorkerConfig(connect=(endpoint,), tls=certs, name="a", allow_file=(file,))
+    stop = threading.Event()
+
+    def serve() -> None:
+        with connect(config.connect, None, stop.is_set, config.bundle) as session:
+            worker = Worker(config, session)
+            worker.join()
+            while not stop.is_set():
+                worker.turn()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(20)
+
+
+def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_path: Path) -> None:
+    file, hashes, late = pole(tmp_path / "mine"), [], 0
+    config = farm.configure(f"{file}:Pole", generations=200, pairs=15)
+    for name in ("alone", "flooded"):
+        place = Placement(listen=tls(), tls=find(certs, "learner"), record=False)
+        with open_run(config, tmp_path / name, place) as run, honest(place.listen, certs, file):
+            learning = run.learn()
+            next(learning)
+            if name == "alone":
+                for _ in learning:
+                    pass
+            else:
+                with silent_instances(place.listen, certs):
+                    before = time.monotonic()
+                    for _ in learning:
+                        late += time.monotonic() - before > 0.8  # patience is 1 s
+                        before = time.monotonic()
+        hashes.append(run.summary["parameters_sha256"])
+    assert hashes[0] == hashes[1]
+    assert late <= 15, f"{late} of 199 rounds were late, in {run.summary['seconds']} s"
