@@ -145,7 +145,10 @@ def completed(command: str, *words: str) -> list[str]:
 
 
 def script(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start a script of the checkout until it has read its arguments."""
+    """Start a script of the checkout until it has read its arguments; of `python -c` only the syntax is checked."""
+    if words[0] == "-c":
+        compile(words[1], "page", "exec")
+        return
     name = words[words.index("-m") + 1].replace(".", "/") + "/__main__.py" if "-m" in words else words[0]
     [path] = [each for each in (ROOT / name, ROOT / "examples" / name) if each.is_file()]
     monkeypatch.setattr(sys, "argv", [str(path), *words[2 if "-m" in words else 1 :]])
