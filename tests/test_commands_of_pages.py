@@ -118,6 +118,9 @@ def reader(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_command_is_accepted(words: str, whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if "--backend warp" in words:
         pytest.importorskip("mujoco_warp")
+    if words.startswith("python -c "):
+        compile(shlex.split(words)[2], "page", "exec")
+        return
     extras = set(re.findall(r"[\w-]+", "".join(re.findall(r"'\.\[(.*)\]'", words))))
     for name, value in STANDS_FOR.items():
         words = words.replace(name, value)
@@ -145,10 +148,7 @@ def completed(command: str, *words: str) -> list[str]:
 
 
 def script(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start a script of the checkout until it has read its arguments; of `python -c` only the syntax is checked."""
-    if words[0] == "-c":
-        compile(words[1], "page", "exec")
-        return
+    """Start a script of the checkout until it has read its arguments."""
     name = words[words.index("-m") + 1].replace(".", "/") + "/__main__.py" if "-m" in words else words[0]
     [path] = [each for each in (ROOT / name, ROOT / "examples" / name) if each.is_file()]
     monkeypatch.setattr(sys, "argv", [str(path), *words[2 if "-m" in words else 1 :]])
