@@ -48,7 +48,12 @@ _COMMON: Final = {
     "transport/link/rx/max_message_size": 64 * 1024 * 1024,
     "transport/shared_memory/enabled": False,
 }
-_ROUTER: Final = {"mode": "router", "transport/unicast/max_sessions": 4096, "transport/unicast/accept_pending": 1024}
+_ROUTER: Final = {
+    "mode": "router",
+    "transport/unicast/max_sessions": 4096,
+    # Connections that say nothing take 10 s and some 10 kB each; while there are so many, nobody else can join.
+    "transport/unicast/accept_pending": 8192,
+}
 _RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
 _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
@@ -375,12 +380,13 @@ def _open(settings: Mapping[str, object]) -> zenoh.Session:
 
 @contextmanager
 def _closing(session: zenoh.Session) -> Iterator[Session]:
-    with session:
-        opened = Session(session)
-        try:
-            yield opened
-        finally:
-            opened.close()
+    opened = Session(session)
+    try:
+        yield opened
+    finally:
+        opened.close()
+        with suppress(zenoh.ZError):  # it waits for connections that say nothing, and gives up
+            session.close()
 
 
 def _first_line(error: Exception) -> str:
