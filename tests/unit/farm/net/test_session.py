@@ -1,7 +1,9 @@
 """Real sessions on loopback."""
 
+import socket
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 
 from farm.net import keys
 from farm.net.session import Session, connect, free_endpoint, listen
@@ -30,3 +32,13 @@ def test_many_tokens_are_all_found() -> None:
 
         assert within(30, look), f"it waits for ever, or finds {[len(found) for found in seen.values()]}"
         assert all(len(set(found)) == MANY for found in seen.values())
+
+
+def test_connections_that_say_nothing_keep_nobody_out() -> None:
+    endpoint = free_endpoint()
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    with listen(endpoint, "farm"), ExitStack() as silent:
+        for _ in range(1500):
+            silent.enter_context(socket.create_connection((host, int(port))))
+        with connect((endpoint,), 5.0, lambda: False):
+            pass
