@@ -147,6 +147,7 @@ def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(
     assert evaluate(RunFolder.open(tmp_path / "3"), 100, 0)["perturbed"]["return_mean"] == runs[0]["robust_return"]
 
 
+@pytest.mark.slow
 def test_several_episodes_count_alike_for_any_workers_after_a_death_a_lie_and_a_resume(
     cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -173,6 +173,7 @@ def test_what_cannot_be_felt_is_one_line(pads: Any, shape: Any, said: str) -> No
 GRIPPER = Path(__file__).parents[4] / "examples/tasks/gripper.py"
 
 
+@pytest.mark.slow
 def test_a_gripper_learns_to_lift_and_is_recorded_with_its_pads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
