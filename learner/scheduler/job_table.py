@@ -39,6 +39,11 @@ class Worker:
     """It failed at a job, or was late when a round ended: while there are other workers, it gets no jobs until it
     sends a message."""
 
+    def bench(self, late: int, now: float) -> None:
+        """Give it no jobs for a time that doubles with the number of its late rounds."""
+        self.benched, self.late = True, min(late, _LATE)
+        self.until = now + 2.0 ** (self.late - 1) - 1.0
+
 
 class JobTable:
     """Jobs, workers, and the queues the jobs are in."""
@@ -52,7 +57,8 @@ class JobTable:
         """Forget every job; 0..jobs-1 are pending, and no worker holds anything.
 
         A worker that still holds a job sent before `late` [s] is benched: each time that it has been late without a
-        result for twice as long, so that workers that only ask for jobs delay few rounds.
+        result for twice as long, so that workers that only ask for jobs delay few rounds. Workers of one host that have
+        never sent a result are benched together, so that many of them delay no more rounds than one.
         """
         self.size = jobs
         # Jobs that are not done, and the workers expected to answer, in the order of issue.
@@ -64,11 +70,17 @@ class JobTable:
         self.out: dict[int, float] = {}  # one more copy is permitted
         self.full: dict[int, float] = {}  # all copies are out
         self.failed: dict[int, float] = {}  # no worker holds it after an error
-        for worker in self.workers.values():
+        times: dict[str, int] = {}  # how often a host's workers without a result were late
+        for name, worker in self.workers.items():
             if min(worker.held.values(), default=math.inf) <= late:
-                worker.benched, worker.late = True, min(worker.late + 1, _LATE)
-                worker.until = now + 2.0 ** (worker.late - 1) - 1.0
+                worker.bench(worker.late + 1, now)
+                if not worker.proven:
+                    host = name.partition("/")[0]
+                    times[host] = max(times.get(host, 0), worker.late)
             worker.held.clear()
+        for name, worker in self.workers.items():
+            if not worker.proven and (host := name.partition("/")[0]) in times:
+                worker.bench(times[host], now)
 
     @property
     def waiting(self) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from made import pole
 
@@ -129,4 +130,7 @@ def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_p
                         before = time.monotonic()
         hashes.append(run.summary["parameters_sha256"])
     assert hashes[0] == hashes[1]
-    assert late <= 15, f"{late} of 199 rounds were late, in {run.summary['seconds']} s"
+    tries = 4.0 + np.log2(
+        1.0 + run.summary["seconds"]
+    )  # of a host that never answers; the machine may delay two rounds
+    assert late <= tries, f"{late} of 199 rounds were late, in {run.summary['seconds']} s"
