@@ -79,6 +79,11 @@ def test_the_task_in_the_readme_is_the_one_that_new_task_writes() -> None:
     assert parts(shown) == parts((ROOT / "learner/commands/task_template.py.txt").read_text("utf-8"))
 
 
+def test_the_pendulum_of_the_examples_is_the_one_that_new_task_writes() -> None:
+    template, example = ROOT / "learner/commands/task_template.py.txt", ROOT / "examples/tasks/pendulum.py"
+    assert example.read_text("utf-8") == template.read_text("utf-8")
+
+
 def parts(source: str) -> list[str]:
     """The statements of a task's class, without its docstring, comments, or spaces between XML elements."""
     [task] = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]

@@ -69,6 +69,33 @@ def jobs(policy: Linear) -> Jobs:
     return Jobs.joined([Jobs.exploring(eps, (1, -1), drawn), Jobs.mean("control", [None])])
 
 
+class Either(Kicked):
+    """With one of two paddles."""
+
+    def models(self) -> list[str]:
+        """The second has a knob, so that its data have another layout."""
+        return [
+            self.xml,
+            self.xml.replace('mass="0.3"/>', 'mass="0.3"/><geom pos="0 0 -0.15" size="0.02" mass="0.1"/>'),
+        ]
+
+    def which(self, rng: np.random.Generator) -> int:
+        """Draw one."""
+        return int(rng.integers(2))
+
+
+def test_several_models_in_one_batch_are_mujocos_to_single_precision() -> None:
+    task = Either(TaskConfig())
+    policy = Linear(Linear.Config(), specification(task), {})
+    cpu, gpu = Runner(task, policy), Runner(task, policy, backend("warp").engine, exact=False)
+    theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
+    drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    expected, found = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)
+    assert set(expected.which) == {0, 1}
+    np.testing.assert_array_equal(found.which, expected.which)
+    np.testing.assert_allclose(found.returns, expected.returns, atol=2e-4)
+
+
 def test_returns_are_mujocos_to_single_precision(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
