@@ -95,11 +95,11 @@ def still(task: str, seed: int, _: int) -> float:
     return trial.score(np.zeros(trial.size))
 
 
-def constant(task: str, seed: int, _: int) -> float:
-    """The best of random constant actions."""
+def constant(task: str, seed: int, _: int, tries: int = 300, starts: int = 10) -> float:
+    """The best of random constant actions, each tried on some starts."""
     trial = Rollouts(task, seed, policy="constant")
-    thetas = np.random.default_rng(seed).uniform(-1.0, 1.0, (300, trial.size))
-    returns = sum(trial(thetas) for _ in range(10))
+    thetas = np.random.default_rng(seed).uniform(-1.0, 1.0, (tries, trial.size))
+    returns = sum(trial(thetas) for _ in range(starts))
     return trial.score(thetas[int(np.argmax(returns))])
 
 
