@@ -119,7 +119,7 @@ def film(run: Path, path: Path, policy: LoadedPolicy) -> None:
             large.seek(at)
             frames.append(large.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
         duration = 2 * large.info["duration"]
-    palette = frames[len(frames) // 2].quantize(COLOURS, dither=Image.Dither.NONE)
+    palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
 

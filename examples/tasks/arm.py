@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from farm import Task
+from farm import Camera, Task
 from farm.elementary import cos, exp, sin
 
 
@@ -13,7 +13,6 @@ class Arm(Task):
       <option timestep="0.005"/>
       <worldbody>
         <light pos="0 0 2"/>
-        <camera pos="0.15 -0.35 1" xyaxes="1 0 0 0 0.9 0.44"/>
         <geom type="plane" size="0.5 0.5 0.1" pos="0 0 -0.05" rgba="0.85 0.85 0.85 1"/>
         <body name="ball" mocap="true" pos="0.3 0 0">
           <geom type="sphere" size="0.02" rgba="0.9 0.5 0.1 1" contype="0" conaffinity="0"/>
@@ -34,6 +33,7 @@ class Arm(Task):
       </actuator>
     </mujoco>"""
     steps, substeps = 100, 5  # 2.5 s
+    camera = Camera(lookat=(0.15, 0.0, 0.0), distance=1.3, azimuth=90.0, elevation=-65.0)
 
     def reset(self, sim, row, rng):
         sim.qpos[row] = [0.0, 1.0]
