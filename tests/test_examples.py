@@ -63,7 +63,8 @@ SEARCHES = {
 """Examples of other packages' searches on a pool of workers, and the package that each needs."""
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "cma_es" else pytest.mark.slow) for n in SEARCHES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEARCHES)
 def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str) -> None:
     if importlib.util.find_spec(SEARCHES[name]) is None:
         pytest.skip(f"{SEARCHES[name]} is not installed")

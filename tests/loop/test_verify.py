@@ -16,6 +16,7 @@ from learner.commands import verify as command
 from learner.run.launch import Placement, open_run
 
 
+@pytest.mark.slow
 def test_a_whole_run_is_repeated_on_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = farm.configure(f"{pole(tmp_path)}:Pole", generations=4, pairs=3)
     for _ in farm.learn(config, tmp_path / "r", workers=1):
