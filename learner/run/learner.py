@@ -190,7 +190,7 @@ class Learner:
         return dispatcher.collect()
 
     def _expelled(self, dispatcher: Dispatcher) -> None:
-        """Save who is expelled, so that no resume admits or believes them.
+        """Save the expelled hosts, so that no resume admits or believes them.
 
         Raises:
           RolledBack: their numbers are in the state.

@@ -8,14 +8,13 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
+from learning import workers
 from ways import way
 
 import farm
-from farm.net.session import connect, free_endpoint
+from farm.net.session import free_endpoint
 from learner.run.config import configure
 from learner.run.launch import Placement, open_run
-from workers.config import WorkerConfig
-from workers.worker import Worker
 
 ROOT = f"{Path(farm.__file__).parents[1]}/"  # of the packages, which may be installed
 PACKAGES = tuple(ROOT + package for package in ("farm/", "workers/", "learner/"))
@@ -32,7 +31,7 @@ def calls(folder: Path, generations: int) -> list[Call]:
             seen.append((code.co_filename.removeprefix(ROOT), code.co_qualname))
 
     config, endpoint = configure("finger-gait", pairs=2, generations=generations), free_endpoint()
-    with profiled(note), open_run(config, folder, Placement(listen=endpoint)) as run, working(endpoint):
+    with profiled(note), open_run(config, folder, Placement(listen=endpoint)) as run, workers(endpoint, 1):
         seen.clear()
         for _ in run.learn():
             pass
@@ -49,27 +48,6 @@ def profiled(note: Callable[[FrameType, str, object], None]) -> Iterator[None]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-
-
-@contextmanager
-def working(endpoint: str) -> Iterator[None]:
-    """A worker on a thread of this process."""
-    stop = threading.Event()
-
-    def serve() -> None:
-        with connect((endpoint,), None, stop.is_set) as session:
-            worker = Worker(WorkerConfig(connect=(endpoint,), name="w"), session)
-            worker.join()
-            while not stop.is_set():
-                worker.turn()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(20)
 
 
 def station(call: Call) -> tuple[str, str]:

@@ -27,7 +27,7 @@ EPISODES = 7
 
 
 class Hosts:
-    """Instead of the dispatcher: a host per part, whose results are changed, and who is expelled in which part."""
+    """In place of a dispatcher: the host of each part, changes of its results, and the hosts expelled in each part."""
 
     def __init__(self, work: Work, change: Callable[[int, Any], Any], expelled: dict[int, str]) -> None:
         self._work, self._change, self._expelled = work, change, expelled
