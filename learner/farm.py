@@ -134,7 +134,7 @@ class Farm:
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
         self._holder: int | None = None  # the thread of the current call
         with ExitStack() as stack:
-            session = stack.enter_context(connected(self._place, self._closed.is_set))
+            session = stack.enter_context(connected(self._place, self._problem, self._closed.is_set))
             admission = Admission(numbers or fingerprint.digest())
             name = f"pool-{secrets.token_hex(4)}"
             self._dispatcher, self._pool = dispatch(

@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,27 +25,30 @@ class Event:
 
 
 class Events:
-    """A first-in, first-out queue of limited size; further events are dropped.
+    """A first-in, first-out queue of limited size, for each key and in all; further events are dropped.
 
     Not a SimpleQueue: if a signal arrives just before the timeout, Python 3.11's may wait forever.
     """
 
     def __init__(self) -> None:
         self._events: deque[Event] = deque()
+        self._of: Counter[str] = Counter()  # events by key
         self._came = threading.Condition()
         self._bytes = self.dropped = 0
 
-    def put(self, event: Event, *, wake: bool = True) -> None:
-        """Append an event unless the queue is full.
+    def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> None:
+        """Append an event unless the queue is full, or has `most` with this key.
 
         Liveliness events have twice the room, because they are never repeated.
         """
-        size = _size(event)
+        size, message = _size(event), bool(event.payload)
         with self._came:
-            if self._bytes + size > (_BACKLOG if event.payload else 2 * _BACKLOG):
+            full = self._bytes + size > (_BACKLOG if message else 2 * _BACKLOG)
+            if full or (most is not None and self._of[event.key] >= most):
                 self.dropped += 1
                 return
             self._bytes += size
+            self._of[event.key] += 1
             self._events.append(event)
             if wake:
                 self._came.notify()
@@ -70,6 +73,7 @@ class Events:
                 self._came.wait_for(lambda: self._events, timeout)
             events = [self._events.popleft() for _ in range(min(most, len(self._events)))]
             self._bytes -= sum(map(_size, events))
+            self._of -= Counter(event.key for event in events)
         return events
 
     def __len__(self) -> int:

@@ -38,6 +38,8 @@ _JOIN_S: Final = 1.0
 _REQUEST: Final = 65_536  # [bytes] of a request for work
 _REQUESTS: Final = 1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
 _REMIND: Final = 60.0  # [s] between two messages about the same problem
+_LARGEST: Final = 64 * 1024 * 1024  # [bytes] of a message
+_RECEIVE: Final = "transport/link/rx/max_message_size"
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -45,7 +47,7 @@ _COMMON: Final = {
     "transport/link/tx/lease": _LEASE_MS,
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
     "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 300_000,
-    "transport/link/rx/max_message_size": 64 * 1024 * 1024,
+    _RECEIVE: _LARGEST,
     "transport/shared_memory/enabled": False,
 }
 _ROUTER: Final = {
@@ -123,12 +125,12 @@ class Session:
             priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
         )
 
-    def subscribe(self, topic: str, key: str, *, wake: bool = True) -> None:
+    def subscribe(self, topic: str, key: str, *, wake: bool = True, most: int | None = None) -> None:
         """Put everything published on the key into `events` under the topic's name.
 
-        Without `wake`, a thread that waits for events is not woken; it gets the event with the next one.
+        Without `wake`, a thread that waits for events is not woken. Of each sender, `most` wait to be read.
         """
-        callback = self._callback(self._put(topic, wake=wake))
+        callback = self._callback(self._put(topic, wake=wake, most=most))
         self._declared.append(_as_daemon(lambda: self._session.declare_subscriber(key, callback)))
 
     def watch(self, topic: str, key: str) -> None:
@@ -191,10 +193,11 @@ class Session:
         for over in self._over:
             over.wait(_JOIN_S)
 
-    def _put(self, topic: str, *, wake: bool = True) -> Callable[[zenoh.Sample], None]:
+    def _put(self, topic: str, *, wake: bool = True, most: int | None = None) -> Callable[[zenoh.Sample], None]:
         def put(sample: zenoh.Sample) -> None:
             alive = sample.kind == zenoh.SampleKind.PUT
-            self.events.put(Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive), wake=wake)
+            event = Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive)
+            self.events.put(event, wake=wake, most=most)
 
         return put
 
@@ -277,16 +280,17 @@ def _limits(farm: str) -> dict[str, object]:
 
 
 def listen(
-    endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = ()
-) -> AbstractContextManager[Session]:
-    """A session that workers connect to; for the arguments see `router_settings`.
+    endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = (),
+    largest: int = _LARGEST,
+) -> AbstractContextManager[Session]:  # fmt: skip
+    """A session that workers connect to; `largest` is as in `connect`, for the others see `router_settings`.
 
     Raises:
       ConfigError: an endpoint is malformed, open to other machines without certificates, or its port in use.
     """
     settings = router_settings(endpoint, farm, bundle, trusted=trusted, routers=routers)
     try:
-        return _closing(_open(settings))
+        return _closing(_open(settings | {_RECEIVE: largest}))
     except zenoh.ZError as error:
         raise ConfigError(
             f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? "
@@ -317,8 +321,9 @@ def _raise_descriptors() -> None:
 
 
 def connect(
-    endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None
-) -> AbstractContextManager[Session]:
+    endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None, *,
+    largest: int = _LARGEST,
+) -> AbstractContextManager[Session]:  # fmt: skip
     """A session connected to a learner or a router; keeps trying until one answers.
 
     Args:
@@ -326,13 +331,14 @@ def connect(
       bundle: our certificates, for tls endpoints.
       timeout: give up after this time [s]; None: never.
       stopped: called between attempts; true ends them.
+      largest: bytes of the largest message to receive, 64 MiB by default; Zenoh drops larger ones unread.
 
     Raises:
       FarmError: no answer in time; Interrupted: it was stopped.
     """
     for endpoint in endpoints:
         check_endpoint(endpoint, encrypted=bundle is not None)
-    settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": []}
+    settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": [], _RECEIVE: largest}
     if bundle is not None:
         settings |= bundle.settings("connect")
     return _closing(_try(settings, endpoints, timeout, stopped, bundle))

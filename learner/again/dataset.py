@@ -108,7 +108,7 @@ class DataSet:
         work = Work(self, restored(self.run, at), at, place.connect != ())
         if work.next < work.parts:
             with ExitStack() as stack:
-                link = stack.enter_context(connected(place, stopped))
+                link = stack.enter_context(connected(place, work.problem, stopped))
                 admission = Admission(fingerprint.digest(), work.expelled)
                 name = f"dataset-{secrets.token_hex(4)}"
                 dispatcher, _ = dispatch(

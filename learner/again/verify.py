@@ -138,7 +138,7 @@ def workers(run: Stored, place: Placement | None, stopped: Callable[[], bool]) -
             runner = stack.enter_context(closing(run.problem.runner()))
             yield lambda mu, jobs, seen: runner.run(mu, jobs, "none", seen)
             return
-        link, name = stack.enter_context(connected(place, stopped)), f"verify-{secrets.token_hex(4)}"
+        link, name = stack.enter_context(connected(place, run.problem, stopped)), f"verify-{secrets.token_hex(4)}"
         admission, count = Admission(fingerprint.digest()), itertools.count()
         dispatcher, _ = dispatch(stack, link, place, run.problem, name, admission, run.last, stopped)
 

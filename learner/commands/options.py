@@ -55,7 +55,7 @@ class LearnerOptions(Listening):
     """Share of the jobs that a second host repeats as a check; hosts with wrong answers are expelled; 0: no checks."""
     patience: float = setting(1.0, above=0.0, most=1e6)
     """Least time before a job also goes to a second worker [s]; increase it for slow devices."""
-    instances: int = setting(1000, least=1, most=10_000)
+    instances: int = setting(500, least=1, most=10_000)
     """Largest number of workers of one host name, that is of one certificate."""
     quiet: bool = False
     """Print only warnings and the final result."""

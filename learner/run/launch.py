@@ -28,7 +28,6 @@ from farm.net.tls import Bundle
 from farm.processes import LocalWorkers
 from farm.sim.model_files import by_digest
 from farm.sim.trajectory import Trajectory
-from farm.tasks.outcomes import whole
 from learner.algorithms import Diverged
 from learner.loggers.base import Loggers
 from learner.recording.files import set_aside
@@ -225,7 +224,7 @@ def open_run(
             problem, at = start(config, folder.name, numbers=place.numbers)
         if place.workers:
             problem.runner().close()  # reports early what no worker could simulate
-        link = stack.enter_context(connected(place, stopped))
+        link = stack.enter_context(connected(place, problem, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:
             RunFolder.create(path, config)
@@ -278,13 +277,10 @@ def dispatch(
         link.answer(keys.code(place.farm, name, digest), partial(bytes, source))
     for digest, content in by_digest(problem.task.sources).items():
         link.answer(keys.asset(place.farm, name, digest), partial(bytes, content))
-    trace = whole(problem.spec) if steps else problem.spec.trace
-    shapes = trace, problem.spec.shapes(len(problem.scene.bodies))
-    count = len(problem.spec.measures)
     join = None if place.workers else how_to_join(place, problem)
     spec, judge = problem.specification(name), stack.enter_context(closing(Judge(problem)))
     dispatcher = Dispatcher(
-        link, place.farm, spec, generations, join, tend, admission, shapes, place.scheduler, count, judge
+        link, place.farm, spec, generations, join, tend, admission, problem.shapes(steps=steps), place.scheduler, judge
     )
     if place.workers:
         flags = [*_worker_flags(place, problem), "--backend", place.backend]
@@ -328,11 +324,12 @@ def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[]
             raise taken
 
 
-def connected(place: Placement, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
-    """A session for the placement: one that listens, or one connected to a router."""
+def connected(place: Placement, problem: Problem, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
+    """A session for results of the problem: one that listens, or one connected to a router."""
+    largest = problem.shapes(steps=True).largest_message
     if place.connect:
-        return session.connect(place.connect, None, stopped, place.tls)
-    return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted)
+        return session.connect(place.connect, None, stopped, place.tls, largest=largest)
+    return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted, largest=largest)
 
 
 def _worker_flags(place: Placement, problem: Problem) -> list[str]:

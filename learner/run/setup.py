@@ -18,6 +18,7 @@ from farm.rollouts import Runner, build_policy, build_task, draw_constants
 from farm.sim.model_files import Files, split
 from farm.sim.scene import Scene
 from farm.tasks.base import Task, TaskSpec
+from farm.tasks.outcomes import whole
 from farm.tasks.probe import specification
 from farm.tasks.standard import nominal
 from learner import algorithms
@@ -28,6 +29,7 @@ from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
+from learner.scheduler.round import Shapes
 
 MESSAGE_LIMIT: Final = 32 << 20
 """Largest size of a mean in a message [bytes]; a chunk also holds eps."""
@@ -46,6 +48,14 @@ class Problem:
     def scene(self) -> Scene:
         """The scene to draw."""
         return Scene.of(self.task.simulated)
+
+    def shapes(self, *, steps: bool = False) -> Shapes:
+        """What results look like; with `steps` traces of that kind."""
+        spec = self.spec
+        return Shapes(
+            trace=whole(spec) if steps else spec.trace, frame=spec.shapes(len(self.scene.bodies)),
+            observation=spec.observation, measures=len(spec.measures), substeps=self.task.substeps,
+        )  # fmt: skip
 
     def specification(self, run: str) -> Spec:
         """The specification for workers."""

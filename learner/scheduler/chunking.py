@@ -34,7 +34,7 @@ class SchedulerConfig(Settings):
     """Largest number of workers that hold the same job; 1 means no copies."""
     max_errors: int = setting(3, least=1)
     """Number of hosts on which one job must fail before the run stops."""
-    instances: int = setting(1000, least=1, most=10_000)
+    instances: int = setting(500, least=1, most=10_000)
     """Largest number of workers of one name, that is of one certificate."""
     audit: float = setting(0.02, least=0.0, most=1.0)
     """Share of the jobs that a second host repeats, if there is one; 0: no spot checks."""

@@ -7,7 +7,7 @@ import hashlib
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -27,7 +27,7 @@ from learner.scheduler.judging import Judge, Judging
 from learner.scheduler.ledger import Ledger
 from learner.scheduler.membership import Admission, Attendance
 from learner.scheduler.roster import Roster
-from learner.scheduler.round import RoundResults
+from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import SchedulerConfig
 from learner.scheduler.status import StatusAnswer
 
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 _WAIT: Final = 0.2  # [s] at most between two checks whether to stop
 _ASK: Final = 0.5  # [s] timeout of a query for one token
 _LOOKS: Final = 5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
-_CHUNK: Final = 32 << 20  # [bytes] of eps in one message, unless one job alone has more
+_RESULTS: Final = 100  # unread results of one worker, which has a few chunks at a time
 _PATIENCE: Final = 3.0  # [s] without workers before the user is warned
 
 
@@ -56,9 +56,8 @@ class Dispatcher:
         how_to_join: str | None,
         stopped: Callable[[], bool],
         admission: Admission,
-        sizes: tuple[tuple[int, int], Mapping[str, tuple[int, ...]]],
+        shapes: Shapes,
         scheduler: SchedulerConfig | None = None,
-        measures: int = 0,
         judge: Judge | None = None,
     ) -> None:
         """Show the run on the network: subscriptions first, the liveliness token last.
@@ -71,15 +70,14 @@ class Dispatcher:
           how_to_join: the command that starts workers, shown when there are none; None if they are local.
           stopped: called regularly; if it returns true, `collect` raises Stopped.
           admission: decides which workers may take part.
-          sizes: shape of a trace, and of a frame of each of a trajectory's arrays.
+          shapes: of the results.
           scheduler: how jobs are cut into chunks, and when they are sent again.
-          measures: number of the task's measures.
           judge: decides between hosts whose answers differ; without one, other hosts do.
         """
         self.run, self.admission = spec.run, admission
         self.notices = Notices(log)  # what was ignored, and why
-        self._session, self._farm, self._stopped, self._sizes = session, farm, stopped, sizes
-        self._measures, self._how_to_join, self._generations = measures, how_to_join, generations
+        self._session, self._farm, self._stopped, self._shapes = session, farm, stopped, shapes
+        self._how_to_join, self._generations = how_to_join, generations
         config = scheduler or SchedulerConfig()
         self._attendance, self._roster = Attendance(config.instances), Roster(admission)
         secret = np.random.default_rng(secrets.randbits(128))  # decides what is checked, and no number of the run
@@ -93,7 +91,7 @@ class Dispatcher:
         self._progress: GenerationStats | None = None
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
         session.subscribe("want", keys.want(farm, "**"))
-        session.subscribe("result", keys.result(farm, self.run, "**"))
+        session.subscribe("result", keys.result(farm, self.run, "**"), most=_RESULTS)
         session.watch("worker", keys.worker_token(farm, "**"))
         session.answer(keys.spec(farm, self.run), lambda: simulated)
         session.answer(keys.generation(farm, self.run), lambda: codec.encode(self._header))
@@ -151,8 +149,8 @@ class Dispatcher:
             normaliser=normaliser, terms=terms,
         )  # fmt: skip
         header = codec.encode(self._header)
-        observed = normaliser.shape[-1]
-        self._ledger.begin(RoundResults(jobs, traces, *self._sizes, observed, measures=self._measures, terms=terms))
+        observed = normaliser.shape[-1] > 0
+        self._ledger.begin(RoundResults(jobs, traces, self._shapes, observed=observed, terms=terms))
         self._judging.begin(self._header, self._ledger.round)
         self._session.publish(keys.generation(self._farm, self.run), header)  # back to back with the jobs
         self._send(self._ledger.due(time.monotonic()))
@@ -285,6 +283,12 @@ class Dispatcher:
 
     def _result(self, event: Event) -> None:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
+        if sender in self._roster.refused:
+            self.notices.ignore("refused", f"of {sender}, which is not admitted")
+            return
+        if not self._ledger.scheduler.given(sender):  # before it is decoded: a flood must cost little
+            self.notices.ignore("unasked", f"of {sender}, which has no jobs of this round")
+            return
         try:
             message: Results | Failure = codec.decode(event.payload, Results)
         except MessageError as first:
@@ -296,8 +300,6 @@ class Dispatcher:
                 raise first from None
         if message.worker != sender or message.run != self.run:
             self.notices.ignore("foreign", f"of {message.worker} on {event.key}")
-        elif message.worker in self._roster.refused:
-            self.notices.ignore("refused", f"of {message.worker}, which is not admitted")
         elif (message.incarnation, message.round) != (self.incarnation, self._header.round):
             self.notices.ignored["stale"] += 1
         elif isinstance(message, Failure):
@@ -353,11 +355,9 @@ class Dispatcher:
         """Send jobs, by worker, to their inboxes."""
         # Without block: a frozen host must not delay the others; deadlines cover lost messages.
         head = {"run": self.run, "incarnation": self.incarnation, "round": self._header.round}
-        size = self._header.mu.nbytes + self._header.normaliser.nbytes  # of a job's eps, and of its results
-        most = max(1, _CHUNK // max(1, size))
         for worker, indices in jobs:
-            for first in range(0, len(indices), most):
-                chunk = Chunk.carrying(self._ledger.round.jobs.take(indices[first : first + most]), **head)
+            for some in self._ledger.round.messages(indices):
+                chunk = Chunk.carrying(self._ledger.round.jobs.take(some), **head)
                 self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)
 
     def _refresh_status(self) -> None:

@@ -39,6 +39,10 @@ class Worker:
     """It failed at a job, or was late when a round ended: while there are other workers, it gets no jobs until it
     sends a message."""
 
+    def holds(self, late: float) -> bool:
+        """Whether it holds a job sent before `late` [s]."""
+        return min(self.held.values(), default=math.inf) <= late
+
     def bench(self, late: int, now: float) -> None:
         """Give it no jobs for a time that doubles with the number of its late rounds."""
         self.benched, self.late = True, min(late, _LATE)
@@ -72,7 +76,7 @@ class JobTable:
         self.failed: dict[int, float] = {}  # no worker holds it after an error
         times: dict[str, int] = {}  # how often a host's workers without a result were late
         for name, worker in self.workers.items():
-            if min(worker.held.values(), default=math.inf) <= late:
+            if worker.holds(late):
                 worker.bench(worker.late + 1, now)
                 if not worker.proven:
                     host = name.partition("/")[0]
@@ -184,22 +188,20 @@ class JobTable:
 
         Benched workers are left out, unless all are benched; and most new workers of a host that has few with results.
         """
-        all_benched, wait = all(state.benched for state in self.workers.values()), self._waiting()
-        return [
-            (len(state.held), name)
-            for name, state in self.workers.items()
-            if state.credits and (all_benched or not state.benched) and name not in wait
-        ]
+        ready = [(name, state) for name, state in self.workers.items() if not state.benched]
+        ready = ready or list(self.workers.items())
+        wait = self._waiting([name for name, state in ready if not (state.proven or state.tried)])
+        return [(len(state.held), name) for name, state in ready if state.credits and name not in wait]
 
-    def _waiting(self) -> set[str]:
-        """Workers that are not tried yet, because too many of their host were, and have sent no result."""
-        new = [name for name, state in self.workers.items() if not state.proven]
+    def _waiting(self, new: list[str]) -> set[str]:
+        """Those of the new workers that are not tried yet, because too many of their host were and sent no result."""
         if not new:
             return set()
-        proven = Counter(name.partition("/")[0] for name, state in self.workers.items() if state.proven)
-        tried = Counter(name.partition("/")[0] for name in new if self.workers[name].tried)
+        others = [(name.partition("/")[0], state) for name, state in self.workers.items()]
+        proven = Counter(host for host, state in others if state.proven)
+        tried = Counter(host for host, state in others if state.tried and not state.proven)
         wait: set[str] = set()
-        for name in (name for name in new if not self.workers[name].tried):
+        for name in new:
             host = name.partition("/")[0]
             if tried[host] < max(_AT_FIRST, proven[host]):
                 tried[host] += 1
@@ -207,9 +209,18 @@ class JobTable:
                 wait.add(name)
         return wait
 
-    def spare(self, most: int) -> list[tuple[bool, int, str]]:
-        """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for a silent one."""
-        spare = [(not self.workers[name].proven, held, name) for held, name in self.free(most)]
+    def spare(self, most: int, late: float) -> list[tuple[bool, int, str]]:
+        """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for a silent one.
+
+        Those without a result that have been late, or hold a job sent before `late` [s], are left out: a copy that
+        they hold is missed only after a long time. But not if all workers are like that.
+        """
+        silent = {
+            name for name, state in self.workers.items() if not state.proven and (state.late or state.holds(late))
+        }
+        if len(silent) == len(self.workers):
+            silent.clear()
+        spare = [(not self.workers[name].proven, held, name) for held, name in self.free(most) if name not in silent]
         heapq.heapify(spare)
         return spare
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from farm.net.work import Jobs, Results
 from learner.scheduler.audit import Audit
-from learner.scheduler.round import RoundResults
+from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import Scheduler, SchedulerConfig, Verdict
 
 
@@ -17,7 +17,7 @@ class Ledger:
         """Start without a round; `canary` and `rng` are as in `Audit`."""
         self.scheduler = Scheduler(config)
         self.audit = Audit(config.audit, rng, canary)
-        self.round = RoundResults(Jobs.exploring(np.empty((0, 0)), (1,), None), "none", (0, 0), {})
+        self.round = RoundResults(Jobs.exploring(np.empty((0, 0)), (1,), None), "none", Shapes(trace=(0, 0), frame={}))
         """The round's jobs and results; before the first round there are none."""
 
     def begin(self, results: RoundResults) -> None:

@@ -57,7 +57,7 @@ class Admission:
 class Attendance:
     """Liveliness tokens of workers, and requests that arrived before their token."""
 
-    def __init__(self, most: int = 1000) -> None:
+    def __init__(self, most: int = 500) -> None:
         """With at most this number of tokens per host name, so that one host cannot use up the limit for all."""
         self._most = most
         self._there: set[str] = set()

@@ -1,13 +1,48 @@
 """A round's jobs and their results: one array per quantity, over all rollouts in the order of the jobs. Pure."""
 
-from collections.abc import Mapping
-from typing import NamedTuple
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.net.work import Jobs, Results, Simulated, traced
 from farm.sim.trajectory import Trajectory
+
+_MESSAGE: Final = 8 << 20  # [bytes] of jobs, and of their results, in one message, unless one job alone has more
+_SPARE: Final = 1 << 20  # [bytes] of whatever else is in a message, such as a traceback
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shapes:
+    """What results of a run look like."""
+
+    trace: tuple[int, int]
+    """Control steps of a rollout, and numbers per step of its trace"""
+    frame: Mapping[str, tuple[int, ...]]
+    """Shape of a frame of each of a trajectory's arrays"""
+    observation: int = 0
+    """Size d of the observation"""
+    measures: int = 0
+    """Number M of the task's measures"""
+    substeps: int = 1
+    """Physics steps of a control step"""
+
+    def answer_bytes(self, *, trajectory: bool = True, traced: bool = True) -> int:
+        """At most so many bytes answer one job: two rollouts, their traces, and a trajectory at physics rate."""
+        terms = int(np.prod(self.frame.get("terms", (0,))))
+        numbers = 8 * (2 + 1 + 2 * self.observation + self.measures + terms) + 4  # returns, steps, moments...; flags
+        frame = 8 + 4 * sum(int(np.prod(shape)) for shape in self.frame.values())
+        trace = 4 * self.trace[0] * self.trace[1]
+        frames = self.trace[0] * self.substeps + 1
+        return 2 * (numbers + traced * trace) + trajectory * frames * frame
+
+    @property
+    def largest_message(self) -> int:
+        """No answer has more bytes: the jobs of a message with one more, the traces of its best and worst rollout."""
+        return _MESSAGE + 2 * self.answer_bytes() + _SPARE
 
 
 class RoundResults:
@@ -17,11 +52,9 @@ class RoundResults:
         self,
         jobs: Jobs,
         traces: str,
-        trace: tuple[int, int],
-        shapes: Mapping[str, tuple[int, ...]],
-        observation: int = 0,
+        shapes: Shapes,
         *,
-        measures: int = 0,
+        observed: bool = False,
         terms: bool = False,
     ) -> None:
         """Allocate the arrays.
@@ -29,29 +62,30 @@ class RoundResults:
         Args:
           jobs: all jobs of the round, by index.
           traces: which traces workers must send, one of TRACES.
-          trace: shape of a trace: control steps, numbers per step.
-          shapes: shape of a frame of each of a trajectory's arrays.
-          observation: size d of the observation, if its moments are collected; else 0.
-          measures: number M of the task's measures.
+          shapes: of the results.
+          observed: whether workers must send the moments of the observations.
           terms: whether workers must send each reward term's part of the returns.
         """
-        self.jobs, self._traces, self._trace, self._shapes = jobs, traces, trace, shapes
+        self.jobs, self._traces, self._trace, self._shapes = jobs, traces, shapes.trace, shapes.frame
         self._rollouts, self._seen = jobs.rollouts, jobs.seen
         self._exploring = np.repeat(~self._seen, self._rollouts)
         self._starts = [0, *np.cumsum(self._rollouts).tolist()]  # first row of each job, and the end
         self._trajectories: dict[int, Trajectory] = {}
-        count = len(self._exploring)
+        count, measures = len(self._exploring), shapes.measures
+        whole = traces in ("all", "steps")  # the two traces of `extremes` are one message's, not a job's
+        seen, plain = (shapes.answer_bytes(trajectory=one, traced=whole) for one in (True, False))
+        self._bytes = np.maximum(np.where(self._seen, seen, plain), jobs.eps.nbytes // max(1, len(jobs.eps)))
         self.returns: FloatArray = np.zeros(count)
         """(S,)"""
         self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
         """success, ended, failed, clamped, (S, 4)"""
         self.steps: IntArray = np.zeros(count, dtype=np.int64)
         """Control steps, (S,)"""
-        self.moments: FloatArray = np.zeros((count, 1 + 2 * observation) if observation else (0, 0))
+        self.moments: FloatArray = np.zeros((count, 1 + 2 * shapes.observation) if observed else (0, 0))
         """Moments of the observations, as in `farm.moments`, (S, 1 + 2 d), or (0, 0)"""
         self.measures: FloatArray = np.zeros((count, measures) if measures else (0, 0))
         """Of the task's measures, (S, M), or (0, 0)"""
-        self.terms: FloatArray = np.zeros((count, *shapes["terms"]) if terms else (0, 0))
+        self.terms: FloatArray = np.zeros((count, *shapes.frame["terms"]) if terms else (0, 0))
         """Each reward term's part of the return, (S, K), or (0, 0)"""
         self.done: BoolArray = np.zeros(len(jobs), dtype=bool)
         """Jobs whose results have arrived, (J,)"""
@@ -61,6 +95,13 @@ class RoundResults:
     def __len__(self) -> int:
         """Number of jobs."""
         return len(self.jobs)
+
+    def messages(self, jobs: Sequence[int]) -> Iterator[Sequence[int]]:
+        """Cut jobs into messages, so that no message, and no answer to one, is much larger than the others."""
+        message = np.cumsum(self._bytes[list(jobs)]) // _MESSAGE
+        ends = [0, *(np.flatnonzero(np.diff(message)) + 1).tolist(), len(jobs)]
+        for first, end in itertools.pairwise(ends):
+            yield jobs[first:end]
 
     def rows(self, job: int) -> slice:
         """Rows of a job's rollouts."""

@@ -121,6 +121,10 @@ class Scheduler:
             errors.pop(worker, None)
         return self.lost(worker)
 
+    def given(self, worker: str) -> bool:
+        """Whether it was given jobs of this round."""
+        return bool(self._table.given.get(worker))
+
     def results(self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0) -> list[Verdict]:
         """Note the results in a message, simulated in some seconds (0: not measured); return a verdict for each.
 
@@ -238,7 +242,7 @@ class Scheduler:
     def _again(self, queue: dict[int, float], size: int) -> list[Assignment]:
         """Issue failed or overdue jobs to workers that have room and do not hold them."""
         due = self._due(queue)
-        spare = self._table.spare(2 * size) if due else []
+        spare = self._table.spare(2 * size, self._now - self._chunking.patience) if due else []
         chunks: dict[str, list[int]] = {}
         for index in due:
             if not spare:

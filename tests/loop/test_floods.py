@@ -60,6 +60,24 @@ def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> Non
     assert max(len(event.payload) for event in got) == 100
 
 
+def test_results_larger_than_any_of_the_run_are_dropped_unread(certs: Path, tmp_path: Path) -> None:
+    file = pole(tmp_path / "mine")
+    place = Placement(listen=tls(), tls=find(certs, "learner"), record=False)
+    with open_run(farm.configure(f"{file}:Pole", generations=5000, pairs=15), tmp_path / "run", place) as run:
+        learning, key = run.learn(), keys.result("farm", "run", "silent/1")
+        with (
+            connect((place.listen,), None, lambda: False, find(certs, "worker", "silent")) as liar,
+            honest(place.listen, certs, file),
+        ):
+            next(learning)
+            liar.publish(key, b"x" * 20_000_000)
+            liar.publish(key, b"small")
+            next(learning)
+            while not run.dispatcher.notices.ignored["unasked"]:
+                next(learning)
+            assert run.dispatcher.notices.ignored == {"unasked": 1}
+
+
 @contextmanager
 def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
     """Instances of one certificate that ask for jobs, and answer none."""

@@ -27,6 +27,18 @@ def test_first_come_first_served() -> None:
         events.get(timeout=0.001)
 
 
+def test_a_sender_that_floods_leaves_room_for_the_others() -> None:
+    events = Events()
+    for _ in range(3):
+        for _ in range(1000):
+            events.put(event(1), most=10)
+        events.put(event(2), most=10)
+        assert events.waiting(0.0) == [event(1)] * 10 + [event(2)]
+    assert events.dropped == 3 * 990
+    events.put(event(1), most=10)
+    assert len(events) == 1
+
+
 def test_a_waiting_thread_is_woken() -> None:
     events = Events()
     threading.Timer(0.05, events.put, [event(1)]).start()

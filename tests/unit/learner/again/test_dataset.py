@@ -35,8 +35,7 @@ class Hosts:
         self.admission, self.parts = SimpleNamespace(expelled={}), list[int]()
 
     def begin(self, part: int, mu: np.ndarray, jobs: Jobs, traces: str, seen: np.ndarray, *, terms: bool) -> None:
-        spec, scene = self._work.problem.spec, self._work.problem.scene
-        self.round = RoundResults(jobs, traces, whole(spec), spec.shapes(len(scene.bodies)), terms=terms)
+        self.round = RoundResults(jobs, traces, self._work.problem.shapes(steps=True), terms=terms)
         given = self._runner.run(mu, jobs, traces, seen, terms=terms)
         said = self._change(part, Results.carrying(given, jobs, 0.0, run="r", incarnation="i", round=0, worker="w/1"))
         place = self.round.place(said)

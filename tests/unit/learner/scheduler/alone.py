@@ -68,8 +68,7 @@ class Alone:
     ) -> None:
         self.rounds.append((generation, jobs, traces))
         self.normalisers.append(normaliser)
-        shapes = self.problem.spec.shapes(len(self.problem.scene.bodies))
-        self._round = RoundResults(jobs, traces, self.problem.spec.trace, shapes, normaliser.shape[-1])
+        self._round = RoundResults(jobs, traces, self.problem.shapes(), observed=normaliser.shape[-1] > 0)
         for some in np.array_split(self._rng.permutation(len(jobs)), 3):
             part = jobs.take(sorted(some.tolist()))
             given = self._runner.run(mu, part, traces, normaliser)

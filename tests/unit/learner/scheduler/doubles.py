@@ -14,7 +14,7 @@ from farm.net.session import Session
 from farm.net.work import Chunk, Failure, Jobs, Results, traced
 from learner.scheduler.dispatcher import Dispatcher
 from learner.scheduler.membership import Admission
-from learner.scheduler.round import RoundResults
+from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import SchedulerConfig
 
 FARM, RUN, TRACE = "try", "r", (3, 4)
@@ -119,7 +119,7 @@ class Learner:
             join,
             stopped or self.stop.is_set,
             Admission(canary),
-            (TRACE, SHAPES),
+            Shapes(trace=TRACE, frame=SHAPES),
             scheduler,
         )
         return self.dispatcher

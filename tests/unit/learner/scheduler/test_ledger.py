@@ -7,7 +7,7 @@ from doubles import PATIENT, jobs
 
 from farm.net.work import Results
 from learner.scheduler.ledger import Ledger
-from learner.scheduler.round import RoundResults
+from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import SchedulerConfig
 
 AUDITED = replace(PATIENT, audit=1.0)
@@ -28,7 +28,7 @@ def begun(count: int, *workers: str, config: SchedulerConfig = PATIENT) -> Ledge
     assert not ledger.over
     for worker in workers:
         ledger.scheduler.want(worker, 2, 0.0)
-    ledger.begin(RoundResults(jobs(count), "none", (3, 4), {}))
+    ledger.begin(RoundResults(jobs(count), "none", Shapes(trace=(3, 4), frame={})))
     return ledger
 
 

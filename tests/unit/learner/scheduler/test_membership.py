@@ -91,7 +91,7 @@ def test_names_and_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     known = Attendance()
     for name in ("a/1", "b/1"):
         known.came(name)
-    with pytest.raises(MessageError, match="there are already 2 workers, or 1000 of its name"):
+    with pytest.raises(MessageError, match="there are already 2 workers, or 500 of its name"):
         known.came("c/1")
     known.came("b/1")
     for name in ("d/1", "e/1"):

@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from farm.net import codec
 from farm.net.work import Jobs, Results, traced
 from farm.sim.trajectory import Trajectory
-from learner.scheduler.round import RoundResults
+from learner.scheduler.round import RoundResults, Shapes
 
 TRACE = (3, 5)
-SHAPES = {"bodies": (2, 7), "actions": (1,), "terms": (2,), "channels/angle": (1,)}
+FRAME = {"bodies": (2, 7), "actions": (1,), "terms": (2,), "channels/angle": (1,)}
 PAIRS = 12
 LAST = PAIRS + 1
 RETURNS = np.random.default_rng(0).integers(0, 4, 2 * PAIRS).astype(float)  # many are equal
@@ -30,7 +31,7 @@ JOBS = Jobs.joined(
 
 
 def begun(traces: str, trace: tuple[int, int] = TRACE) -> RoundResults:
-    return RoundResults(JOBS, traces, trace, SHAPES)
+    return RoundResults(JOBS, traces, Shapes(trace=trace, frame=FRAME))
 
 
 def message(indices: Sequence[int], traces: str) -> Results:
@@ -124,7 +125,7 @@ def test_results_of_other_shapes_do_not_fit() -> None:
 
 
 def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
-    round_ = RoundResults(JOBS, "none", TRACE, SHAPES, 2)
+    round_ = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME, observation=2), observed=True)
     assert round_.place(message([0], "none")) is None, "it has none"
     for job in (1, 0, PAIRS):
         sent = message([job], "none")
@@ -136,14 +137,14 @@ def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
         round_.put(sent, place, np.ones(1, bool))
     assert round_.moments[:4, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
     assert round_.moments[round_.rows(PAIRS), 0].tolist() == [PAIRS + 1.0]
-    plain, sent = RoundResults(JOBS, "none", TRACE, SHAPES), message([0], "none")
+    plain, sent = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME)), message([0], "none")
     assert plain.place(sent) is not None
     assert plain.place(replace(sent, moments=np.zeros((2, 5)))) is None, "moments were not requested"
 
 
 @pytest.mark.parametrize("changed", ["returns", "flags", "steps", "moments"])
 def test_answers_differ_by_any_number_that_counts(changed: str) -> None:
-    round_ = RoundResults(JOBS, "none", TRACE, SHAPES, 2)
+    round_ = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME, observation=2), observed=True)
     said = message([0, 1], "none")
     said = replace(said, moments=np.ones((4, 5)))
     place = round_.place(said)
@@ -158,7 +159,7 @@ def test_answers_differ_by_any_number_that_counts(changed: str) -> None:
 
 
 def test_measures_and_terms_belong_to_results_that_were_asked_for_them() -> None:
-    round_ = RoundResults(JOBS, "none", TRACE, SHAPES, measures=3, terms=True)
+    round_ = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME, measures=3), terms=True)
     plain = message([0, LAST], "none")
     assert round_.place(plain) is None
     own = replace(plain, measures=np.arange(9.0).reshape(3, 3), terms=np.ones((3, 2)))
@@ -172,3 +173,26 @@ def test_measures_and_terms_belong_to_results_that_were_asked_for_them() -> None
     for wrong in ({"measures": np.zeros((3, 2))}, {"terms": np.zeros((3, 3))}, {"measures": np.empty((0, 0))}):
         assert round_.place(replace(own, **wrong)) is None
     assert begun("none").place(own) is None, "nobody asked for them"
+
+
+def test_jobs_are_cut_into_messages_whose_answers_are_not_too_large() -> None:
+    shapes = Shapes(trace=(1000, 100), frame=FRAME, substeps=10)
+    trace, pair = 4 * 1000 * 100, Jobs.exploring(np.zeros((100, 3)), (1, -1), None)
+    all_traces = [list(some) for some in RoundResults(pair, "all", shapes).messages(range(100))]
+    assert sum(all_traces, []) == list(range(100))
+    assert {len(some) for some in all_traces[:-1]} <= {10, 11}, "8 MiB / 800 kB"
+    assert [list(some) for some in RoundResults(pair, "extremes", shapes).messages([3, 4, 9])] == [[3, 4, 9]]
+    seen = RoundResults(Jobs.mean("physics", [None] * 100), "none", shapes)
+    assert len(list(seen.messages(range(100)))) == 10, "10 001 frames of 80 bytes each"
+    assert shapes.largest_message == (9 << 20) + 2 * (2 * (trace + 44) + 10_001 * 80)
+    large = RoundResults(Jobs.exploring(np.zeros((6, 1_000_000)), (1,), None), "none", shapes)
+    assert [len(some) for some in large.messages(range(6))] == [1] * 6, "8 MB of eps each"
+
+
+def test_no_answer_is_larger_than_said() -> None:
+    shapes = Shapes(trace=TRACE, frame=FRAME)
+    for job in (0, PAIRS):
+        for traces in ("none", "all"):
+            spare = len(codec.encode(replace(message([job], traces), traces=TRACES[:0]))) if traces == "none" else 0
+            sent = len(codec.encode(message([job], traces)))
+            assert sent <= shapes.answer_bytes() + 1000 + spare

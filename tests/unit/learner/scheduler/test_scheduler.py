@@ -398,6 +398,20 @@ def test_a_worker_that_hung_at_the_end_of_a_round_is_not_waited_for_again():
     assert given(scheduler.assign(1.4)) == {"a": [0], "b": [1]}
 
 
+def test_no_copy_goes_to_a_worker_that_was_late_and_has_never_answered():
+    scheduler = started(2, ["a", "silent"], credits=1)
+    assert given(scheduler.assign(0.0)) == {"a": [0], "silent": [1]}
+    scheduler.results("a", [0], 0.1)
+    assert given(scheduler.assign(1.0)) == {"a": [1]}
+    scheduler.results("a", [1], 1.1)
+    scheduler.begin(2)
+    scheduler.want("silent", 9, 1.2)
+    assert given(scheduler.assign(1.2)) == {"a": [0], "silent": [1]}
+    assert scheduler.assign(2.5) == [], "a has no room, and silent has for both"
+    scheduler.results("a", [0], 2.6)
+    assert given(scheduler.assign(2.6)) == {"a": [1]}
+
+
 def test_the_last_worker_is_asked_again():
     scheduler = started(1, ["a"])
     scheduler.assign(0.0)

@@ -11,7 +11,7 @@ from farm.net import codec
 from farm.net.messages import Refusal
 from farm.net.work import Chunk, Results
 from learner.scheduler.audit import Audit
-from learner.scheduler.round import RoundResults
+from learner.scheduler.round import RoundResults, Shapes
 
 ALL = PATIENT.__class__(straggler_seconds=60.0, audit=1.0)
 
@@ -133,7 +133,7 @@ def test_one_host_alone_is_not_checked(learner: Learner, hire: Hire, names) -> N
 
 
 def filled(returns: FloatArray) -> RoundResults:
-    results = RoundResults(jobs(len(returns)), "none", (0, 0), {})
+    results = RoundResults(jobs(len(returns)), "none", Shapes(trace=(0, 0), frame={}))
     results.returns[:] = np.repeat(returns, 2)
     return results
 
