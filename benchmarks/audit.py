@@ -1,14 +1,17 @@
 """Measures the cost of spot checks: rollouts/s of two hosts, in turn without and with checks; one table.
 
-    python benchmarks/audit.py [--generations 60] [--repeats 5]
+    python benchmarks/audit.py [--repeats 3]
 
-Two workers with different host names on this machine learn the finger gait as `farm run` does, without recording.
+Two workers with different host names on this machine learn the finger gait as `farm run` does, without recording. The
+rate is that of the generations until both hosts have passed 240 checks, and of as many after them.
 """
 
 import argparse
+import math
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,41 +22,57 @@ from learner.run.config import RunConfig, configure
 from learner.run.launch import Placement, open_run
 from learner.scheduler.scheduler import SchedulerConfig
 
-AUDITS = (0.0, 0.02, 0.1)
+EARNED = 240  # checks that a host passes before it counts as known: `learner.scheduler.audit`
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--generations", type=int, default=60)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    print("| pairs | --audit | rollouts/s | ratio to no checks |\n|---|---|---|---|")
+    print("| pairs | hosts | checks per generation | rollouts/s | ratio to no checks |\n|---|---|---|---|---|")
     for pairs in (15, 100):
-        config = configure(pairs=pairs, generations=max(10, arguments.generations * 15 // pairs))
-        rates = np.array([[_rate(config, audit) for audit in AUDITS] for _ in range(arguments.repeats)])
-        for audit, column in zip(AUDITS, rates.T, strict=True):
-            print(
-                f"| {pairs} | {audit:g} | {np.median(column):.0f} | {np.median(column / rates[:, 0]):.3f} |", flush=True
-            )
+        turns: dict[str, list[tuple[float, float]]] = {"without checks": [], "new": [], "known": []}
+        for _ in range(arguments.repeats):
+            times, checks = _learnt(configure(pairs=pairs, generations=10_000), 0.02, math.inf)
+            new = next(at for at, count in enumerate(checks) if count >= EARNED)
+            without, _ = _learnt(configure(pairs=pairs, generations=new), 0.0, new)
+            turns["without checks"].append((_rate(without), 0.0))
+            turns["new"].append((_rate(times[: new + 1]), checks[new] / new))
+            turns["known"].append((_rate(times[new:]), (checks[-1] - checks[new]) / new))
+        base = np.array(turns["without checks"])[:, 0]
+        for what, column in turns.items():
+            rates, each = np.array(column).T
+            figures = f"{2 * np.median(each):.1f} | {2 * pairs * np.median(rates):.0f} | {np.median(rates / base):.3f}"
+            print(f"| {pairs} | {what} | {figures} |", flush=True)
 
 
-def _rate(config: RunConfig, audit: float) -> float:
-    """Exploring rollouts per second, without the first tenth of the generations."""
+def _rate(times: Sequence[float]) -> float:
+    """Generations per second, without the first ones."""
+    first = len(times) // 10 + 1
+    return (len(times) - 1 - first) / (times[-1] - times[first])
+
+
+def _learnt(config: RunConfig, audit: float, most: float) -> tuple[list[float], list[int]]:
+    """The time after each generation [s], and how many checks the host with the fewest had passed by then.
+
+    The run ends when it has learnt as many generations with known hosts as with new ones, or this number.
+    """
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
     flags = ["--connect", place.listen, "--log-level", "WARNING"]
-    times: list[float] = []
+    times, checks, known = list[float](), list[int](), 0
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder) / "run", place) as run:
         with (
             LocalWorkers(1, [*flags, "--name", "a"], dict(os.environ)),
             LocalWorkers(1, [*flags, "--name", "b"], dict(os.environ)),
         ):
-            for report in run.learn():
+            for _ in run.learn():
                 times.append(time.perf_counter())
-                last = report.progress
-    begun = len(times) // 10
-    done = last.rollouts / last.generation * (len(times) - 1 - begun)
-    return done / (times[-1] - times[begun])
+                checks.append(min(run.dispatcher.checks.values(), default=0))
+                known = known or (len(times) if checks[-1] >= EARNED else 0)
+                if len(times) == (2 * known or most):
+                    break
+    return times, checks
 
 
 if __name__ == "__main__":
