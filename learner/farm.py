@@ -10,6 +10,7 @@ import logging
 import secrets
 import threading
 import weakref
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from learner.run.launch import Placement, check_workers, connected, dispatch
 from learner.run.setup import problem
 from learner.scheduler.dispatcher import Stopped
 from learner.scheduler.membership import Admission
+from learner.scheduler.round import RoundResults
 from learner.scheduler.scheduler import SchedulerConfig
 
 log = logging.getLogger(__name__)
@@ -175,7 +177,7 @@ class Farm:
             return np.empty(0)
         with self._turn():
             self._begin(Jobs.exploring(theta, (1,), drawn))
-            return self._dispatcher.collect().returns.copy()
+            return self._collected().returns.copy()
 
     def evaluate(
         self,
@@ -206,7 +208,7 @@ class Farm:
             return Evaluated(none, own, flags if spec.success else None, flags, none.astype(int), terms, empty)
         with self._turn():
             self._begin(Jobs.exploring(theta, (1,), drawn), "all" if traces else "none", terms=True)
-            found = self._dispatcher.collect()
+            found = self._collected()
         return Evaluated(
             returns=found.returns,
             measures=found.measures if spec.measures else np.zeros((count, 0)),
@@ -230,7 +232,7 @@ class Farm:
         with self._turn():
             self._begin(jobs)
             yielded = np.full(len(jobs), np.nan)  # the answers of an expelled host are discarded
-            for results in self._dispatcher.progress():
+            for results in self._progress():
                 for index in np.flatnonzero(results.done & (results.returns != yielded)).tolist():
                     yielded[index] = results.returns[index]
                     yield index, float(yielded[index])
@@ -243,7 +245,7 @@ class Farm:
         drawn = self._seeds(None if seed is None else [seed], 1)
         with self._turn():
             self._begin(Jobs.single(one, "physics", None if drawn is None else drawn[0]))
-            trajectory = self._dispatcher.collect().trajectory(0)
+            trajectory = self._collected().trajectory(0)
         assert trajectory is not None
         return trajectory
 
@@ -290,6 +292,17 @@ class Farm:
             raise RunError("the pool is closed")
         self._round += 1
         self._dispatcher.begin(self._round, np.zeros(self.size), jobs, traces, terms=terms)
+
+    def _progress(self) -> Iterator[RoundResults]:
+        """The round after each batch of results; this machine checks a host on a farm that no other host can check."""
+        yield from self._dispatcher.progress()
+        while self._place.connect and self._dispatcher.check_the_rest():
+            yield from self._dispatcher.progress()
+
+    def _collected(self) -> RoundResults:
+        """The whole round's results."""
+        results = deque(self._progress(), maxlen=1)
+        return results[0]
 
     def _parameters(self, thetas: Any) -> FloatArray:  # noqa: ANN401
         expected = f"expected numbers of shape (B, {self.size})"

@@ -330,26 +330,30 @@ class Dispatcher:
 
     def _failed(self, failure: Failure) -> None:
         if failure.index is None:
-            self._does_not_serve(failure)
+            self._decline(failure.worker, failure.error, failure.traceback)
             return
         if not 0 <= failure.index < len(self._ledger.round):
             self.notices.ignored["bad"] += 1
             return
         self.notices.once(f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback)
         if self._ledger.scheduler.error(failure.worker, failure.index, time.monotonic()):
+            if self._judging.right(failure.index, self.admission.canary) is not None:
+                for worker in self._ledger.scheduler.failed_at(failure.index):
+                    self._decline(worker, f"it failed at job {failure.index}, which this machine can do")
+                return
             seed = self._ledger.round.jobs.take([failure.index]).seeds()[0]
             raise RunError(
                 f"job {failure.index} of generation {self._header.generation} (seed {seed}) failed wherever it was "
                 f"tried, last with {failure.error}"
             )
 
-    def _does_not_serve(self, failure: Failure) -> None:
-        """A connected worker cannot build the task, or may not serve it; a different one may."""
-        if failure.worker in self._ledger.scheduler.workers:
-            self.notices.once(f"worker {failure.worker} does not serve this run: {failure.error}", failure.traceback)
-            self._ledger.scheduler.refused(failure.worker)
-            self._ledger.lost(failure.worker)
-            self._roster.decline(failure.worker, failure.error)
+    def _decline(self, worker: str, reason: str, traceback: tuple[str, ...] = ()) -> None:
+        """A connected worker cannot build the task, or may not serve it, or fails; a different one may be better."""
+        if worker in self._ledger.scheduler.workers:
+            self.notices.once(f"worker {worker} does not serve this run: {reason}", traceback)
+            self._ledger.scheduler.refused(worker)
+            self._ledger.lost(worker)
+            self._roster.decline(worker, reason)
 
     def _send(self, jobs: Iterable[tuple[str, Sequence[int]]]) -> None:
         """Send jobs, by worker, to their inboxes."""
@@ -370,18 +374,12 @@ class Dispatcher:
         if flood:
             self.notices.ignored["flood"] = flood
         return RunStatus(
-            run=self.run,
-            generation=self._header.generation,
-            generations=self._generations,
+            run=self.run, generation=self._header.generation, generations=self._generations,
             return_mean=last.return_mean if last else None,
             mean_policy_return=last.mean_policy_return if last else None,
-            open=self._ledger.scheduler.remaining,
-            reissued=self.reissued,
-            refused=len(self._roster.reasons),
-            ignored=dict(self.notices.ignored),
-            workers=self.census(),
-            numbers=self.admission.canary,
-        )
+            open=self._ledger.scheduler.remaining, reissued=self.reissued, refused=len(self._roster.reasons),
+            ignored=dict(self.notices.ignored), workers=self.census(), numbers=self.admission.canary,
+        )  # fmt: skip
 
     def _end_if_nobody_can_come(self) -> None:
         """Say how workers join if there are none.

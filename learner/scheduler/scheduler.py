@@ -174,6 +174,10 @@ class Scheduler:
             self._table.workers[worker].answered = self._now
         return counts and self._table.hopeless(index, self._config.max_errors)
 
+    def failed_at(self, index: int) -> list[str]:
+        """The workers that have failed at a job."""
+        return list(self._table.errors[index])
+
     def assign(self, now: float) -> list[Assignment]:
         """Return the chunks to send now, within the credits, and count them as sent.
 

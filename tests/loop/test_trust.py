@@ -3,7 +3,9 @@
 import hashlib
 import re
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from made import pole
 from rerun.chunk import RrdReader
 
+import farm
 from farm import fingerprint
 from farm.commands import certificates
 from farm.errors import MessageError
@@ -21,7 +24,7 @@ from farm.net import codec
 from farm.net.messages import WorkRequest
 from farm.net.session import Session, connect, free_endpoint, listen
 from farm.net.tls import find
-from farm.net.work import Results
+from farm.net.work import Failure, Results
 from learner.commands import learner as learner_command
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
@@ -254,6 +257,49 @@ def test_what_no_second_host_can_check_is_checked_before_the_result_is_final(
     assert list(checkpoints.load(run.learner.folder.checkpoint).expelled) == ["liar"]
     with opened(config, tmp_path / "liar-alone", place, resume=True) as run, host(place.listen, certs, "a", file):
         assert finished(run) == honest
+
+
+def test_hosts_that_only_say_that_jobs_fail_stop_no_run(
+    certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    place, file, liars = checked(tls(), certs, 0.0), file_of(config), ("b", "c", "liar")
+    failed, everywhere = defaultdict[int, set[str]](set), threading.Event()
+
+    def failing(said: Results) -> Failure:
+        job = int(said.jobs[0])
+        failed[job].add(said.worker)
+        if len(failed[job]) == len(liars):
+            everywhere.set()
+        where = {"run": said.run, "incarnation": said.incarnation, "round": said.round, "worker": said.worker}
+        return Failure(**where, index=job, error="ValueError: made up")
+
+    with opened(config, tmp_path / "r", place) as run, ExitStack() as hosts:
+        for name in liars:
+            hosts.enter_context(host(place.listen, certs, name, file, Late(failing, 2)))
+        with ThreadPoolExecutor(1) as pool:
+            learnt = pool.submit(finished, run)
+            assert everywhere.wait(30)
+            hosts.enter_context(host(place.listen, certs, "a", file))
+            assert learnt.result(60) == honest
+    told = (re.match(r"worker (\w+)/\S+ does not serve this run: it failed at job", line) for line in caplog.messages)
+    assert {each[1] for each in told if each} == set(liars)
+
+
+def test_a_pool_checks_a_lone_host_before_it_gives_out_returns(certs: Path, config: RunConfig) -> None:
+    endpoint, file = tls(), file_of(config)
+    with listen(endpoint, "farm", find(certs, "learner")), ExitStack() as hosts:
+        pool = hosts.enter_context(farm.Farm(config.task, connect=endpoint, tls=certs))
+        thetas = np.random.default_rng(0).normal(size=(5, pool.size))
+        with farm.Farm(config.task, workers=1) as own:
+            right = own.map(thetas, seeds=range(5))
+        came = pool.imap(thetas, seeds=range(5))
+        liar = hosts.enter_context(ExitStack())
+        liar.enter_context(host(endpoint, certs, "liar", file, LIES["the last bit"]))
+        wrong = [next(came) for _ in range(5)]
+        hosts.enter_context(host(endpoint, certs, "a", file))
+        assert dict(came) == dict(enumerate(right.tolist())), "later returns count"
+        assert all(value != right[index] for index, value in wrong)
+        assert pool.map(thetas, seeds=range(5)).tobytes() == right.tobytes()
 
 
 class Late:
