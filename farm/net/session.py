@@ -1,9 +1,9 @@
 """Zenoh sessions as the farm uses them; the only module that uses zenoh.
 
-The settings here were measured: see docs/protocol.md. Every subscription has a callback, on its own
-thread, that moves samples into the application's queue, so that the link is always drained. The
-thread that reads the queue owns all state and does all the publishing. (Zenoh's channels would work
-too, but a thread that waits for one wakes up ten times per second.)
+The settings here were measured: see docs/protocol.md. Every subscription has a callback, on its own thread, that moves
+samples into the application's queue, so that the link is always drained. The thread that reads the queue owns all state
+and does all the publishing. (Zenoh's channels would work too, but a thread that waits for one wakes up ten times per
+second.)
 """
 
 import ipaddress
