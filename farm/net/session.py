@@ -2,8 +2,7 @@
 
 The settings here were measured: see docs/protocol.md. Every subscription has a callback, on its own thread, that moves
 samples into the application's queue, so that the link is always drained. The thread that reads the queue owns all state
-and does all the publishing. (Zenoh's channels would work too, but a thread that waits for one wakes up ten times per
-second.)
+and does all the publishing. (A thread that waits for one of Zenoh's channels wakes up ten times per second.)
 """
 
 import ipaddress
