@@ -248,7 +248,7 @@ def main() -> None:
                 rows.append(row | {"score": round(done.result(), 4)})
                 with given.out.open("a") as file:
                     file.write(json.dumps(rows[-1]) + "\n")
-    print("\n".join(table(row for row in rows if row["rollouts"] == given.rollouts)))
+    print("\n".join(table(row for row in rows if row["rollouts"] == given.rollouts and row["seed"] < given.seeds)))
 
 
 if __name__ == "__main__":
