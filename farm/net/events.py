@@ -32,7 +32,7 @@ class Events:
 
     def __init__(self) -> None:
         self._events: deque[Event] = deque()
-        self._of: Counter[str] = Counter()  # events by key
+        self._counts: Counter[str] = Counter()  # of queued events, by key
         self._came = threading.Condition()
         self._bytes = self.dropped = 0
 
@@ -41,14 +41,14 @@ class Events:
 
         Liveliness events have twice the room, because they are never repeated.
         """
-        size, message = _size(event), bool(event.payload)
+        size = _size(event)
         with self._came:
-            full = self._bytes + size > (_BACKLOG if message else 2 * _BACKLOG)
-            if full or (most is not None and self._of[event.key] >= most):
+            full = self._bytes + size > (_BACKLOG if event.payload else 2 * _BACKLOG)
+            if full or (most is not None and self._counts[event.key] >= most):
                 self.dropped += 1
                 return
             self._bytes += size
-            self._of[event.key] += 1
+            self._counts[event.key] += 1
             self._events.append(event)
             if wake:
                 self._came.notify()
@@ -73,7 +73,7 @@ class Events:
                 self._came.wait_for(lambda: self._events, timeout)
             events = [self._events.popleft() for _ in range(min(most, len(self._events)))]
             self._bytes -= sum(map(_size, events))
-            self._of -= Counter(event.key for event in events)
+            self._counts -= Counter(event.key for event in events)
         return events
 
     def __len__(self) -> int:

@@ -35,7 +35,7 @@ class Judge:
             self._runner = self._runner or self._problem.runner()
             first, again = (self._runner.run(mu, job, "none", normaliser, terms=terms) for _ in range(2))
         except Exception as error:  # a task may need what only the workers' machines have
-            log.warning("this machine cannot tell who is right (%s: %s)", type(error).__name__, error)
+            log.warning("the learner's machine cannot repeat this job (%s: %s)", type(error).__name__, error)
             return None
         if bits(first, slice(None)) != bits(again, slice(None)):
             log.warning("the same rollout has other numbers when it is repeated: farm check TASK shows where")

@@ -337,7 +337,8 @@ class Dispatcher:
             return
         self.notices.once(f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback)
         if self._ledger.scheduler.error(failure.worker, failure.index, time.monotonic()):
-            if self._judging.right(failure.index, self.admission.canary) is not None:
+            mine = None if self.admission.mixed else self._judging.right(failure.index, self.admission.canary)
+            if mine is not None:  # with devices, this machine's simulation says nothing about theirs
                 for worker in self._ledger.scheduler.failed_at(failure.index):
                     self._decline(worker, f"it failed at job {failure.index}, which this machine can do")
                 return

@@ -39,7 +39,7 @@ class Worker:
     """It failed at a job, or was late when a round ended: while there are other workers, it gets no jobs until it
     sends a message."""
 
-    def holds(self, late: float) -> bool:
+    def overdue(self, late: float) -> bool:
         """Whether it holds a job sent before `late` [s]."""
         return min(self.held.values(), default=math.inf) <= late
 
@@ -76,7 +76,7 @@ class JobTable:
         self.failed: dict[int, float] = {}  # no worker holds it after an error
         times: dict[str, int] = {}  # how often a host's workers without a result were late
         for name, worker in self.workers.items():
-            if worker.holds(late):
+            if worker.overdue(late):
                 worker.bench(worker.late + 1, now)
                 if not worker.proven:
                     host = name.partition("/")[0]
@@ -216,7 +216,7 @@ class JobTable:
         they hold is missed only after a long time. But not if all workers are like that.
         """
         silent = {
-            name for name, state in self.workers.items() if not state.proven and (state.late or state.holds(late))
+            name for name, state in self.workers.items() if not state.proven and (state.late or state.overdue(late))
         }
         if len(silent) == len(self.workers):
             silent.clear()
