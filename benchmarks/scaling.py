@@ -157,9 +157,9 @@ class Noted(Events):
         super().__init__()
         self._tell = tell
 
-    def put(self, event: Event, *, wake: bool = True) -> None:
+    def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> None:
         """Append the event, and call the function."""
-        super().put(event, wake=wake)
+        super().put(event, wake=wake, most=most)
         if wake:
             self._tell()
 
