@@ -73,7 +73,7 @@ def _instances(session: Session, _: str) -> None:
 
 def _connections(_: Session, endpoint: str) -> None:
     """6000 connections that say nothing, opened again when the learner closes them."""
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    host, port = endpoint.partition("/")[2].rsplit(":", 1)
     silent: list[socket.socket] = []
     while True:
         with suppress(OSError):

@@ -14,6 +14,7 @@ and what the head of `jaco.py` and docs/gymnasium.md say.
 """
 
 import argparse
+import itertools
 import json
 import shlex
 import subprocess
@@ -23,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from own_tasks import SEED, STARTS, constant, still
-from PIL import Image
+from PIL import Image, ImageSequence
 from running import script
 
 from learner.again.replay import LoadedPolicy, load
@@ -115,9 +116,8 @@ def film(run: Path, path: Path, policy: LoadedPolicy) -> None:
     _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"))
     with Image.open(path) as large:
         frames = []
-        for at in range(0, large.n_frames, 2):
-            large.seek(at)
-            frames.append(large.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
+        for frame in itertools.islice(ImageSequence.Iterator(large), 0, None, 2):
+            frames.append(frame.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
         duration = 2 * large.info["duration"]
     palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

@@ -136,7 +136,7 @@ def measure(workers: int, pair: float, latency: float, seconds: float) -> tuple[
         patch.object(session, "listen", listen),
         patch.object(time, "monotonic", network.now),
         open_run(config, Path(folder) / "run", Placement(record=False, numbers="c")) as run,
-        closing(run.learn()) as generations,
+        closing(run.learn()) as generations,  # type: ignore[bad-specialization]  # a generator
     ):
         for _ in generations:
             marks.append((network.now(), network.busy))

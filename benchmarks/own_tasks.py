@@ -145,7 +145,7 @@ def ars(task: str, seed: int, rollouts: int) -> float:
         action_space = gymnasium.spaces.Box(-1.0, 1.0, (shape[1],))
 
         def reset(self, **_: object) -> tuple[FloatArray, dict[str, Any]]:  # it only begins; no step follows
-            return np.zeros(shape[0], dtype=np.float32), {}
+            return np.zeros(shape[0]), {}
 
     found = Made("LinearPolicy", Spaces(), seed=seed, device="cpu")
     found.learn(rollouts)

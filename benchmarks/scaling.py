@@ -74,15 +74,17 @@ class MadeUp:
         seen = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
         flags = np.zeros((len(returns), 4), dtype=bool)
         steps = np.full(len(returns), self.spec.steps)
-        traces = np.zeros((len(rows), *self.spec.trace), "<f4")
-        return Simulated(returns=returns, flags=flags, steps=steps, traces=traces, trajectories=seen)
+        felt = np.zeros((len(rows), *self.spec.trace), "<f4")
+        return Simulated(returns=returns, flags=flags, steps=steps, traces=felt, trajectories=seen)
 
     def _trajectory(self, *, physics: bool) -> Trajectory:
         frames = self.spec.steps * (self._parts if physics else 1) + 1
         plain = {name: np.zeros((frames, *shape), "<f4") for name, shape in self._plain.items()}
         channels = {name: np.zeros((frames, *shape), "<f4") for name, shape in self._channels.items()}
         success = False if self.spec.success else None
-        return Trajectory(value=0.0, success=success, times=np.arange(frames) * 0.1, channels=channels, **plain)
+        return Trajectory(
+            value=0.0, success=success, times=0.1 * np.arange(frames, dtype=np.float64), channels=channels, **plain
+        )
 
 
 class MadeUpRunners:

@@ -18,6 +18,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from farm.net.session import free_endpoint
 from learner.run.config import RunConfig
@@ -96,7 +97,7 @@ def main() -> None:
         sys.exit("memory grows")
 
 
-def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[dict[str, object], Crowd, list[float]]:
+def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[dict[str, Any], Crowd, list[float]]:
     until, learner = time.monotonic() + seconds, []
     place = Placement(listen=free_endpoint(), record=False)
     with open_run(config, path, place, stopped=lambda: time.monotonic() > until) as run:

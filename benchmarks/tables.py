@@ -236,7 +236,8 @@ _MOST: Final = 1_000_000  # generations: runs end by their number of steps
 def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[list[Search], Runner]:
     searches, runner = [], None
     for number in numbers:
-        config = configure(task, seed=number, **{"generations": _MOST, **values})
+        settings: dict[str, Any] = {"generations": _MOST, **values}
+        config = configure(task, seed=number, **settings)
         problem = setup.problem(config)
         runner = runner or problem.runner()
         state = config.algorithm_config.init(problem.policy.size)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 import farm
-from farm.arrays import FloatArray
+from farm.arrays import AnyArray, FloatArray
 from farm.policies.base import Policy
 from farm.rollouts import Runner
 from farm.settings import setting
@@ -247,7 +247,7 @@ class Zeroed:
             kept = (force < BREAKS) & ~np.isnan(x).any(axis=-1)
             self.map = np.linalg.lstsq(np.insert(x[kept], 0, 1.0, axis=-1), force[kept], rcond=None)[0]
 
-    def rollouts(self, starts: Sequence[Seed], rate: float | None = None) -> tuple[FloatArray, ...]:
+    def rollouts(self, starts: Sequence[Seed], rate: float | None = None) -> tuple[AnyArray, ...]:
         """Rollouts that follow the estimate, or close at a constant rate [rad per step].
 
         Returns:
@@ -258,7 +258,7 @@ class Zeroed:
         parts = [again(partial(self._once, starts[i : i + size], rate)) for i in range(0, len(starts), size)]
         return tuple(np.concatenate(values) for values in zip(*parts, strict=True))
 
-    def _once(self, starts: Sequence[Seed], rate: float | None) -> tuple[FloatArray, ...]:
+    def _once(self, starts: Sequence[Seed], rate: float | None) -> tuple[AnyArray, ...]:
         batch, sim = Batch(self.runner.task, self.runner.sim, tuple(starts)), self.runner.sim
         seen = np.full((len(starts), self.runner.task.steps, len(JOINTS)), np.nan)
         zero, estimate = np.zeros((len(starts), len(JOINTS))), np.zeros(len(starts))

@@ -127,7 +127,7 @@ def _turned(found: loop.Rollouts) -> Turned:
     qpos, force = (
         np.concatenate([found.start[name][:, None], found.frames[name]], axis=1) for name in ("qpos", "force")
     )
-    return Turned.of(qpos, (force > 0).any(axis=-1))
+    return Turned.of(qpos, np.any(force > 0, axis=-1))
 
 
 def _figures(found: Turned) -> Figures:

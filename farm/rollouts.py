@@ -1,6 +1,6 @@
 """Builds a run's simulation from its specification and runs jobs; for workers and learners."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias, cast
@@ -142,7 +142,7 @@ class Runner:
         return around, own
 
     @plugins.no_exit
-    def rollouts(self, theta: FloatArray, seeds: list[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
+    def rollouts(self, theta: FloatArray, seeds: Sequence[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
         """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
         return loop.run(self.task, self.policy, self.sim, theta, seeds, 1 if physics else 0)
 

@@ -90,7 +90,9 @@ class Finding:
     @property
     def answer(self) -> str:
         """Whether the part is true, in a word or two."""
-        return {True: "yes", False: "no"}.get(self.holds, str(self.holds))
+        if isinstance(self.holds, str):
+            return self.holds
+        return "yes" if self.holds else "no"
 
 
 @dataclass(frozen=True, kw_only=True)

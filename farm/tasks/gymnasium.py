@@ -22,7 +22,7 @@ from farm.sim.channels import Quantity
 from farm.sim.interfaces import Engine, MakeEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec, rescaled
-from farm.tasks.gymnasium_batched import batched
+from farm.tasks.gymnasium_batched import Batched, batched
 from farm.tasks.gymnasium_engine import NOMINAL, EnvironmentEngine, leaves, make, simulated
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Environment(Task):
         if not _NAME.fullmatch(variant):
             raise ConfigError(f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN")
         self.steps = self._horizon()
-        self.batched = batched(self._first)
+        self.batched: Batched | None = batched(self._first)
         if self.batched is not None:
             self.substeps = self.batched.env.frame_skip
 

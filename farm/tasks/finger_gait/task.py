@@ -14,6 +14,7 @@ import numpy as np
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.settings import Texts, setting
+from farm.sim.model_files import Files
 from farm.sim.sim import Sim
 from farm.tasks.base import Record, Score, TaskConfig
 from farm.tasks.finger_gait import rewards, touch
@@ -130,7 +131,7 @@ class FingerGait(HandTask):
     goals: Sequence[Felt]
     """The grip to be reached, of each object."""
 
-    def __init__(self, config: Any = None, variant: str = "", files: Mapping[str, str] | None = None) -> None:  # noqa: ANN401
+    def __init__(self, config: Any = None, variant: str = "", files: Files | None = None) -> None:  # noqa: ANN401
         """Take what the settings say of object, hand and grip."""
         own: Any = self.Config() if config is None else config
         self.pose, self.start_grip, self.clip = own.pose, own.start_grip, own.clip
