@@ -23,6 +23,7 @@ as docs/choosing.md says.
 
 import argparse
 import json
+import math
 import statistics
 import sys
 import tempfile
@@ -210,9 +211,9 @@ def table(rows: Iterable[dict[str, Any]]) -> Iterator[str]:
     for task in dict.fromkeys(row["task"] for row in rows):
         cells = []
         for method in methods:
-            scores = [row["score"] for row in rows if (row["task"], row["method"]) == (task, method)]
-            said = f"{statistics.median(scores):.4g} ({min(scores):.4g} to {max(scores):.4g})" if scores else "-"
-            cells.append(said)
+            scores = [row["score"] for row in rows if (row["task"], row["method"]) == (task, method)] or [math.nan]
+            low, middle, high = (f"{value:.3g}" for value in (min(scores), statistics.median(scores), max(scores)))
+            cells.append(middle if low == high else f"{middle} ({low} to {high})")
         yield f"| {task} | " + " | ".join(cells) + " |"
 
 

@@ -40,6 +40,14 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
     assert all(line.count("|") >= 3 for line in lines)
 
 
+def test_the_page_of_own_tasks_shows_the_recorded_table() -> None:
+    results = FOLDER.parent / "docs/results"
+    words = ["--out", results / "tables/own-tasks.jsonl", "--table"]
+    done = subprocess.run([sys.executable, FOLDER / "own_tasks.py", *words], capture_output=True, text=True, check=True)
+    assert done.stdout.count("\n") == 8
+    assert done.stdout in (results / "own-tasks.md").read_text("utf-8")
+
+
 @pytest.mark.slow
 def test_ctrl_c_ends_a_script_with_one_line() -> None:
     command = [sys.executable, "-u", FOLDER / "early.py"]
