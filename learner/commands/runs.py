@@ -1,4 +1,4 @@
-"""`farm runs`: a table of the runs in a folder."""
+"""`farm runs`: a table of the runs in a folder, or a catalog of their recordings."""
 
 import csv
 import io
@@ -13,9 +13,12 @@ import tyro
 from farm import settings as arguments
 from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
-from farm.errors import ConfigError
+from farm.commands.signals import stop_flag
+from farm.errors import ConfigError, Interrupted
+from farm.net.session import is_port
 from farm.settings import Settings
 from learner.run.folder import RunFolder
+from learner.run.launch import check_rerun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +31,21 @@ class RunsCommand(Settings):
     """Print JSON instead of a table."""
     csv: bool = False
     """Print CSV instead of a table: one column per field of summary.json."""
+    serve: str | None = None
+    """Serve the recordings as a data set of Rerun's catalog on this port of this machine, until Ctrl-C."""
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(RunsCommand, words, "farm runs")
-    if command.json and command.csv:
-        raise ConfigError("--json and --csv exclude each other")
+    if command.json + command.csv + (command.serve is not None) > 1:
+        raise ConfigError("--json, --csv and --serve exclude each other")
     if not command.dir.is_dir():
         raise ConfigError(f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}")
-    rows = [_row(RunFolder(path.parent)) for path in sorted(command.dir.glob("*/config.json"))]
+    folders = [RunFolder(path.parent) for path in sorted(command.dir.glob("*/config.json"))]
+    if command.serve is not None:
+        return _serve(folders, command.dir.resolve().name, command.serve)
+    rows = [_row(folder) for folder in folders]
     if command.json:
         say(json.dumps(rows, indent=2))
         return 0
@@ -68,6 +76,28 @@ def main(words: Sequence[str]) -> int:
         table.add_row(*(plain(text or "") for text in what))
     wide().print(table)
     return 0
+
+
+def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:
+    """Serve recordings of runs as one data set of Rerun's catalog until Ctrl-C.
+
+    Raises:
+      ConfigError: the port is none or in use, or there are no recordings.
+      Interrupted: it was stopped.
+    """
+    if not is_port(port):
+        raise ConfigError(f"--serve {port!r} is no port; take one from 1 to 65535, for example 51234")
+    check_rerun()
+    from learner.recording.files import parts
+    from learner.recording.viewing import catalog
+
+    found = [files[0] for folder in folders if (files := parts(folder.path / "run.rrd"))]
+    if not found:
+        raise ConfigError("none of these runs has a recording: learn without --no-record")
+    with stop_flag("closing the catalog") as stop, catalog(name, found, int(port)) as address:
+        say(f"{len(found)} recordings at {address}: farm view {address}, or rerun.catalog.CatalogClient in Python")
+        stop.wait()
+    raise Interrupted("the catalog is closed")
 
 
 def _succeeds(row: dict[str, Any]) -> str:

@@ -1,13 +1,18 @@
-"""The viewer's program, and the table of recordings in a running viewer."""
+"""The table of recordings in a running viewer, and a catalog of recordings."""
 
 import logging
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
 from rerun.experimental import ViewerClient, ViewerState
+from rerun.server import Server
+
+from farm.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -66,3 +71,18 @@ def once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClient
             log.debug("not yet: %s", error)
         time.sleep(_PERIOD)
     return False
+
+
+@contextmanager
+def catalog(name: str, files: Sequence[Path], port: int) -> Iterator[str]:
+    """Serve recordings on this machine as one data set of Rerun's catalog; gives its address.
+
+    Raises:
+      ConfigError: the port is in use.
+    """
+    try:
+        server = Server(host="127.0.0.1", port=port, datasets={name: files})
+    except ValueError as error:
+        raise ConfigError(f"{error}: take another port") from None
+    with server:
+        yield server.url()

@@ -469,6 +469,8 @@ MISTAKES = [
     (("compare", "runs/a", "nowhere"), 2, "nowhere is not a run's folder"),
     (("compare", "runs/a", "runs/b", "--to", "/proc/c.rrd"), 1, "cannot write /proc/c.rrd"),
     (("view", "runs/a", "nowhere"), 2, "no recording in nowhere"),
+    (("runs", "--serve", "0"), 2, "--serve '0' is no port; take one from 1 to 65535"),
+    (("runs", "--serve", "9876", "--csv"), 2, "--json, --csv and --serve exclude each other"),
     (("export", "nowhere", "p.npz"), 2, "nowhere is not a run's folder"),
     (("export", "runs/a", "p.zip"), 2, "p.zip: expected a name that ends in .npz or .onnx"),
     (("export", "runs/a", "no/p.npz"), 1, "cannot write no/p.npz: No such file or directory"),
