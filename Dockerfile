@@ -3,7 +3,8 @@
 #   docker build --target worker --tag rolloutfarm-worker .
 #
 # BASE: any image with Python 3.11 or newer and its venv module. UID: the user that the programs run as; files
-# that are mounted into them (certificates) must be readable for this user.
+# that are mounted into them (certificates, tasks) must be readable for this user. PACKAGES: what else pip installs,
+# for example "rolloutfarm[gym]", or a package with tasks of your own.
 ARG BASE=python:3.11-slim
 
 FROM ${BASE} AS build
@@ -21,6 +22,9 @@ COPY workers workers
 COPY learner learner
 RUN /opt/build/bin/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir /dist . \
     && /opt/build/bin/pip --python /opt/farm install --quiet --no-deps /dist/*.whl
+ARG PACKAGES=
+RUN test -z "${PACKAGES}" \
+    || /opt/build/bin/pip --python /opt/farm install --quiet --no-cache-dir -c constraints.txt ${PACKAGES}
 
 FROM ${BASE} AS program
 ARG UID=1000

@@ -56,7 +56,9 @@ class Stack:
         self._program = ["docker", "compose"] if succeeds("docker", "compose", "version") else ["docker-compose"]
         self._project = f"farm{uuid.uuid4().hex[:8]}"
         self.files: tuple[str, ...] = ()
-        self.settings: dict[str, str] = {"BASE": base, "FARM_UID": str(USER), "LIVE": "127.0.0.1:0"}
+        self.settings: dict[str, str] = {
+            "BASE": base, "FARM_UID": str(USER), "LIVE": "127.0.0.1:0", "PACKAGES": "rolloutfarm[gym]",
+        }  # fmt: skip
 
     def compose(self, *words: str) -> str:
         files = [word for name in ("compose.yaml", *self.files) for word in ("-f", str(ROOT / name))]
@@ -127,7 +129,8 @@ def stack(images: Stack) -> Iterator[Stack]:
 
 def outside(farm: Farm, **settings: str) -> str:
     """The hash of the same run without containers."""
-    flags = [word for name in ("SEED", "GENERATIONS", "PAIRS") for word in (f"--{name.lower()}", settings[name])]
+    given = [name for name in ("TASK", "SEED", "GENERATIONS", "PAIRS") if name in settings]
+    flags = [word for name in given for word in (f"--{name.lower()}", settings[name])]
     farm.call("run", "--name", settings["RUN"], "--no-record", *flags, timeout=300)
     return str(farm.summary(settings["RUN"])["parameters_sha256"])
 
@@ -172,6 +175,24 @@ def test_containers_that_die(farm: Farm, stack: Stack) -> None:
     assert "continuing after generation" in stack.compose("logs", "--no-color", "learner")
     expected = outside(farm, **{**settings, "GENERATIONS": str(summary["generations"])})
     assert summary["parameters_sha256"] == expected
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"TASK": "tasks/own.py:Own", "ALLOW": "--allow-file tasks/own.py"}, {"TASK": "gym:InvertedPendulum-v5"}],
+    ids=["file", "package"],
+)
+def test_a_task_of_ones_own(farm: Farm, stack: Stack, settings: dict[str, str]) -> None:
+    (farm.folder / "tasks").mkdir()
+    farm.call("new-task", "own")
+    shutil.move(farm.folder / "own.py", farm.folder / "tasks")
+    run = {"RUN": "own", "SEED": "6", "GENERATIONS": "5", "PAIRS": "4", **settings}
+    stack.start(TASKS=str(farm.folder / "tasks"), **run)
+    assert stack.hash_at_the_end(farm.folder) == outside(farm, **run)
+    assert call("docker", "wait", stack.container("recorder")).strip() == "0"
+    recording = farm.folder / "run.rrd"
+    recording.write_bytes(stack.fetch("recorder", "recordings/own/run.rrd", farm.folder))
+    assert generations(recording) == list(range(1, 6))
 
 
 def test_certificates(farm: Farm, stack: Stack) -> None:

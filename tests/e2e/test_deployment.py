@@ -90,10 +90,9 @@ def test_the_manifest_fits_together() -> None:
         pod = part["spec"]["template"]["spec"]
         mounted = {mount["name"] for mount in pod["containers"][0]["volumeMounts"]}
         assert mounted == {volume["name"] for volume in pod["volumes"]}
-    assert (
-        job["spec"]["template"]["spec"]["volumes"][-1]["persistentVolumeClaim"]["claimName"]
-        == (claim["metadata"]["name"])
-    )
+    volumes = {volume["name"]: volume for volume in job["spec"]["template"]["spec"]["volumes"]}
+    assert volumes["runs"]["persistentVolumeClaim"]["claimName"] == claim["metadata"]["name"]
+    assert volumes["tasks"]["configMap"]["optional"], "a farm without tasks of its own does not start"
 
 
 def test_the_manifests_commands_learn(farm: Farm, place: Place) -> None:
