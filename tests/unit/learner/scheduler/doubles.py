@@ -13,6 +13,7 @@ from farm.net.messages import WorkRequest
 from farm.net.session import Session
 from farm.net.work import Chunk, Failure, Jobs, Results, traced
 from learner.scheduler.dispatcher import Dispatcher
+from learner.scheduler.judging import Judge
 from learner.scheduler.membership import Admission
 from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import SchedulerConfig
@@ -110,6 +111,9 @@ class Learner:
         stopped: Callable[[], bool] | None = None,
         join: str | None = "farm worker --connect here",
         canary: str = "c",
+        *,
+        mixed: bool = False,
+        judge: Judge | None = None,
     ) -> Dispatcher:
         self.dispatcher = Dispatcher(
             self.session,
@@ -118,9 +122,10 @@ class Learner:
             9,
             join,
             stopped or self.stop.is_set,
-            Admission(canary),
+            Admission(canary, mixed=mixed),
             Shapes(trace=TRACE, frame=SHAPES),
             scheduler,
+            judge,
         )
         return self.dispatcher
 

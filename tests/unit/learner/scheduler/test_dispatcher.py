@@ -24,11 +24,12 @@ from doubles import (
     jobs,
 )
 
+from farm.arrays import FloatArray
 from farm.errors import RunError
 from farm.net import codec, keys
 from farm.net.session import Session, connect
 from farm.net.telemetry import RunStatus
-from farm.net.work import Chunk, Jobs, Results, RoundHeader
+from farm.net.work import Chunk, Jobs, Results, RoundHeader, Simulated
 from farm.sim.trajectory import Trajectory
 from learner.scheduler import dispatcher as dispatchers
 from learner.scheduler import status as answers
@@ -229,6 +230,43 @@ def test_a_job_that_fails_everywhere(learner: Learner, hire: Hire, workers: int)
     for thread in threads:
         thread.join()
     assert turn.qsize() == 3
+
+
+def able(_: str, __: FloatArray, job: Jobs, ___: FloatArray, *, terms: bool) -> Simulated:
+    """A judge whose machine can do every job."""
+    assert not terms
+    count = 2 * len(job)
+    return Simulated(
+        returns=np.zeros(count), flags=np.zeros((count, 4), bool), steps=np.ones(count, "<i8"),
+        traces=np.zeros((count, *TRACE), "<f4"), trajectories=(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_what_the_learner_can_simulate_says_nothing_of_a_device(learner: Learner, hire: Hire, mixed: bool) -> None:
+    dispatcher = learner.show(judge=able, mixed=mixed)
+    failing, good = [hire(f"w{i}/1") for i in range(3)], hire("good/1")
+    collected = learner.collect(jobs(1))
+    for hand in failing:
+        hand.want(1)
+    until = time.monotonic() + WAIT
+    while len(dispatcher.workers) < 3:
+        assert time.monotonic() < until
+    while dispatcher.workers and not collected.done():
+        assert time.monotonic() < until
+        for hand in failing:
+            for event in hand.session.events.waiting(0.01):
+                if event.topic == "inbox":
+                    chunk = codec.decode(event.payload, Chunk)
+                    hand.answer(hand.failure(chunk, 0, "RuntimeError: the motor is hot"))
+    if mixed:
+        with pytest.raises(RunError, match="the motor is hot"):
+            collected.result(WAIT)
+        return
+    good.want(1)
+    good.work(1)
+    assert done(collected.result(WAIT)) == [0]
+    assert dispatcher.workers == ("good/1",), "hosts that cannot do what this machine can are not asked again"
 
 
 def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:
