@@ -29,12 +29,13 @@ def test_jobs_of_a_workflow_run_what_exists(path: Path) -> None:
         assert called == [each for each in called if (ROOT / each).is_file()]
 
 
-def test_only_the_job_that_publishes_can_publish() -> None:
+def test_only_the_jobs_that_publish_can_publish() -> None:
     workflow = read(".github/workflows/release.yml")
     assert workflow["permissions"] == {"contents": "read"}
     able = {name for name, job in workflow["jobs"].items() if "id-token" in job.get("permissions", {})}
-    assert able == {"publish"}
+    assert able == {"publish", "site"}, "actions/deploy-pages needs a token as well"
     assert workflow["jobs"]["publish"]["environment"] == "release"
+    assert workflow["jobs"]["site"]["permissions"]["pages"] == "write"
 
 
 def test_checks_before_a_commit_are_steps_of_ci() -> None:

@@ -1,9 +1,14 @@
-"""`farm view --web` in a real browser."""
+"""Rerun's viewer in a real browser: `farm view --web`, and the copy of it on the site."""
 
+import functools
+import http.server
+import importlib.util
 import io
 import os
 import re
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,3 +47,34 @@ def test_the_page_draws_the_hand(tmp_path: Path) -> None:
         assert "http" not in said, "one line says where"
     finally:
         farm.close()
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+def test_the_site_has_a_viewer_of_its_own(tmp_path: Path) -> None:
+    need_chromium()
+    spec = importlib.util.spec_from_file_location("docs_embedded", Path(__file__).parents[2] / "docs/embedded.py")
+    assert spec
+    assert spec.loader
+    embedded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(embedded)
+    embedded.on_post_build(SimpleNamespace(site_dir=tmp_path))
+    assert b"https://fonts" not in (tmp_path / "viewer/index.html").read_bytes()
+    page = tmp_path / "docs/files/index.html"
+    page.parent.mkdir(parents=True)
+    page.write_text(f"<!doctype html><link rel=icon href=data:,>{embedded.BOX}")
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=tmp_path))
+    threading.Thread(target=server.serve_forever).start()
+    try:
+        with Browser(tmp_path / "profile") as browser:
+            browser.open(f"http://127.0.0.1:{server.server_port}/docs/files/")
+            browser.call("Runtime.evaluate", expression="document.querySelector('details').open = true")
+            farm = Farm(tmp_path)
+            farm.wait_for(lambda: _orange(browser.picture()) > 0.005, seconds=300)
+            assert browser.errors == [], browser.errors
+    finally:
+        server.shutdown()
+        server.server_close()
