@@ -56,16 +56,17 @@ class Stack:
         self._program = ["docker", "compose"] if succeeds("docker", "compose", "version") else ["docker-compose"]
         self._project = f"farm{uuid.uuid4().hex[:8]}"
         self.files: tuple[str, ...] = ()
-        self.settings: dict[str, str] = {
+        self._always: dict[str, str] = {
             "BASE": base, "FARM_UID": str(USER), "LIVE": "127.0.0.1:0", "PACKAGES": "rolloutfarm[gym]",
         }  # fmt: skip
+        self.settings = self._always
 
     def compose(self, *words: str) -> str:
         files = [word for name in ("compose.yaml", *self.files) for word in ("-f", str(ROOT / name))]
         return call(*self._program, "-p", self._project, *files, *words, **self.settings)
 
     def start(self, *files: str, **settings: str) -> None:
-        self.files, self.settings = files, {**self.settings, **settings}
+        self.files, self.settings = files, {**self._always, **settings}
         self.compose("up", "--detach")
 
     def containers(self, service: str) -> list[str]:
