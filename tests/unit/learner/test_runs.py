@@ -91,7 +91,7 @@ def test_csv_has_a_column_for_each_name_in_a_summary(runs: Path, capsys: pytest.
     assert {name: good[name] for name in GOOD} == {name: str(value) for name, value in GOOD.items()}
     assert (last["run"], last["steps"]) == ('a "z", indeed', "7")
     assert main(["runs", str(runs), "--csv", "--json"]) == 2
-    assert "--json and --csv exclude each other" in capsys.readouterr().err
+    assert "--json, --csv and --serve exclude each other" in capsys.readouterr().err
 
 
 def test_a_run_that_was_cut_short_has_not_failed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
