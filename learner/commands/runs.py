@@ -95,7 +95,8 @@ def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:
     if not found:
         raise ConfigError("none of these runs has a recording: learn without --no-record")
     with stop_flag("closing the catalog") as stop, catalog(name, found, int(port)) as address:
-        say(f"{len(found)} recordings at {address}: farm view {address}, or rerun.catalog.CatalogClient in Python")
+        count = "1 recording" if len(found) == 1 else f"{len(found)} recordings"
+        say(f"{count} at {address}: farm view {address}, or rerun.catalog.CatalogClient in Python")
         stop.wait()
     raise Interrupted("the catalog is closed")
 
