@@ -28,7 +28,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:  # noqa: ANN401
     """The page about recordings, with a box that opens the viewer."""
     if page.file.src_uri != PAGE:
         return markdown
-    assert PICTURE in markdown
+    if PICTURE not in markdown:
+        raise ValueError(f"{PAGE} has no line {PICTURE!r}")
     return markdown.replace(PICTURE, PICTURE + BOX)
 
 
