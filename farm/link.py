@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from farm.net import keys
-from farm.net.session import LISTEN, check_endpoint
 from farm.net.tls import Bundle, Role, find
+from farm.net.zenoh_settings import LISTEN, check_endpoint
 from farm.settings import Settings, setting
 
 

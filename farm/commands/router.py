@@ -2,14 +2,20 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
+from farm.errors import MessageError
 from farm.link import Listening
-from farm.net.session import listen, router_settings
+from farm.net import keys
+from farm.net.session import listen
+from farm.net.zenoh_settings import router_settings
+
+_WAIT: Final = 0.5  # [s] at most between two looks whether to stop
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +38,13 @@ def main(words: Sequence[str]) -> int:
         settings = router_settings(endpoint, command.farm, bundle, trusted=trusted, routers=routers)
         logs.say(json.dumps(_nested(settings), indent=2))
         return 0
-    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, routers=routers):
+    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, routers=routers) as session:
+        session.subscribe("cut", keys.cut(command.farm, "*"))
         logs.say(f"router at {endpoint}; learners and workers connect to it with --connect")
-        stop.wait()
+        while not stop.is_set():
+            for event in session.events.waiting(_WAIT):
+                with suppress(MessageError):  # published on a pattern: nobody's name
+                    session.cut(keys.run_in(event.key, keys.cut(command.farm, "")))
     return 0
 
 

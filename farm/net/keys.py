@@ -14,6 +14,7 @@
 <farm>/run/<run>/report            published: a finished generation
 <farm>/run/<run>/history           queryable, ?from=<generation>: past reports; published, empty, when the run is over
 <farm>/refused/<worker>            why a learner gives a worker no jobs
+<farm>/cut/<name>                  published: a machine sends too much; routers close its connections
 """
 
 import re
@@ -103,6 +104,11 @@ def history(farm: str, run: str) -> str:
 def refused(farm: str, worker: str) -> str:
     """Where a learner tells a worker why it gets no jobs."""
     return f"{farm}/refused/{worker}"
+
+
+def cut(farm: str, name: str) -> str:
+    """Where a learner tells routers which machine to cut off; name `*` for all."""
+    return f"{farm}/cut/{name}"
 
 
 def worker_in(key: str, prefix: str) -> str:

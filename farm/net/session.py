@@ -1,14 +1,12 @@
 """Zenoh sessions as the farm uses them; the only module that uses zenoh.
 
-The settings here were measured: see docs/protocol.md. Every subscription has a callback, on its own thread, that moves
+Every subscription has a callback, on its own thread, that moves
 samples into the application's queue, so that the link is always drained. The thread that reads the queue owns all state
 and does all the publishing. (A thread that waits for one of Zenoh's channels wakes up ten times per second.)
 """
 
-import ipaddress
 import json
 import logging
-import re
 import socket
 import threading
 import time
@@ -20,81 +18,23 @@ from typing import Any, Final, TypeVar
 import zenoh
 
 from farm.errors import ConfigError, FarmError, Interrupted
-from farm.net import keys, probe
+from farm.net import probe
 from farm.net.events import Event, Events
-from farm.net.tls import Bundle, access_control
+from farm.net.rates import Rates
+from farm.net.sockets import raise_descriptors, shut_down
+from farm.net.tls import Bundle
+from farm.net.zenoh_settings import LARGEST, RECEIVE, client_settings, router_settings
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 _TOKENS: Final = 65_536  # most tokens in one query's answer; a router accepts 4096 sessions
-_LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machine
-_DESCRIPTORS: Final = 65_536
-_PORT: Final = re.compile(r"[0-9]{1,5}")
-_FEWEST: Final = 64  # enough files and connections for a run with two workers
-_OPEN_S: Final = 1.0
 _JOIN_S: Final = 1.0
-_REQUEST: Final = 65_536  # [bytes] of a request for work
-_REQUESTS: Final = 1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
+_CUT: Final = 60.0  # [s] that a machine is cut off
 _REMIND: Final = 60.0  # [s] between two messages about the same problem
-_LARGEST: Final = 64 * 1024 * 1024  # [bytes] of a message
-_RECEIVE: Final = "transport/link/rx/max_message_size"
-_COMMON: Final = {
-    "scouting/multicast/enabled": False,
-    "scouting/gossip/enabled": False,
-    "scouting/delay": 0,
-    "transport/link/tx/lease": _LEASE_MS,
-    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
-    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 300_000,
-    _RECEIVE: _LARGEST,
-    "transport/shared_memory/enabled": False,
-}
-_ROUTER: Final = {
-    "mode": "router",
-    "transport/unicast/max_sessions": 4096,
-    # Connections that say nothing take 10 s and some 10 kB each; while there are so many, nobody else can join.
-    "transport/unicast/accept_pending": 8192,
-}
-_RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
-_CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
-
-def is_port(text: str) -> bool:
-    """Whether a text is a port's number."""
-    return bool(_PORT.fullmatch(text)) and 0 < int(text) < 65536
-
-
-def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
-    """Check an endpoint's form, and return its host (Zenoh silently accepts some malformed ones).
-
-    Args:
-      endpoint: tcp/HOST:PORT, or tls/HOST:PORT with certificates.
-      encrypted: whether there are certificates.
-
-    Raises:
-      ConfigError: it is malformed, or certificates and protocol do not match.
-    """
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if protocol not in ("tcp", "tls") or not host or not (is_port(port) or port == "0"):
-        raise ConfigError(f"endpoint {endpoint!r} is not of the form tcp/HOST:PORT, for example tcp/127.0.0.1:7447")
-    if protocol == "tls" and not encrypted:
-        raise ConfigError(f"endpoint {endpoint} needs certificates: give their folder with --tls")
-    if protocol == "tcp" and encrypted:
-        raise ConfigError(f"endpoint {endpoint} is not encrypted, but --tls is given: use tls/{address}")
-    return host
-
-
-def _reachable(host: str) -> bool:
-    """Whether other machines may be able to connect to a listener on this host."""
-    try:
-        return not ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host != "localhost"
-
-
-LISTEN: Final = "tcp/127.0.0.1:7447"
-"""A learner's default endpoint."""
+FLOOD: Final = "flood"
+"""Topic of the event that a machine was cut off."""
 
 
 def free_endpoint() -> str:
@@ -107,13 +47,15 @@ def free_endpoint() -> str:
 class Session:
     """An open session; use `listen` or `connect`."""
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    def __init__(self, session: zenoh.Session, *, certified: bool = False) -> None:
+        self._session, self._certified = session, certified  # whether certificates say whose keys are whose
         self.events = Events()
         """Everything received by subscriptions."""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
         self._over: list[threading.Event] = []  # of their callbacks
         self._tokens: list[zenoh.LivelinessToken] = []
+        self._cut: dict[str, float] = {}  # machines, and until when
+        self._opened: zenoh.LinkEventsListener[None] | None = None
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
         """Send bytes to the subscribers of the key; without `block` a receiver that is stuck loses them."""
@@ -124,12 +66,17 @@ class Session:
             priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
         )
 
-    def subscribe(self, topic: str, key: str, *, wake: bool = True, most: int | None = None) -> None:
+    def subscribe(
+        self, topic: str, key: str, *, wake: bool = True, most: int | None = None, rate: int | None = None
+    ) -> None:
         """Put everything published on the key into `events` under the topic's name.
 
-        Without `wake`, a thread that waits for events is not woken. Of each sender, `most` wait to be read.
+        Without `wake`, a thread that waits for events is not woken. Of each sender, `most` wait to be read. A machine
+        with a certificate that publishes more than `rate` messages a second is cut off, with an event of the topic
+        FLOOD and its name; the key then ends with `**`.
         """
-        callback = self._callback(self._put(topic, wake=wake, most=most))
+        rates = None if rate is None or not self._certified else Rates(key.removesuffix("**"), rate)
+        callback = self._callback(self._put(topic, wake=wake, most=most, rates=rates))
         self._declared.append(_as_daemon(lambda: self._session.declare_subscriber(key, callback)))
 
     def watch(self, topic: str, key: str) -> None:
@@ -183,20 +130,53 @@ class Session:
                 if reply.ok is not None:
                     yield reply.ok.payload.to_bytes()
 
+    def cut(self, name: str) -> bool:
+        """Close the connections of the machine with this certificate, and for a minute each new one; false if done.
+
+        Zenoh's filters drop what it sends only after reading it, on a thread that takes a whole core.
+        """
+        if self._is_cut(name):
+            return False
+        self._cut[name] = time.monotonic() + _CUT
+        log.warning("machine %s sends more messages than any worker: it is cut off for %g s", name, _CUT)
+        threading.Thread(target=self._sever, args=(name,), daemon=True).start()  # this may be a callback of Zenoh's
+        return True
+
+    def _sever(self, name: str) -> None:
+        if self._opened is None:
+            watcher = self._callback(self._on_link)
+            self._opened = self._session.info.declare_link_events_listener(watcher)
+        shut_down({_address(link) for link in self._session.info.links() if link.auth_identifier == name})
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        if event.kind == zenoh.SampleKind.PUT and self._is_cut(event.link.auth_identifier):
+            shut_down({_address(event.link)})
+
+    def _is_cut(self, name: str | None) -> bool:
+        return name in self._cut and time.monotonic() < self._cut[name]
+
     def close(self) -> None:
         """Undeclare everything and wait for the callbacks: one left running in Rust aborts the interpreter's exit."""
         for token in self._tokens:
             token.undeclare()
+        if self._opened is not None:
+            self._opened.undeclare()
         for declared in self._declared:
             declared.undeclare()
         for over in self._over:
             over.wait(_JOIN_S)
 
-    def _put(self, topic: str, *, wake: bool = True, most: int | None = None) -> Callable[[zenoh.Sample], None]:
+    def _put(
+        self, topic: str, *, wake: bool = True, most: int | None = None, rates: Rates | None = None
+    ) -> Callable[[zenoh.Sample], None]:
         def put(sample: zenoh.Sample) -> None:
-            alive = sample.kind == zenoh.SampleKind.PUT
-            event = Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive)
-            self.events.put(event, wake=wake, most=most)
+            key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            name = None if rates is None else rates.flooding(key, time.monotonic())
+            if name is not None:
+                if self.cut(name):
+                    self.events.put(Event(FLOOD, name, b""))
+                return
+            self.events.put(Event(topic, key, sample.payload.to_bytes(), alive), wake=wake, most=most)
 
         return put
 
@@ -220,6 +200,11 @@ def _as_daemon(declare: Callable[[], _T]) -> _T:
     return made.result()
 
 
+def _address(link: zenoh.Link) -> str:
+    """HOST:PORT of the other side."""
+    return link.dst.partition("/")[2]
+
+
 class Outlet:
     """A publisher for one key; a receiver that is stuck loses messages."""
 
@@ -237,50 +222,9 @@ class Outlet:
         self._publisher.put(payload)
 
 
-def router_settings(
-    endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False, routers: tuple[str, ...] = ()
-) -> dict[str, object]:
-    """Zenoh's settings for a session that accepts connections, by configuration path.
-
-    Args:
-      endpoint: where it listens.
-      farm: name of the farm, for access control.
-      bundle: the learner's certificates; with them only machines on its roster are accepted.
-      trusted: listen to other machines without certificates.
-      routers: other routers that it connects to, and reconnects to after a loss.
-
-    Raises:
-      ConfigError: an endpoint is malformed, or open to other machines without certificates.
-    """
-    host, *_ = (check_endpoint(each, encrypted=bundle is not None) for each in (endpoint, *routers))
-    if bundle is None and _reachable(host) and not trusted:
-        raise ConfigError(
-            f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
-            "--trust-network if everyone on that network may read everything and pose as a worker"
-        )
-    secured: dict[str, object] = {}
-    if bundle:
-        secured = {**bundle.settings("listen"), **_limits(farm)}
-        secured["access_control"] = access_control(farm, bundle.roster())
-    settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
-    if routers:
-        joined = bundle.settings("connect") if bundle else {}
-        settings |= {"connect/endpoints": list(routers), **_RETRY, **joined}
-    return settings
-
-
-def _limits(farm: str) -> dict[str, object]:
-    """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over one link."""
-    asked, common = keys.want(farm, "**"), {"flows": ["ingress"], "messages": ["put"]}
-    return {
-        "low_pass_filter": [{**common, "key_exprs": [asked], "size_limit": _REQUEST}],
-        "downsampling": [{**common, "rules": [{"key_expr": asked, "freq": _REQUESTS}]}],
-    }
-
-
 def listen(
     endpoint: str, farm: str, bundle: Bundle | None = None, *, trusted: bool = False, routers: tuple[str, ...] = (),
-    largest: int = _LARGEST,
+    largest: int = LARGEST,
 ) -> AbstractContextManager[Session]:  # fmt: skip
     """A session that workers connect to; `largest` is as in `connect`, for the others see `router_settings`.
 
@@ -289,7 +233,7 @@ def listen(
     """
     settings = router_settings(endpoint, farm, bundle, trusted=trusted, routers=routers)
     try:
-        return _closing(_open(settings | {_RECEIVE: largest}))
+        return _closing(_open(settings | {RECEIVE: largest}), certified=bundle is not None)
     except zenoh.ZError as error:
         raise ConfigError(
             f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? "
@@ -297,31 +241,9 @@ def listen(
         ) from None
 
 
-def _raise_descriptors() -> None:
-    """Raise the limit of open files to the system's maximum: the usual 1024 suffice for 1000 workers only.
-
-    A system without such limits, or that does not let them be raised, is left as it is.
-
-    Raises:
-      FarmError: the maximum is so low that Zenoh would abort the process.
-    """
-    try:
-        import resource
-    except ImportError:
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        with suppress(ValueError):  # macOS has a smaller limit than its "infinite" one
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-            soft = wanted
-    if soft != resource.RLIM_INFINITY and soft < _FEWEST:
-        raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
-
-
 def connect(
     endpoints: tuple[str, ...], timeout: float | None, stopped: Callable[[], bool], bundle: Bundle | None = None, *,
-    largest: int = _LARGEST,
+    largest: int = LARGEST,
 ) -> AbstractContextManager[Session]:  # fmt: skip
     """A session connected to a learner or a router; keeps trying until one answers.
 
@@ -335,12 +257,8 @@ def connect(
     Raises:
       FarmError: no answer in time; Interrupted: it was stopped.
     """
-    for endpoint in endpoints:
-        check_endpoint(endpoint, encrypted=bundle is not None)
-    settings = {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": [], _RECEIVE: largest}
-    if bundle is not None:
-        settings |= bundle.settings("connect")
-    return _closing(_try(settings, endpoints, timeout, stopped, bundle))
+    settings = client_settings(endpoints, bundle) | {RECEIVE: largest}
+    return _closing(_try(settings, endpoints, timeout, stopped, bundle), certified=bundle is not None)
 
 
 def _try(
@@ -376,7 +294,7 @@ def _why(endpoints: tuple[str, ...], bundle: Bundle | None, error: Exception) ->
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:
-    _raise_descriptors()
+    raise_descriptors()
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -384,8 +302,8 @@ def _open(settings: Mapping[str, object]) -> zenoh.Session:
 
 
 @contextmanager
-def _closing(session: zenoh.Session) -> Iterator[Session]:
-    opened = Session(session)
+def _closing(session: zenoh.Session, *, certified: bool) -> Iterator[Session]:
+    opened = Session(session, certified=certified)
     try:
         yield opened
     finally:

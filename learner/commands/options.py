@@ -12,7 +12,7 @@ from farm import plugins, settings
 from farm.errors import ConfigError
 from farm.link import Listening
 from farm.net import keys
-from farm.net.session import is_port
+from farm.net.zenoh_settings import is_port
 from farm.settings import setting
 from learner.commands.display import Style
 from learner.run import config as configs

@@ -15,7 +15,7 @@ from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, Interrupted
-from farm.net.session import is_port
+from farm.net.zenoh_settings import is_port
 from farm.settings import Settings
 from learner.run.folder import RunFolder
 from learner.run.launch import check_rerun

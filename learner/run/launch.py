@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any, Final
 from farm.commands.logs import Formatter
 from farm.errors import ConfigError, NameTakenError, RunError
 from farm.net import keys, session
-from farm.net.session import LISTEN, Session, free_endpoint
+from farm.net.session import Session, free_endpoint
 from farm.net.telemetry import Report, RunEnd
 from farm.net.tls import Bundle
+from farm.net.zenoh_settings import LISTEN
 from farm.processes import LocalWorkers
 from farm.sim.model_files import by_digest
 from farm.sim.trajectory import Trajectory

@@ -19,7 +19,7 @@ from farm.net import codec, keys
 from farm.net.events import Event
 from farm.net.messages import Refusal, Spec, WorkRequest
 from farm.net.notices import Notices
-from farm.net.session import Session
+from farm.net.session import FLOOD, Session
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import RunStatus, WorkerStatus
 from farm.net.work import NOT_NORMALISED, Chunk, Failure, Jobs, Results, RoundHeader
@@ -37,6 +37,8 @@ _WAIT: Final = 0.2  # [s] at most between two checks whether to stop
 _ASK: Final = 0.5  # [s] timeout of a query for one token
 _LOOKS: Final = 5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
 _RESULTS: Final = 100  # unread results of one worker, which has a few chunks at a time
+_ASKED: Final = 800  # [1/s] requests of one machine; a worker asks once per second
+_ANSWERED: Final = 5000  # [1/s] results of one machine; a learner cannot hand out as many jobs
 _PATIENCE: Final = 3.0  # [s] without workers before the user is warned
 
 
@@ -90,8 +92,8 @@ class Dispatcher:
         self._status, self._alone = StatusAnswer(), time.monotonic()
         self._progress: GenerationStats | None = None
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
-        session.subscribe("want", keys.want(farm, "**"))
-        session.subscribe("result", keys.result(farm, self.run, "**"), most=_RESULTS)
+        session.subscribe("want", keys.want(farm, "**"), rate=_ASKED)
+        session.subscribe("result", keys.result(farm, self.run, "**"), most=_RESULTS, rate=_ANSWERED)
         session.watch("worker", keys.worker_token(farm, "**"))
         session.answer(keys.spec(farm, self.run), lambda: simulated)
         session.answer(keys.generation(farm, self.run), lambda: codec.encode(self._header))
@@ -210,6 +212,9 @@ class Dispatcher:
                 self._asked(event)
             elif event.topic == "worker":
                 self._liveliness(event)
+            elif event.topic == FLOOD:
+                self.notices.ignored["cut"] += 1
+                self._session.publish(keys.cut(self._farm, event.key), b"", block=False)  # to routers
             else:
                 self._result(event)
         except MessageError as error:
@@ -284,11 +289,9 @@ class Dispatcher:
     def _result(self, event: Event) -> None:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
         if sender in self._roster.refused:
-            self.notices.ignore("refused", f"of {sender}, which is not admitted")
-            return
+            raise MessageError("a result of a worker that is not admitted", "refused")
         if not self._ledger.scheduler.given(sender):  # before it is decoded: a flood must cost little
-            self.notices.ignore("unasked", f"of {sender}, which has no jobs of this round")
-            return
+            raise MessageError("a result of a worker that has no jobs of this round", "unasked")
         try:
             message: Results | Failure = codec.decode(event.payload, Results)
         except MessageError as first:

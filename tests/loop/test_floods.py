@@ -1,9 +1,12 @@
 """What a host with a certificate can send too much of, over TLS on loopback, and what a learner notices of it."""
 
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +25,15 @@ from workers.config import WorkerConfig
 from workers.worker import Worker
 
 pytestmark = pytest.mark.slow
-SILENT = 300
+ROOT, SILENT = Path(__file__).parents[2], 300
 
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("certificates") / "own"
-    certificates.main(["new", str(folder), "--learner", "127.0.0.1", "--worker", "a", "--worker", "silent"])
+    certificates.main(
+        ["new", str(folder), "--learner", "127.0.0.1", "--worker", "a", "--worker", "silent", "--worker", "liar"]
+    )
     return folder
 
 
@@ -56,8 +61,61 @@ def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> Non
             while not got or got[-1].payload != b"last":
                 got.append(learner.events.get(10))
     assert sent > 10_000
-    assert len(got) < 1100 * taken
+    assert len(got) < 2200 * taken
     assert max(len(event.payload) for event in got) == 100
+
+
+@pytest.mark.parametrize("through", ["learner", "router"])
+@pytest.mark.parametrize("what", ["requests", "many-results"])
+def test_a_machine_that_floods_is_cut_off(certs: Path, tmp_path: Path, what: str, through: str) -> None:
+    endpoint, token = tls(), keys.worker_token("farm", "liar/0")
+    task, mine = pole(tmp_path / "mine"), find(certs, "learner")
+    config = farm.configure(f"{task}:Pole", generations=10_000, pairs=15)
+    place = Placement(listen=endpoint, tls=mine, record=False)
+    with ExitStack() as stack:
+        if through == "router":
+            stack.enter_context(router(endpoint, certs))
+            place = replace(place, connect=(endpoint,))
+        run = stack.enter_context(open_run(config, tmp_path / "run", place))
+        learning = run.learn()
+        stack.enter_context(honest(endpoint, certs, task))
+        viewer = stack.enter_context(connect((endpoint,), None, lambda: False, mine))
+        stack.enter_context(connect((endpoint,), None, lambda: False, find(certs, "worker", "liar"))).token(token)
+        while not viewer.present(token, 1.0):
+            pass
+        attack = [str(ROOT / "benchmarks/floods.py"), "--attack", what, "--at", endpoint, str(certs)]
+        stack.enter_context(subprocess.Popen([sys.executable, *attack], stdin=subprocess.PIPE))
+        while viewer.present(token, 1.0):
+            next(learning)
+        assert run.dispatcher.notices.ignored["cut"]
+        assert run.dispatcher.workers  # the honest one
+
+
+@contextmanager
+def endless(act: Callable[[], None]) -> Iterator[None]:
+    stop = threading.Event()
+
+    def repeat() -> None:
+        while not stop.is_set():
+            act()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(20)
+
+
+@contextmanager
+def router(endpoint: str, certs: Path) -> Iterator[None]:
+    words = [sys.executable, "-m", "farm", "router", "--listen", endpoint, "--tls", str(certs / "learner")]
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
 
 
 def test_results_larger_than_any_of_the_run_are_dropped_unread(certs: Path, tmp_path: Path) -> None:
@@ -111,22 +169,11 @@ def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
 @contextmanager
 def honest(endpoint: str, certs: Path, file: Path) -> Iterator[None]:
     config = WorkerConfig(connect=(endpoint,), tls=certs, name="a", allow_file=(file,))
-    stop = threading.Event()
-
-    def serve() -> None:
-        with connect(config.connect, None, stop.is_set, config.bundle) as session:
-            worker = Worker(config, session)
-            worker.join()
-            while not stop.is_set():
-                worker.turn()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(20)
+    with connect(config.connect, None, lambda: False, config.bundle) as session:
+        worker = Worker(config, session)
+        worker.join()
+        with endless(worker.turn):
+            yield
 
 
 def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_path: Path) -> None:
