@@ -60,15 +60,22 @@ def _many_results(session: Session, _: str) -> None:
         session.publish(keys.result("farm", "run", "liar/1"), b"x" * 2000)
 
 
+def _some_results(session: Session, _: str) -> None:
+    """4000 small results per second at most."""
+    while True:
+        session.publish(keys.result("farm", "run", "liar/1"), b"x" * 2000)
+        time.sleep(1 / 4000)
+
+
 def _instances(session: Session, _: str) -> None:
-    """1000 instances of one certificate that ask for jobs, and answer none."""
+    """1000 instances that ask for jobs, and answer none (500 are admitted); 600 requests per second."""
     names = [f"liar/{i}" for i in range(1000)]
     for name in names:
         session.token(keys.worker_token("farm", name))
     while True:
         for name in names:
             session.publish(keys.want("farm", name), _want(name))
-            time.sleep(0.001)
+            time.sleep(1 / 600)
 
 
 def _connections(_: Session, endpoint: str) -> None:
@@ -87,6 +94,7 @@ ATTACKS: Final[dict[str, Callable[[Session, str], None]]] = {
     "large-requests": _large_requests,
     "results": _results,
     "many-results": _many_results,
+    "some-results": _some_results,
     "instances": _instances,
     "connections": _connections,
 }

@@ -14,7 +14,6 @@ and what the head of `jaco.py` and docs/gymnasium.md say.
 """
 
 import argparse
-import itertools
 import json
 import shlex
 import subprocess
@@ -32,7 +31,7 @@ from learner.run.evaluation import evaluation_jobs
 
 ROOT: Final = Path(__file__).parents[1]
 SECONDS: Final = 5.0  # of a film
-SIZE: Final = (240, 180)  # of a film [pixels]
+SIZE: Final = (200, 150)  # of a film [pixels]
 COLOURS: Final = 32
 TRIES: Final = (50, 5)  # constant actions, starts of each
 
@@ -45,6 +44,10 @@ class Piece:
     what: str
     flags: str = ""
     """Of `farm run`, beside the task."""
+    view: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    """Part of the picture that is shown: left, top, right, bottom."""
+    needs: str = ""
+    """What else is to be installed."""
 
     @property
     def name(self) -> str:
@@ -62,7 +65,8 @@ PIECES: Final = (
     Piece("cart.py:Cart", "A cart balances a pole of random mass."),
     Piece("arm.py:Arm", "An arm follows a ball; the circle and its speed are random.", "--generations 300"),
     Piece("hopper.py:Hopper", "A planar hopper of random weight hops on random ground."),
-    Piece("jaco.py:Jaco", "A Kinova arm with its meshes follows a ball.", "--generations 60"),
+    Piece("jaco.py:Jaco", "A Kinova arm with its meshes follows a ball.", "--generations 60",
+          needs="Meshes: [a robot with meshes](../examples/README.md#a-robot-with-meshes)."),
     Piece(
         "gripper.py:Gripper", "A gripper lifts a box of unknown weight by touch.",
         "--policy linear --normalise --algorithm ars --learning-rate-mu 0.1 --initial-sigma 0.1 --touch-noise 0.05 "
@@ -70,7 +74,8 @@ PIECES: Final = (
     ),
     Piece(
         "shadow_hand.py:Hold", "A goal environment: the Shadow hand holds a block so that many touch sensors feel it.",
-        "--generations 10",
+        "--generations 10", (0.36, 0.06, 0.68, 0.38),
+        "Package: [environments of other packages](gymnasium.md#environments-of-other-packages).",
     ),
     Piece("grips.py:Grips", "The Allegro hand adds its middle finger to a grip."),
 )  # fmt: skip
@@ -92,7 +97,7 @@ def main() -> None:
         if piece.name in given.only.split(","):
             run = given.runs / f"{piece.name}-s{given.seed}"
             rows[piece.task] = measured(piece, run, given.seed)
-            film(run, films / f"{piece.name}.gif", load(run))
+            film(run, films / f"{piece.name}.gif", load(run), piece.view)
             file.write_text("".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows))
     (given.docs / "gallery.md").write_text(page(rows), "utf-8")
 
@@ -109,19 +114,26 @@ def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
     return row | {name: round(score, 3) for name, score in scores.items()}
 
 
-def film(run: Path, path: Path, policy: LoadedPolicy) -> None:
+def film(run: Path, path: Path, policy: LoadedPolicy, view: tuple[float, ...]) -> None:
     """The last policy's rollout from the nominal start, in a small file."""
     task = policy.problem.task
     speed = task.steps * task.period / SECONDS
     _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"))
+    frames: list[Image.Image] = []
+    shown: list[int] = []  # for how long [ms]; equal frames are one
     with Image.open(path) as large:
-        frames = []
-        for frame in itertools.islice(ImageSequence.Iterator(large), 0, None, 2):
-            frames.append(frame.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
-        duration = 2 * large.info["duration"]
+        left, top, right, bottom = (round(share * size) for share, size in zip(view, 2 * large.size, strict=True))
+        for at, frame in enumerate(ImageSequence.Iterator(large)):
+            if at % 2:
+                shown[-1] += frame.info["duration"]
+            else:
+                frames.append(
+                    frame.convert("RGB").crop((left, top, right, bottom)).resize(SIZE, Image.Resampling.LANCZOS)
+                )
+                shown.append(frame.info["duration"])
     palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
+    first.save(path, save_all=True, append_images=rest, duration=shown, loop=0, optimize=True)
 
 
 def page(rows: dict[str, Any]) -> str:
@@ -138,7 +150,8 @@ def page(rows: dict[str, Any]) -> str:
         scores = ", ".join(f"{name} {_short(row[name])}" for name in ("learnt", "constant", "still"))
         title = piece.name.replace("_", " ").capitalize()
         lines += ["", f"## {title}", "", f"![{piece.what}](pictures/gallery/{piece.name}.gif)", ""]
-        lines += [f"{piece.what} **{scores}** after {row['rollouts']} rollouts, {row['seconds']} s.", ""]
+        cost = f"after {row['rollouts']} rollouts, {row['seconds']} s. {piece.needs}".rstrip()
+        lines += [f"{piece.what} **{scores}** {cost}", ""]
         lines += [f"    farm {shlex.join(piece.words)}"]
     return "\n".join(lines) + "\n"
 

@@ -159,11 +159,12 @@ class Noted(Events):
         super().__init__()
         self._tell = tell
 
-    def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> None:
+    def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> bool:
         """Append the event, and call the function."""
-        super().put(event, wake=wake, most=most)
+        kept = super().put(event, wake=wake, most=most)
         if wake:
             self._tell()
+        return kept
 
 
 class Agenda:

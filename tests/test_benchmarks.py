@@ -1,5 +1,7 @@
 """The benchmarks' scripts run and print the expected rows; no test measures speed."""
 
+import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -102,3 +104,19 @@ def interrupt(config: RunConfig, path: Path, after: int) -> None:
 
 def hash_of(path: Path) -> str:
     return (RunFolder(path).read_summary() or {})["parameters_sha256"]
+
+
+def test_the_gallery_shows_the_recorded_scores(tmp_path: Path) -> None:
+    docs, table = FOLDER.parent / "docs", "results/tables/gallery.jsonl"
+    (tmp_path / table).parent.mkdir(parents=True)
+    shutil.copy(docs / table, tmp_path / table)
+    words = ["--only", "none", "--docs", tmp_path]
+    subprocess.run([sys.executable, FOLDER / "gallery.py", *words], check=True)
+    shown = (tmp_path / "gallery.md").read_text("utf-8")
+    assert shown == (docs / "gallery.md").read_text("utf-8")
+    assert shown.count("](pictures/gallery/") == 8
+    assert sum(film.stat().st_size for film in (docs / "pictures/gallery").iterdir()) < 6e6
+    kept = [each.stat().st_size for part in ("pictures", "results") for each in (docs / part).rglob("*.*")]
+    assert sum(kept) < 8e6
+    for row in map(json.loads, (docs / table).read_text().splitlines()):
+        assert row["learnt"] > max(row["constant"], row["still"]), row["task"]

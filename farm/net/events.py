@@ -36,8 +36,8 @@ class Events:
         self._came = threading.Condition()
         self._bytes = self.dropped = 0
 
-    def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> None:
-        """Append an event unless the queue is full, or has `most` with this key.
+    def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> bool:
+        """Append an event unless the queue is full, or has `most` with this key; return whether it did.
 
         Liveliness events have twice the room, because they are never repeated.
         """
@@ -46,12 +46,13 @@ class Events:
             full = self._bytes + size > (_BACKLOG if event.payload else 2 * _BACKLOG)
             if full or (most is not None and self._counts[event.key] >= most):
                 self.dropped += 1
-                return
+                return False
             self._bytes += size
             self._counts[event.key] += 1
             self._events.append(event)
             if wake:
                 self._came.notify()
+        return True
 
     def get(self, timeout: float = 0.0) -> Event:
         """The next event.

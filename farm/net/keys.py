@@ -14,7 +14,7 @@
 <farm>/run/<run>/report            published: a finished generation
 <farm>/run/<run>/history           queryable, ?from=<generation>: past reports; published, empty, when the run is over
 <farm>/refused/<worker>            why a learner gives a worker no jobs
-<farm>/cut/<name>                  published: a machine sends too much; routers close its connections
+<farm>/cut/<name>                  published: a machine sends too much; routers cut it off
 """
 
 import re

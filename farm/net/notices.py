@@ -15,7 +15,7 @@ class Notices:
     def __init__(self, log: logging.Logger) -> None:
         self.ignored: Counter[str] = Counter()
         """Number of ignored messages, by kind: stale, doubled, unasked, foreign, absent, refused, bad, large,
-        version, flood; machines that were cut off."""
+        version, flood."""
         self._log, self._texts = log, set[str]()
 
     def ignore(self, kind: str, text: str) -> None:

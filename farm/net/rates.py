@@ -1,21 +1,22 @@
-"""How many messages a machine sends in a second. Pure: time is an argument [s]."""
+"""Which machines send too much. Pure: time is an argument [s]."""
 
 from collections import Counter
+from typing import Final
+
+_OVER: Final = 3.0  # [s] that messages are counted: a host that wakes up may send many old results at once
+_MOST: Final = 2000  # in that time, of one machine; 500 workers ask for work once per second
 
 
 class Rates:
-    """Counts a subscription's messages by the machine in their keys, <prefix><machine>/<instance>."""
+    """Counts messages by machine."""
 
-    def __init__(self, prefix: str, most: int) -> None:
-        """`most` per second are what honest workers may send."""
-        self._start, self._most = len(prefix), most
+    def __init__(self) -> None:
         self._since, self._counts = 0.0, Counter[str]()
 
-    def flooding(self, key: str, now: float) -> str | None:
-        """Count a message; name its machine if it has sent too many in this second."""
-        if now - self._since >= 1.0:
+    def flooding(self, name: str, now: float) -> bool:
+        """Count a message of a machine; return whether it has sent more in these seconds than any farm's machine."""
+        if now - self._since >= _OVER:
             self._since = now
             self._counts.clear()
-        name = key[self._start : key.find("/", self._start)]
         self._counts[name] += 1
-        return name if self._counts[name] > self._most else None
+        return self._counts[name] > _MOST

@@ -21,7 +21,7 @@ from farm.errors import ConfigError, FarmError, Interrupted
 from farm.net import probe
 from farm.net.events import Event, Events
 from farm.net.rates import Rates
-from farm.net.sockets import raise_descriptors, shut_down
+from farm.net.sockets import raise_descriptors, silence
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LARGEST, RECEIVE, client_settings, router_settings
 
@@ -54,7 +54,8 @@ class Session:
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
         self._over: list[threading.Event] = []  # of their callbacks
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._cut: dict[str, float] = {}  # machines, and until when
+        self._prefixes: dict[str, int] = {}  # length of what precedes a sender in a topic's keys
+        self._rates, self._cut = Rates(), dict[str, float]()  # machines that are cut off, and until when
         self._opened: zenoh.LinkEventsListener[None] | None = None
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
@@ -66,22 +67,18 @@ class Session:
             priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
         )
 
-    def subscribe(
-        self, topic: str, key: str, *, wake: bool = True, most: int | None = None, rate: int | None = None
-    ) -> None:
+    def subscribe(self, topic: str, key: str, *, wake: bool = True, most: int | None = None) -> None:
         """Put everything published on the key into `events` under the topic's name.
 
-        Without `wake`, a thread that waits for events is not woken. Of each sender, `most` wait to be read. A machine
-        with a certificate that publishes more than `rate` messages a second is cut off, with an event of the topic
-        FLOOD and its name; the key then ends with `**`.
+        Without `wake`, a thread that waits for events is not woken. Of each sender, `most` wait to be read; those that
+        are dropped count as a burden.
         """
-        rates = None if rate is None or not self._certified else Rates(key.removesuffix("**"), rate)
-        callback = self._callback(self._put(topic, wake=wake, most=most, rates=rates))
+        callback = self._callback(self._put(topic, key, wake=wake, most=most))
         self._declared.append(_as_daemon(lambda: self._session.declare_subscriber(key, callback)))
 
     def watch(self, topic: str, key: str) -> None:
         """Put existing, new and disappearing liveliness tokens into `events`."""
-        callback = self._callback(self._put(topic))
+        callback = self._callback(self._put(topic, key))
         tokens = self._session.liveliness()
         self._declared.append(_as_daemon(lambda: tokens.declare_subscriber(key, callback, history=True)))
 
@@ -130,8 +127,17 @@ class Session:
                 if reply.ok is not None:
                     yield reply.ok.payload.to_bytes()
 
+    def burden(self, event: Event) -> None:
+        """Count an event against the machine that sent it; with very many, it is cut off.
+
+        That is an event of the topic FLOOD. Without certificates nobody knows who sent it, and nothing is done.
+        """
+        name = event.key[self._prefixes[event.topic] :].partition("/")[0]
+        if self._certified and self._rates.flooding(name, time.monotonic()) and self.cut(name):
+            self.events.put(Event(FLOOD, name, b""))
+
     def cut(self, name: str) -> bool:
-        """Close the connections of the machine with this certificate, and for a minute each new one; false if done.
+        """Silence the connections of the machine with this certificate, and for a minute each new one; false if done.
 
         Zenoh's filters drop what it sends only after reading it, on a thread that takes a whole core.
         """
@@ -146,11 +152,11 @@ class Session:
         if self._opened is None:
             watcher = self._callback(self._on_link)
             self._opened = self._session.info.declare_link_events_listener(watcher)
-        shut_down({_address(link) for link in self._session.info.links() if link.auth_identifier == name})
+        silence({_address(link) for link in self._session.info.links() if link.auth_identifier == name})
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         if event.kind == zenoh.SampleKind.PUT and self._is_cut(event.link.auth_identifier):
-            shut_down({_address(event.link)})
+            silence({_address(event.link)})
 
     def _is_cut(self, name: str | None) -> bool:
         return name in self._cut and time.monotonic() < self._cut[name]
@@ -167,16 +173,15 @@ class Session:
             over.wait(_JOIN_S)
 
     def _put(
-        self, topic: str, *, wake: bool = True, most: int | None = None, rates: Rates | None = None
+        self, topic: str, key: str, *, wake: bool = True, most: int | None = None
     ) -> Callable[[zenoh.Sample], None]:
+        self._prefixes[topic] = len(key.removesuffix("**"))
+
         def put(sample: zenoh.Sample) -> None:
-            key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-            name = None if rates is None else rates.flooding(key, time.monotonic())
-            if name is not None:
-                if self.cut(name):
-                    self.events.put(Event(FLOOD, name, b""))
-                return
-            self.events.put(Event(topic, key, sample.payload.to_bytes(), alive), wake=wake, most=most)
+            alive = sample.kind == zenoh.SampleKind.PUT
+            event = Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive)
+            if not self.events.put(event, wake=wake, most=most):
+                self.burden(event)
 
         return put
 

@@ -1,8 +1,11 @@
 """What the operating system lets this process open, and the sockets that it has open."""
 
+import ctypes
 import os
 import socket
 import stat
+import struct
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +15,9 @@ from farm.errors import FarmError
 
 _DESCRIPTORS: Final = 65_536
 _FEWEST: Final = 64  # enough files and connections for a run with two workers
+_ATTACH_FILTER: Final = 26  # SO_ATTACH_FILTER, which the module socket does not name
+_DROP: Final = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))  # BPF: return 0, take no byte
+_FILTER: Final = struct.pack("HP", 1, ctypes.addressof(_DROP))  # struct sock_fprog
 _OPEN: Final = Path("/dev/fd")  # a process' descriptors, on Linux and macOS
 
 
@@ -37,17 +43,21 @@ def raise_descriptors() -> None:
         raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
 
 
-def shut_down(peers: Collection[str]) -> None:
-    """End this process's connections to these addresses, HOST:PORT; a host of IPv6 has brackets.
+def silence(peers: Collection[str]) -> None:
+    """Let nothing more in from these addresses, HOST:PORT, over this process's connections; IPv6 has brackets.
 
-    Zenoh, which has opened them, has no call for one of them; it notices the end as that of any connection. A system
-    without a list of a process's descriptors keeps them.
+    Zenoh, which has opened them, has no call for it; it gives up a silent connection when its lease is over. One that
+    is closed instead would be opened again within milliseconds, and each time costs a handshake: only on systems other
+    than Linux, whose sockets take no filter. A system without a list of a process's descriptors changes nothing.
     """
     for own in _connections() if peers else ():
         with own, suppress(OSError):
             host, port, *_ = own.getpeername()
             if f"[{host}]:{port}" in peers or f"{host}:{port}" in peers:
-                own.shutdown(socket.SHUT_RDWR)
+                if sys.platform == "linux":
+                    own.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, _FILTER)
+                else:
+                    own.shutdown(socket.SHUT_RDWR)
 
 
 def _connections() -> Iterator[socket.socket]:

@@ -7,6 +7,7 @@ import hashlib
 import logging
 import secrets
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
@@ -36,9 +37,7 @@ log = logging.getLogger(__name__)
 _WAIT: Final = 0.2  # [s] at most between two checks whether to stop
 _ASK: Final = 0.5  # [s] timeout of a query for one token
 _LOOKS: Final = 5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
-_RESULTS: Final = 100  # unread results of one worker, which has a few chunks at a time
-_ASKED: Final = 800  # [1/s] requests of one machine; a worker asks once per second
-_ANSWERED: Final = 5000  # [1/s] results of one machine; a learner cannot hand out as many jobs
+_UNREAD: Final = 100  # requests or results of one worker, which has a few chunks at a time, and asks once per second
 _PATIENCE: Final = 3.0  # [s] without workers before the user is warned
 
 
@@ -92,8 +91,8 @@ class Dispatcher:
         self._status, self._alone = StatusAnswer(), time.monotonic()
         self._progress: GenerationStats | None = None
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
-        session.subscribe("want", keys.want(farm, "**"), rate=_ASKED)
-        session.subscribe("result", keys.result(farm, self.run, "**"), most=_RESULTS, rate=_ANSWERED)
+        session.subscribe("want", keys.want(farm, "**"), most=_UNREAD)
+        session.subscribe("result", keys.result(farm, self.run, "**"), most=_UNREAD)
         session.watch("worker", keys.worker_token(farm, "**"))
         session.answer(keys.spec(farm, self.run), lambda: simulated)
         session.answer(keys.generation(farm, self.run), lambda: codec.encode(self._header))
@@ -207,18 +206,21 @@ class Dispatcher:
         return self._session.events.waiting(_WAIT if due is None else max(0.001, min(due, _WAIT)))
 
     def _take(self, event: Event) -> None:
+        if event.topic == FLOOD:
+            self._session.publish(keys.cut(self._farm, event.key), b"", block=False)  # to routers
+            return
+        ignored = self.notices.ignored.total()
         try:
             if event.topic == "want":
                 self._asked(event)
             elif event.topic == "worker":
                 self._liveliness(event)
-            elif event.topic == FLOOD:
-                self.notices.ignored["cut"] += 1
-                self._session.publish(keys.cut(self._farm, event.key), b"", block=False)  # to routers
             else:
                 self._result(event)
         except MessageError as error:
             self.notices.ignore(error.kind, f"on {event.key}: {error}")
+        if event.topic == "want" or self.notices.ignored.total() > ignored:
+            self._session.burden(event)
 
     def _asked(self, event: Event) -> None:
         sender = keys.worker_in(event.key, keys.want(self._farm, ""))
@@ -314,8 +316,7 @@ class Dispatcher:
         now = time.monotonic()
         verdicts, wrong = self._ledger.put(message, now, self._judging.right)
         if not verdicts:
-            self.notices.ignore("bad", f"of {message.worker}: results that do not fit their jobs")
-            return
+            raise MessageError("results that do not fit their jobs", "bad")
         for host, job in wrong.items():
             others = "this machine" if job in self._judging.decided else "two other hosts"
             where = f"than {others} for job {job} of round {self._header.round}"
@@ -336,8 +337,7 @@ class Dispatcher:
             self._decline(failure.worker, failure.error, failure.traceback)
             return
         if not 0 <= failure.index < len(self._ledger.round):
-            self.notices.ignored["bad"] += 1
-            return
+            raise MessageError("an error at no job of this round", "bad")
         self.notices.once(f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback)
         if self._ledger.scheduler.error(failure.worker, failure.index, time.monotonic()):
             mine = None if self.admission.mixed else self._judging.right(failure.index, self.admission.canary)
@@ -374,15 +374,13 @@ class Dispatcher:
             self._status.make(self._run_status)
 
     def _run_status(self) -> RunStatus:
-        last, flood = self._progress, self._session.events.dropped
-        if flood:
-            self.notices.ignored["flood"] = flood
+        last, ignored = self._progress, self.notices.ignored + Counter(flood=self._session.events.dropped)
         return RunStatus(
             run=self.run, generation=self._header.generation, generations=self._generations,
             return_mean=last.return_mean if last else None,
             mean_policy_return=last.mean_policy_return if last else None,
             open=self._ledger.scheduler.remaining, reissued=self.reissued, refused=len(self._roster.reasons),
-            ignored=dict(self.notices.ignored), workers=self.census(), numbers=self.admission.canary,
+            ignored=dict(ignored), workers=self.census(), numbers=self.admission.canary,
         )  # fmt: skip
 
     def _end_if_nobody_can_come(self) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-_AT_FIRST: Final = 8  # workers of a host that are tried before one of them has sent a result
+_AT_FIRST: Final = 8  # workers of a host that take part before one of them has sent a result
 _LATE: Final = 7  # a worker that is always late is tried once a minute
 
 
@@ -29,8 +29,6 @@ class Worker:
     """Time of its last message about its jobs [s]."""
     proven: bool = False
     """It has sent a result."""
-    tried: bool = False
-    """It has been given a job."""
     late: int = 0
     """Rounds since its last result at whose end it was late."""
     until: float = -math.inf
@@ -55,6 +53,10 @@ class JobTable:
     def __init__(self, copies: int) -> None:
         self.copies = copies
         self.workers: dict[str, Worker] = {}
+        """Those that may be given jobs."""
+        self.outside: dict[str, Worker] = {}
+        """Those that wait until more of their host have sent results; they cost nothing."""
+        self._hosts: defaultdict[str, Counter[bool]] = defaultdict(Counter)  # workers, by whether they are proven
         self.begin(0)
 
     def begin(self, jobs: int, late: float = math.inf, now: float = 0.0) -> None:
@@ -82,9 +84,42 @@ class JobTable:
                     host = name.partition("/")[0]
                     times[host] = max(times.get(host, 0), worker.late)
             worker.held.clear()
-        for name, worker in self.workers.items():
+        for name, worker in (*self.workers.items(), *self.outside.items()):
             if not worker.proven and (host := name.partition("/")[0]) in times:
                 worker.bench(times[host], now)
+
+    def came(self, worker: str, credits: int) -> Worker:
+        """The state of a worker; a new one takes part, unless too many of its host do that have sent no result."""
+        state = self.workers.get(worker) or self.outside.get(worker)
+        if state is None:
+            state = self.outside[worker] = Worker(credits)
+            self._enter(worker.partition("/")[0], [worker])
+        return state
+
+    def left(self, worker: str) -> None:
+        """Forget a worker that holds nothing any more; another one of its host may take part."""
+        self.outside.pop(worker, None)
+        state, host = self.workers.pop(worker, None), worker.partition("/")[0]
+        if state is not None:
+            self._hosts[host][state.proven] -= 1
+            self._enter(host)
+            if not self._hosts[host].total():
+                del self._hosts[host]
+
+    def _prove(self, worker: str, state: Worker) -> None:
+        if not state.proven:
+            state.proven, host = True, worker.partition("/")[0]
+            self._hosts[host].update({True: 1, False: -1})
+            self._enter(host)
+
+    def _enter(self, host: str, names: Sequence[str] | None = None) -> None:
+        """Let workers of a host take part that wait outside, or those of these names, as many as may."""
+        count = self._hosts[host]
+        for name in [each for each in self.outside if each.partition("/")[0] == host] if names is None else names:
+            if count[False] >= max(_AT_FIRST, count[True]):
+                return
+            self.workers[name] = self.outside.pop(name)
+            count[False] += 1
 
     @property
     def waiting(self) -> int:
@@ -100,7 +135,6 @@ class JobTable:
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
         taken: list[int] = []
-        self.workers[worker].tried = True
         pending, held, queue = self._pending, self.workers[worker].held, self.full if self.copies == 1 else self.out
         while pending and len(taken) < count:
             index = heapq.heappop(pending)
@@ -119,7 +153,7 @@ class JobTable:
             del holders[0]
         holders.append(worker)
         self.given[worker].add(index)
-        self.workers[worker].held[index], self.workers[worker].tried = now, True
+        self.workers[worker].held[index] = now
         queue = self.full if len(holders) >= self.copies else self.out
         queue[index] = now
 
@@ -136,7 +170,8 @@ class JobTable:
         if state is not None:
             held, state.benched = state.held, False
             if indices:
-                state.proven, state.late = True, 0
+                state.late = 0
+                self._prove(worker, state)
         done: list[bool] = []
         for index in indices:
             held.pop(index, None)
@@ -186,28 +221,10 @@ class JobTable:
     def able(self) -> list[tuple[int, str]]:
         """Return (jobs held, worker) of the workers that take jobs at all.
 
-        Benched workers are left out, unless all are benched; and most new workers of a host that has few with results.
+        Benched workers are left out, unless all are benched.
         """
         ready = [(name, state) for name, state in self.workers.items() if not state.benched]
-        ready = ready or list(self.workers.items())
-        wait = self._waiting([name for name, state in ready if not (state.proven or state.tried)])
-        return [(len(state.held), name) for name, state in ready if state.credits and name not in wait]
-
-    def _waiting(self, new: list[str]) -> set[str]:
-        """Those of the new workers that are not tried yet, because too many of their host were and sent no result."""
-        if not new:
-            return set()
-        others = [(name.partition("/")[0], state) for name, state in self.workers.items()]
-        proven = Counter(host for host, state in others if state.proven)
-        tried = Counter(host for host, state in others if state.tried and not state.proven)
-        wait: set[str] = set()
-        for name in new:
-            host = name.partition("/")[0]
-            if tried[host] < max(_AT_FIRST, proven[host]):
-                tried[host] += 1
-            else:
-                wait.add(name)
-        return wait
+        return [(len(state.held), name) for name, state in ready or self.workers.items() if state.credits]
 
     def spare(self, most: int, late: float) -> list[tuple[bool, int, str]]:
         """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for a silent one.

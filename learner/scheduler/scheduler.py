@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import ChainMap
 from collections.abc import Container, Sequence, Set
 from typing import Literal, NamedTuple, TypeAlias
 
 from learner.scheduler.chunking import Chunking, SchedulerConfig
-from learner.scheduler.job_table import JobTable, Worker
+from learner.scheduler.job_table import JobTable
 
 __all__ = ["Assignment", "Scheduler", "SchedulerConfig", "Verdict"]
 
@@ -66,7 +67,7 @@ class Scheduler:
     @property
     def workers(self) -> Set[str]:
         """Names of the known workers."""
-        return self._table.workers.keys()
+        return ChainMap(self._table.workers, self._table.outside).keys()
 
     @property
     def willing(self) -> list[str]:
@@ -99,20 +100,18 @@ class Scheduler:
         if credits < 0:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
         self._tick(now)
-        state = self._table.workers.setdefault(worker, Worker(credits))
+        state = self._table.came(worker, credits)
         state.credits, state.benched = credits, state.benched and self._now < state.until
-        if idle:
+        if idle and worker in self._table.workers:
             state.answered = self._now
             self._reissued += self._table.release(worker, self._now)
 
     def lost(self, worker: str) -> int:
         """Forget a worker; return how many of its jobs are pending again."""
-        if worker not in self._table.workers:
-            return 0
         self._seen = -math.inf
-        count = self._table.release(worker, self._now)
+        count = self._table.release(worker, self._now) if worker in self._table.workers else 0
         self._reissued += count
-        del self._table.workers[worker]
+        self._table.left(worker)
         return count
 
     def refused(self, worker: str) -> int:
@@ -185,12 +184,11 @@ class Scheduler:
         the next one; the other jobs stay pending here, so that all workers finish together.
         """
         self._tick(now)
-        size = self._chunking.chunk(self._table.size, self._table.waiting, len(self._table.workers))
-        chunks = self._again(self._table.failed, size)
-        chunks += self._first_time(size)
+        chunks = self._again(self._table.failed)
+        chunks += self._first_time()
         if not self._table.any_pending():
-            chunks += self._again(self._table.out, size)
-            chunks += self._again(self._table.full, size)
+            chunks += self._again(self._table.out)
+            chunks += self._again(self._table.full)
         self._seen = self._now
         return chunks
 
@@ -220,9 +218,16 @@ class Scheduler:
             self._chunking.learn(len(sent), self._now - max(state.answered, min(sent)), seconds)
             state.answered = self._now
 
-    def _first_time(self, size: int) -> list[Assignment]:
+    def _size(self) -> int:
+        """Jobs of a chunk."""
+        return self._chunking.chunk(self._table.size, self._table.waiting, len(self._table.able()))
+
+    def _first_time(self) -> list[Assignment]:
         """Hand out pending jobs in chunks, lowest index first; evenly if there are not two chunks for each worker."""
-        free = self._table.free(2 * size) if self._table.any_pending() else []
+        if not self._table.any_pending():
+            return []
+        size = self._size()
+        free = self._table.free(2 * size)
         load = sum(held for held, _ in free)
         chunks: list[Assignment] = []
         while free and self._table.any_pending():
@@ -243,10 +248,13 @@ class Scheduler:
                 load += held
         return chunks
 
-    def _again(self, queue: dict[int, float], size: int) -> list[Assignment]:
+    def _again(self, queue: dict[int, float]) -> list[Assignment]:
         """Issue failed or overdue jobs to workers that have room and do not hold them."""
         due = self._due(queue)
-        spare = self._table.spare(2 * size, self._now - self._chunking.patience) if due else []
+        if not due:
+            return []
+        size = self._size()
+        spare = self._table.spare(2 * size, self._now - self._chunking.patience)
         chunks: dict[str, list[int]] = {}
         for index in due:
             if not spare:

@@ -496,3 +496,32 @@ def test_credits_and_jobs_must_not_be_negative():
 def test_a_wrong_setting_is_named(name, value):
     with pytest.raises(ConfigError, match=name.replace("_", "-")):
         SchedulerConfig(**{name: value})
+
+
+def test_instances_that_never_answer_make_no_chunk_smaller():
+    silent = [f"liar/{i}" for i in range(100)]
+    scheduler = started(40, [*silent, "a/1"], credits=8, seconds=0.01)
+    scheduler.assign(0.0)
+    scheduler.begin(40)
+    for worker in silent:
+        scheduler.want(worker, 8, 0.1)
+    assert scheduler.workers == {*silent, "a/1"}
+    jobs = given(scheduler.assign(0.1))
+    assert len(jobs) == 9, "eight of the silent host"
+    assert len(jobs["a/1"]) > 1
+
+
+def test_workers_of_a_host_take_part_as_others_of_it_answer():
+    names = [f"a/{i:02}" for i in range(40)]
+    scheduler = started(400, names, credits=1, seconds=0.01)
+    counts, now, jobs = [], 0.0, {}
+    for _ in range(6):
+        jobs |= given(scheduler.assign(now))
+        counts.append(len(jobs))
+        now += 0.01
+        for worker, indices in sorted(jobs.items()):
+            scheduler.results(worker, indices, now)
+        jobs = {}
+    assert counts == [8, 16, 32, 40, 40, 40]
+    scheduler.lost("a/00")
+    assert scheduler.workers == set(names[1:])
