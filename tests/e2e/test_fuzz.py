@@ -84,8 +84,9 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
     farm.call("run", "--out", "undisturbed", *SETTINGS)
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
-    workers = farm.start("worker", "--connect", endpoint, "--processes", "1")
     with session.connect((endpoint,), 20, lambda: False) as stranger:
+        stranger.subscribe("all", "farm/**")  # before the worker comes, which may ask for work only once
+        workers = farm.start("worker", "--connect", endpoint, "--processes", "1")
         honest = overheard(stranger)
         [worker] = children(workers.pid)
 
@@ -131,7 +132,6 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
 
 def overheard(stranger: session.Session) -> dict[str, tuple[str, bytes]]:
     """A valid message of each kind."""
-    stranger.subscribe("all", "farm/**")
     heard: dict[str, tuple[str, bytes]] = {}
     while set(heard) < set(TOPICS):
         event = stranger.events.get(timeout=20)
