@@ -4,19 +4,20 @@ from collections import Counter
 from typing import Final
 
 _OVER: Final = 3.0  # [s] that messages are counted: a host that wakes up may send many old results at once
-_MOST: Final = 2000  # in that time, of one machine; 500 workers ask for work once per second
 
 
 class Rates:
     """Counts messages by machine."""
 
     def __init__(self) -> None:
+        self.most = 2000
+        """Messages in three seconds that a machine may send."""
         self._since, self._counts = 0.0, Counter[str]()
 
     def flooding(self, name: str, now: float) -> bool:
-        """Count a message of a machine; return whether it has sent more in these seconds than any farm's machine."""
+        """Count a message of a machine; return whether it has sent more than `most` in these seconds."""
         if now - self._since >= _OVER:
             self._since = now
             self._counts.clear()
         self._counts[name] += 1
-        return self._counts[name] > _MOST
+        return self._counts[name] > self.most

@@ -1,8 +1,8 @@
 """Zenoh sessions as the farm uses them; the only module that uses zenoh.
 
-Every subscription has a callback, on its own thread, that moves
-samples into the application's queue, so that the link is always drained. The thread that reads the queue owns all state
-and does all the publishing. (A thread that waits for one of Zenoh's channels wakes up ten times per second.)
+Every subscription has a callback, on its own thread, that moves samples into the application's queue, so that the link
+is always drained. The thread that reads the queue owns all state and does all the publishing. (A thread that waits for
+one of Zenoh's channels wakes up ten times per second.)
 """
 
 import json
@@ -51,12 +51,16 @@ class Session:
         self._session, self._certified = session, certified  # whether certificates say whose keys are whose
         self.events = Events()
         """Everything received by subscriptions."""
-        self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+        self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LinkEventsListener[None]] = []
         self._over: list[threading.Event] = []  # of their callbacks
         self._tokens: list[zenoh.LivelinessToken] = []
         self._prefixes: dict[str, int] = {}  # length of what precedes a sender in a topic's keys
-        self._rates, self._cut = Rates(), dict[str, float]()  # machines that are cut off, and until when
-        self._opened: zenoh.LinkEventsListener[None] | None = None
+        self.rates = Rates()
+        """Of messages that are a burden."""
+        self._cut: dict[str, float] = {}  # machines, and until when
+        if certified:
+            opened = self._callback(self._on_link)
+            self._declared.append(_as_daemon(lambda: session.info.declare_link_events_listener(opened)))
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
         """Send bytes to the subscribers of the key; without `block` a receiver that is stuck loses them."""
@@ -133,7 +137,7 @@ class Session:
         That is an event of the topic FLOOD. Without certificates nobody knows who sent it, and nothing is done.
         """
         name = event.key[self._prefixes[event.topic] :].partition("/")[0]
-        if self._certified and self._rates.flooding(name, time.monotonic()) and self.cut(name):
+        if self._certified and self.rates.flooding(name, time.monotonic()) and self.cut(name):
             self.events.put(Event(FLOOD, name, b""))
 
     def cut(self, name: str) -> bool:
@@ -145,13 +149,10 @@ class Session:
             return False
         self._cut[name] = time.monotonic() + _CUT
         log.warning("machine %s sends more messages than any worker: it is cut off for %g s", name, _CUT)
-        threading.Thread(target=self._sever, args=(name,), daemon=True).start()  # this may be a callback of Zenoh's
+        threading.Thread(target=self._silence, args=(name,), daemon=True).start()  # this may be a callback of Zenoh's
         return True
 
-    def _sever(self, name: str) -> None:
-        if self._opened is None:
-            watcher = self._callback(self._on_link)
-            self._opened = self._session.info.declare_link_events_listener(watcher)
+    def _silence(self, name: str) -> None:
         silence({_address(link) for link in self._session.info.links() if link.auth_identifier == name})
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
@@ -165,8 +166,6 @@ class Session:
         """Undeclare everything and wait for the callbacks: one left running in Rust aborts the interpreter's exit."""
         for token in self._tokens:
             token.undeclare()
-        if self._opened is not None:
-            self._opened.undeclare()
         for declared in self._declared:
             declared.undeclare()
         for over in self._over:

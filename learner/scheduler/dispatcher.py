@@ -91,6 +91,7 @@ class Dispatcher:
         self._status, self._alone = StatusAnswer(), time.monotonic()
         self._progress: GenerationStats | None = None
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
+        session.rates.most = max(session.rates.most, 4 * config.instances)  # each worker asks once per second
         session.subscribe("want", keys.want(farm, "**"), most=_UNREAD)
         session.subscribe("result", keys.result(farm, self.run, "**"), most=_UNREAD)
         session.watch("worker", keys.worker_token(farm, "**"))
@@ -206,15 +207,14 @@ class Dispatcher:
         return self._session.events.waiting(_WAIT if due is None else max(0.001, min(due, _WAIT)))
 
     def _take(self, event: Event) -> None:
-        if event.topic == FLOOD:
-            self._session.publish(keys.cut(self._farm, event.key), b"", block=False)  # to routers
-            return
         ignored = self.notices.ignored.total()
         try:
             if event.topic == "want":
                 self._asked(event)
             elif event.topic == "worker":
                 self._liveliness(event)
+            elif event.topic == FLOOD:
+                self._session.publish(keys.cut(self._farm, event.key), b"", block=False)  # to routers
             else:
                 self._result(event)
         except MessageError as error:

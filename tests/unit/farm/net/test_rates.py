@@ -2,7 +2,7 @@
 
 from farm.net.rates import Rates
 
-MOST = 2000  # messages in three seconds
+MOST = Rates().most
 
 
 def test_only_the_machine_that_sends_too_much_is_named() -> None:
