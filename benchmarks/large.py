@@ -25,6 +25,7 @@ import scaling
 from farm.net import codec, keys, session
 from farm.net.events import Event
 from farm.net.messages import WorkRequest
+from farm.net.rates import Rates
 from farm.net.work import Chunk, Results
 from learner.run import setup
 from learner.run.config import RunConfig, configure
@@ -52,7 +53,7 @@ class Network:
         self._work = scaling.MadeUp(problem.task, problem.policy)
         self._mu, self._traces = np.zeros(problem.policy.size), config.traces
         self._pair, self._latency = pair, latency
-        self.events = self
+        self.events, self.rates = self, Rates()
         self._begun = time.thread_time()
         self._waited = 0.0
         self._other = 0.0  # processor time that is not the learner's [s]
@@ -107,9 +108,9 @@ class Network:
             self._send(done + self._latency, Event("result", keys.result(FARM, chunk.run, name), codec.encode(results)))
 
     def nothing(self, *_: object, **__: object) -> None:
-        """Subscriptions, tokens and queries: no other machine asks."""
+        """Subscriptions, tokens and queries: no other machine asks, or floods."""
 
-    subscribe = watch = token = answer = answer_asked = nothing
+    subscribe = watch = token = answer = answer_asked = burden = nothing
 
     def outlet(self, _: str) -> Silent:
         """A publisher for reports."""

@@ -136,9 +136,11 @@ class Session:
 
         That is an event of the topic FLOOD. Without certificates nobody knows who sent it, and nothing is done.
         """
-        name = event.key[self._prefixes[event.topic] :].partition("/")[0]
-        if self._certified and self.rates.flooding(name, time.monotonic()) and self.cut(name):
-            self.events.put(Event(FLOOD, name, b""))
+        worker = event.key[self._prefixes[event.topic] :]
+        if self._certified and self.rates.flooding(worker, time.monotonic()):
+            name = worker.partition("/")[0]
+            if self.cut(name):
+                self.events.put(Event(FLOOD, name, b""))
 
     def cut(self, name: str) -> bool:
         """Silence the connections of the machine with this certificate, and for a minute each new one; false if done.
