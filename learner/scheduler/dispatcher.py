@@ -292,8 +292,8 @@ class Dispatcher:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
         if sender in self._roster.refused:
             raise MessageError("a result of a worker that is not admitted", "refused")
-        if not self._ledger.scheduler.given(sender):  # before it is decoded: a flood must cost little
-            raise MessageError("a result of a worker that has no jobs of this round", "unasked")
+        if kind := self._ledger.scheduler.useless(sender):  # before it is decoded: a flood must cost little
+            raise MessageError("a result of a worker without jobs of this round", kind)
         try:
             message: Results | Failure = codec.decode(event.payload, Results)
         except MessageError as first:

@@ -29,6 +29,8 @@ class Worker:
     """Time of its last message about its jobs [s]."""
     proven: bool = False
     """It has sent a result."""
+    asked: bool = False
+    """It was given jobs of an earlier round."""
     late: int = 0
     """Rounds since its last result at whose end it was late."""
     until: float = -math.inf
@@ -52,6 +54,8 @@ class JobTable:
 
     def __init__(self, copies: int) -> None:
         self.copies = copies
+        self.given: defaultdict[str, set[int]] = defaultdict(set)
+        """Every job of this round sent to a worker, connected or not."""
         self.workers: dict[str, Worker] = {}
         """Those that may be given jobs."""
         self.outside: dict[str, Worker] = {}
@@ -70,7 +74,6 @@ class JobTable:
         # Jobs that are not done, and the workers expected to answer, in the order of issue.
         self.open: dict[int, list[str]] = {index: [] for index in range(jobs)}
         self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)  # number of errors per job and worker
-        self.given: defaultdict[str, set[int]] = defaultdict(set)  # every job sent to a worker, connected or not
         self._pending = list(range(jobs))  # a heap; done jobs are removed when they reach the top
         # Job and the time of its change to this state [s]; oldest first, as the clock is monotonic.
         self.out: dict[int, float] = {}  # one more copy is permitted
@@ -84,6 +87,8 @@ class JobTable:
                     host = name.partition("/")[0]
                     times[host] = max(times.get(host, 0), worker.late)
             worker.held.clear()
+            worker.asked |= bool(self.given.get(name))
+        self.given.clear()
         for name, worker in (*self.workers.items(), *self.outside.items()):
             if not worker.proven and (host := name.partition("/")[0]) in times:
                 worker.bench(times[host], now)

@@ -120,9 +120,15 @@ class Scheduler:
             errors.pop(worker, None)
         return self.lost(worker)
 
-    def given(self, worker: str) -> bool:
-        """Whether it was given jobs of this round."""
-        return bool(self._table.given.get(worker))
+    def useless(self, worker: str) -> Verdict | None:
+        """The verdict on all results of a worker that was given no job of this round; None if it was given some.
+
+        "stale": it is connected and was given jobs of an earlier round, so that the results may be late copies.
+        """
+        if self._table.given.get(worker):
+            return None
+        state = self._table.workers.get(worker)
+        return "stale" if state is not None and state.asked else "unasked"
 
     def results(self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0) -> list[Verdict]:
         """Note the results in a message, simulated in some seconds (0: not measured); return a verdict for each.

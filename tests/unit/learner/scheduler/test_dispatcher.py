@@ -151,6 +151,23 @@ def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
     assert dispatcher.notices.ignored == {"stale": 1}
 
 
+def test_a_late_copy_of_a_worker_that_has_nothing_to_do_any_more(learner: Learner, hire: Hire) -> None:
+    dispatcher = learner.show()
+    worker = hire("a/1")
+    worker.want(5)
+    collected = learner.collect(jobs(1))
+    first = worker.chunk()
+    worker.answer(worker.results(first))
+    collected.result(WAIT)
+    worker.want(0)
+    worker.answer(worker.results(first))
+    collected = learner.collect(jobs(1))
+    worker.want(5)
+    worker.work(1)
+    collected.result(WAIT)
+    assert dispatcher.notices.ignored == {"stale": 1}
+
+
 def test_a_worker_that_is_gone(endpoint: str, learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     dispatcher = learner.show()

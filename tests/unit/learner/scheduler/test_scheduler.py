@@ -78,6 +78,17 @@ def test_results_count_of_workers_that_were_given_the_job_only():
     assert scheduler.remaining == 1
 
 
+def test_results_of_a_worker_that_was_given_nothing_may_be_of_an_earlier_round():
+    scheduler = started(1, ["a", "b"])
+    assert given(scheduler.assign(0.0)) == {"a": [0]}
+    assert (scheduler.useless("a"), scheduler.useless("b")) == (None, "unasked")
+    for _ in range(2):
+        scheduler.begin(1)
+        assert (scheduler.useless("a"), scheduler.useless("b")) == ("stale", "unasked")
+    scheduler.lost("a")
+    assert scheduler.useless("a") == "unasked"
+
+
 def test_a_worker_that_left_after_its_result_still_counts_and_the_job_is_not_sent_any_more():
     scheduler = started(2, ["a"], credits=1)
     assert given(scheduler.assign(0.0)) == {"a": [0]}
