@@ -192,7 +192,7 @@ class Dispatcher:
 
         Its jobs of this round are to be collected again.
         """
-        wrong = self._judging.settle(self._ledger.audit)
+        wrong = self._judging.settle(self._ledger.audit, self.notices.once)
         for host, generation in wrong.items():
             self._expel(host, f"host {host} was wrong in a job of generation {generation}")
         return bool(wrong)

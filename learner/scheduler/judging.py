@@ -1,5 +1,6 @@
 """What the learner's own machine decides: disputes of a round, and checks that no second host could make. Pure."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from farm.arrays import FloatArray
@@ -68,8 +69,11 @@ class Judging:
                 self._normaliser, self._terms, self._round.answer(index),
             )  # fmt: skip
 
-    def settle(self, audit: Audit) -> dict[str, int]:
-        """Check the hosts that are owed a check; return those that were wrong, each with the generation."""
+    def settle(self, audit: Audit, warn: Callable[[str], None]) -> dict[str, int]:
+        """Check the hosts that are owed a check; return those that were wrong, each with the generation.
+
+        `warn` is told of hosts that nobody can check: they alone have their canary, or this machine cannot simulate.
+        """
         wrong = {}
         for name, owed in self._owed.items():
             found = self._asked(owed.canary, owed.mu, owed.job, owed.normaliser, owed.terms)
@@ -77,6 +81,9 @@ class Judging:
                 audit.credit(name)
             elif found is not None:
                 wrong[name] = owed.generation
+            else:
+                kind = "the learner's machine does not round as it does, or cannot simulate the task"
+                warn(f"the last answers of host {name} are unchecked: no other host could repeat them, and {kind}")
         self._owed.clear()
         return wrong
 

@@ -259,6 +259,19 @@ def test_what_no_second_host_can_check_is_checked_before_the_result_is_final(
         assert finished(run) == honest
 
 
+def test_a_mixed_run_says_which_host_nobody_can_check(
+    certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def alone(said: Any) -> Any:
+        return replace(said, canary=BOGUS) if isinstance(said, WorkRequest) else LIES["the last bit"](said)
+
+    place, file = replace(checked(tls(), certs, 0.02), mixed=True), file_of(config)
+    with opened(config, tmp_path / "r", place) as run, host(place.listen, certs, "liar", file, alone):
+        finished(run)
+    assert run.summary["checks"] == {"liar": 0}
+    assert "the last answers of host liar are unchecked" in caplog.text
+
+
 def test_hosts_that_only_say_that_jobs_fail_stop_no_run(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
