@@ -170,8 +170,9 @@ class Session:
             token.undeclare()
         for declared in self._declared:
             declared.undeclare()
+        until = time.monotonic() + _JOIN_S
         for over in self._over:
-            over.wait(_JOIN_S)
+            over.wait(max(0.0, until - time.monotonic()))
 
     def _put(
         self, topic: str, key: str, *, wake: bool = True, most: int | None = None

@@ -16,8 +16,14 @@ from farm.errors import FarmError
 _DESCRIPTORS: Final = 65_536
 _FEWEST: Final = 64  # enough files and connections for a run with two workers
 _ATTACH_FILTER: Final = 26  # SO_ATTACH_FILTER, which the module socket does not name
-_DROP: Final = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))  # BPF: return 0, take no byte
-_FILTER: Final = struct.pack("HP", 1, ctypes.addressof(_DROP))  # struct sock_fprog
+_NO_DATA: Final = (  # classic BPF: take segments that are no longer than their header, which acknowledge what we send
+    (0x30, 0, 0, 12),  # A = byte 12 of the TCP header, whose upper half is the header's length in words
+    (0x54, 0, 0, 0xF0), (0x74, 0, 0, 2), (0x07, 0, 0, 0),  # X = (A & 0xF0) >> 2
+    (0x80, 0, 0, 0), (0x1D, 0, 1, 0),  # A = the segment's length; if it is not X, skip one
+    (0x06, 0, 0, 0xFFFFFFFF), (0x06, 0, 0, 0),  # take the segment; take nothing
+)  # fmt: skip
+_PROGRAM: Final = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in _NO_DATA))
+_FILTER: Final = struct.pack("HP", len(_NO_DATA), ctypes.addressof(_PROGRAM))  # struct sock_fprog
 _OPEN: Final = Path("/dev/fd")  # a process' descriptors, on Linux and macOS
 
 
@@ -44,7 +50,9 @@ def raise_descriptors() -> None:
 
 
 def silence(peers: Collection[str]) -> None:
-    """Let nothing more in from these addresses, HOST:PORT, over this process's connections; IPv6 has brackets.
+    """Let no more data in from these addresses, HOST:PORT, over this process's connections; IPv6 has brackets.
+
+    What this process sends is still acknowledged, so that nothing waits for the other side.
 
     Zenoh, which has opened them, has no call for it; it gives up a silent connection when its lease is over. One that
     is closed instead would be opened again within milliseconds, and each time costs a handshake: only on systems other

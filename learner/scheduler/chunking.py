@@ -52,7 +52,8 @@ class Chunking:
         self._config = config
         self._samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES)
         self._waits: deque[float] = deque(maxlen=_SAMPLES)
-        self._median: float | None = None  # computed when it is needed
+        self._median: float | None = None  # computed when it is needed, as is the next one
+        self._wait: float | None = 0.0
         self._overhead = 0.0
         self._seconds = 0.0  # duration of the round's longest chunk
 
@@ -66,7 +67,7 @@ class Chunking:
         """
         self._waits.append(max(wait, 0.0))
         self._samples.append((jobs, min(seconds, self._waits[-1]) or self._waits[-1]))
-        self._median = None
+        self._median = self._wait = None
 
     @property
     def median(self) -> float | None:
@@ -96,9 +97,9 @@ class Chunking:
     @property
     def patience(self) -> float:
         """Time after which an unanswered job is overdue [s]; allows for a wait behind another chunk."""
-        factor = self._config.straggler_factor
-        waits = median(self._waits) if self._waits else 0.0
-        return max(self._config.straggler_seconds, factor * max(waits, self._seconds))
+        if self._wait is None:
+            self._wait = median(self._waits)
+        return max(self._config.straggler_seconds, self._config.straggler_factor * max(self._wait, self._seconds))
 
     def chunk(self, jobs: int, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.

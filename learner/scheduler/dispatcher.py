@@ -292,7 +292,7 @@ class Dispatcher:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
         if sender in self._roster.refused:
             raise MessageError("a result of a worker that is not admitted", "refused")
-        if kind := self._ledger.scheduler.useless(sender):  # before it is decoded: a flood must cost little
+        if kind := self._ledger.scheduler.unread(sender):  # before it is decoded: a flood must cost little
             raise MessageError("a result of a worker without jobs of this round", kind)
         try:
             message: Results | Failure = codec.decode(event.payload, Results)
@@ -321,7 +321,7 @@ class Dispatcher:
             others = "this machine" if job in self._judging.decided else "two other hosts"
             where = f"than {others} for job {job} of round {self._header.round}"
             self._expel(host, f"host {host} gave different numbers {where}")
-        self.notices.ignored.update(verdict for verdict in verdicts if verdict != "new")
+        self.notices.ignored.update(verdict for verdict in verdicts if verdict not in ("new", "tried"))
         if "unasked" in verdicts:
             self.notices.once(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
         self._roster.did(message.worker, len(message.returns), now)

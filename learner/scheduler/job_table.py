@@ -13,8 +13,7 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-_AT_FIRST: Final = 8  # workers of a host that take part before one of them has sent a result
-_LATE: Final = 7  # a worker that is always late is tried once a minute
+_LATE: Final = 7  # a worker that never answers in time is tried once a minute
 
 
 @dataclass
@@ -32,7 +31,7 @@ class Worker:
     asked: bool = False
     """It was given jobs of an earlier round."""
     late: int = 0
-    """Rounds since its last result at whose end it was late."""
+    """Rounds since its last result at whose end it was late, or trials that it did not answer."""
     until: float = -math.inf
     """While it is benched, its requests do not change that before this time [s]."""
     benched: bool = False
@@ -56,19 +55,24 @@ class JobTable:
         self.copies = copies
         self.given: defaultdict[str, set[int]] = defaultdict(set)
         """Every job of this round sent to a worker, connected or not."""
+        self.known: dict[str, Worker] = {}
+        """All that are connected."""
         self.workers: dict[str, Worker] = {}
-        """Those that may be given jobs."""
-        self.outside: dict[str, Worker] = {}
-        """Those that wait until more of their host have sent results; they cost nothing."""
-        self._hosts: defaultdict[str, Counter[bool]] = defaultdict(Counter)  # workers, by whether they are proven
+        """Those that take part. The others have answered nothing yet, while some have: they are tried first, which
+        keeps nobody waiting."""
+        self.asking: dict[str, None] = {}
+        """Those that are to be tried, in the order in which they asked."""
+        self.trials: dict[str, int] = {}
+        """Jobs of this round that are trials, by worker."""
+        self._again: dict[str, None] = {}  # workers that are tried once more, at a round's beginning
         self.begin(0)
 
     def begin(self, jobs: int, late: float = math.inf, now: float = 0.0) -> None:
         """Forget every job; 0..jobs-1 are pending, and no worker holds anything.
 
         A worker that still holds a job sent before `late` [s] is benched: each time that it has been late without a
-        result for twice as long, so that workers that only ask for jobs delay few rounds. Workers of one host that have
-        never sent a result are benched together, so that many of them delay no more rounds than one.
+        result for twice as long. If it has never sent one, and others have, it is tried before it takes part again. A
+        trial that was not answered in the last round is repeated once: it may have come when that round was over.
         """
         self.size = jobs
         # Jobs that are not done, and the workers expected to answer, in the order of issue.
@@ -79,52 +83,56 @@ class JobTable:
         self.out: dict[int, float] = {}  # one more copy is permitted
         self.full: dict[int, float] = {}  # all copies are out
         self.failed: dict[int, float] = {}  # no worker holds it after an error
-        times: dict[str, int] = {}  # how often a host's workers without a result were late
-        for name, worker in self.workers.items():
+        proven = self._any_proven()
+        for name, worker in self.known.items():
+            worker.asked |= bool(self.given.get(name))
             if worker.overdue(late):
                 worker.bench(worker.late + 1, now)
-                if not worker.proven:
-                    host = name.partition("/")[0]
-                    times[host] = max(times.get(host, 0), worker.late)
+                if proven and not worker.proven:
+                    del self.workers[name]
             worker.held.clear()
-            worker.asked |= bool(self.given.get(name))
         self.given.clear()
-        for name, worker in (*self.workers.items(), *self.outside.items()):
-            if not worker.proven and (host := name.partition("/")[0]) in times:
-                worker.bench(times[host], now)
+        silent = self.known.keys() - self.workers.keys() - self._again.keys()
+        self._again = {name: None for name in self.trials if name in silent}
+        self.asking = self._again | self.asking
+        self.trials.clear()
 
     def came(self, worker: str, credits: int) -> Worker:
-        """The state of a worker; a new one takes part, unless too many of its host do that have sent no result."""
-        state = self.workers.get(worker) or self.outside.get(worker)
-        if state is None:
-            state = self.outside[worker] = Worker(credits)
-            self._enter(worker.partition("/")[0], [worker])
-        return state
+        """The state of a worker; a new one is to be tried, unless no worker has answered yet."""
+        if worker not in self.known:
+            self.known[worker] = Worker(credits)
+            if not self._any_proven():
+                self.workers[worker] = self.known[worker]
+        return self.known[worker]
 
     def left(self, worker: str) -> None:
-        """Forget a worker that holds nothing any more; another one of its host may take part."""
-        self.outside.pop(worker, None)
-        state, host = self.workers.pop(worker, None), worker.partition("/")[0]
-        if state is not None:
-            self._hosts[host][state.proven] -= 1
-            self._enter(host)
-            if not self._hosts[host].total():
-                del self._hosts[host]
+        """Forget a worker that holds nothing any more."""
+        for table in (self.known, self.workers, self.asking):
+            table.pop(worker, None)
+        if not self._any_proven():
+            self.workers.update(self.known)
+            self.asking.clear()
 
-    def _prove(self, worker: str, state: Worker) -> None:
-        if not state.proven:
-            state.proven, host = True, worker.partition("/")[0]
-            self._hosts[host].update({True: 1, False: -1})
-            self._enter(host)
+    def prove(self, worker: str) -> None:
+        """A worker has answered, so it takes part."""
+        self.asking.pop(worker, None)
+        if worker in self.known:
+            state = self.workers[worker] = self.known[worker]
+            state.proven, state.benched, state.late = True, False, 0
 
-    def _enter(self, host: str, names: Sequence[str] | None = None) -> None:
-        """Let workers of a host take part that wait outside, or those of these names, as many as may."""
-        count = self._hosts[host]
-        for name in [each for each in self.outside if each.partition("/")[0] == host] if names is None else names:
-            if count[False] >= max(_AT_FIRST, count[True]):
-                return
-            self.workers[name] = self.outside.pop(name)
-            count[False] += 1
+    def trial(self, worker: str, now: float) -> int:
+        """Give a new worker one job, an open one if there is one; others may take it too, so nobody waits for it."""
+        tried, last = set(self.trials.values()), next(reversed(self.open), self.size - 1)
+        index = next((index for index in reversed(self.open) if index not in tried), last)
+        del self.asking[worker]
+        if worker not in self._again:
+            self.known[worker].bench(self.known[worker].late + 1, now)
+        self.trials[worker] = index
+        self.given[worker].add(index)
+        return index
+
+    def _any_proven(self) -> bool:
+        return any(state.proven for state in self.workers.values())
 
     @property
     def waiting(self) -> int:
@@ -170,13 +178,12 @@ class JobTable:
 
     def finish(self, worker: str, indices: Sequence[int]) -> list[bool]:
         """Note results of jobs of this round; return for each whether it was not done before."""
+        if indices:
+            self.prove(worker)
         held: dict[int, float] = {}
         state = self.workers.get(worker)
         if state is not None:
             held, state.benched = state.held, False
-            if indices:
-                state.late = 0
-                self._prove(worker, state)
         done: list[bool] = []
         for index in indices:
             held.pop(index, None)
@@ -234,12 +241,10 @@ class JobTable:
     def spare(self, most: int, late: float) -> list[tuple[bool, int, str]]:
         """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for a silent one.
 
-        Those without a result that have been late, or hold a job sent before `late` [s], are left out: a copy that
-        they hold is missed only after a long time. But not if all workers are like that.
+        Those without a result that hold a job sent before `late` [s] are left out: a copy that they hold is missed only
+        after a long time. But not if all workers are like that.
         """
-        silent = {
-            name for name, state in self.workers.items() if not state.proven and (state.late or state.overdue(late))
-        }
+        silent = {name for name, state in self.workers.items() if not state.proven and state.overdue(late)}
         if len(silent) == len(self.workers):
             silent.clear()
         spare = [(not self.workers[name].proven, held, name) for held, name in self.free(most) if name not in silent]

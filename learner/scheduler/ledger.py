@@ -43,7 +43,7 @@ class Ledger:
             checks = self.audit.assign(self.scheduler.willing, now, patience)
         for worker, indices in checks.items():
             self.scheduler.lend(worker, indices)
-        return [*checks.items(), *(() if complete else self.scheduler.assign(now))]
+        return [*checks.items(), *self.scheduler.assign(now)]
 
     def put(
         self, message: Results, now: float, judge: Callable[[int, str], bytes | None] | None = None
@@ -62,10 +62,10 @@ class Ledger:
         self.round.put(message, place, new)
         if new.any():
             self.audit.counted(message.worker, message.jobs[new])
-        if "doubled" not in verdicts:
+        if not {"doubled", "tried"}.intersection(verdicts):
             return verdicts, {}
         for at, (job, verdict) in enumerate(zip(message.jobs.tolist(), verdicts, strict=True)):
-            if verdict == "doubled":  # for a check or after a copy: two hosts must agree to the bit
+            if verdict in ("doubled", "tried"):  # for a check, after a copy, a trial: two hosts must agree to the bit
                 stored, sent = self.round.answer(job), self.round.given(message, job)
                 verdicts[at] = "new" if self.audit.answered(message.worker, job, stored, sent) else verdict
         return verdicts, self.audit.settle(judge)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections import ChainMap
 from collections.abc import Container, Sequence, Set
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -23,7 +22,7 @@ from learner.scheduler.job_table import JobTable
 
 __all__ = ["Assignment", "Scheduler", "SchedulerConfig", "Verdict"]
 
-Verdict: TypeAlias = Literal["new", "doubled", "stale", "unasked"]
+Verdict: TypeAlias = Literal["new", "doubled", "tried", "stale", "unasked"]
 
 # If all copies of a job are out, the one of the oldest holder is replaced after this many times the
 # patience: workers that hang but stay connected must not block a round forever.
@@ -67,7 +66,7 @@ class Scheduler:
     @property
     def workers(self) -> Set[str]:
         """Names of the known workers."""
-        return ChainMap(self._table.workers, self._table.outside).keys()
+        return self._table.known.keys()
 
     @property
     def willing(self) -> list[str]:
@@ -102,7 +101,10 @@ class Scheduler:
         self._tick(now)
         state = self._table.came(worker, credits)
         state.credits, state.benched = credits, state.benched and self._now < state.until
-        if idle and worker in self._table.workers:
+        if worker not in self._table.workers:
+            if credits and not state.benched and (idle or not state.late):
+                self._table.asking[worker] = None
+        elif idle:
             state.answered = self._now
             self._reissued += self._table.release(worker, self._now)
 
@@ -120,20 +122,24 @@ class Scheduler:
             errors.pop(worker, None)
         return self.lost(worker)
 
-    def useless(self, worker: str) -> Verdict | None:
-        """The verdict on all results of a worker that was given no job of this round; None if it was given some.
+    def unread(self, worker: str) -> Verdict | None:
+        """The verdict on results of a worker that was given no job of this round, unread; None if it was given some.
 
-        "stale": it is connected and was given jobs of an earlier round, so that the results may be late copies.
+        "stale": it is connected and was given jobs of an earlier round. So it has answered, and takes part.
         """
         if self._table.given.get(worker):
             return None
-        state = self._table.workers.get(worker)
-        return "stale" if state is not None and state.asked else "unasked"
+        state = self._table.known.get(worker)
+        if state is None or not state.asked:
+            return "unasked"
+        self._table.prove(worker)
+        return "stale"
 
     def results(self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0) -> list[Verdict]:
         """Note the results in a message, simulated in some seconds (0: not measured); return a verdict for each.
 
-        Only "new" counts. "doubled": the job was done before; "stale": not a job of this round; "unasked": this
+        Only "new" counts. "doubled": the job was done before; "tried": so it was, but the worker did it to show that it
+        answers; "stale": not a job of this round; "unasked": this
         worker was never given it in this round. Results of a worker that has left count. The caller must drop
         messages of other rounds.
         """
@@ -145,6 +151,7 @@ class Scheduler:
             "stale" if not 0 <= index < self._table.size
             else "unasked" if index not in given
             else "new" if next(new)
+            else "tried" if self._table.trials.get(worker) == index
             else "doubled"
             for index in indices
         ]  # fmt: skip
@@ -195,6 +202,7 @@ class Scheduler:
         if not self._table.any_pending():
             chunks += self._again(self._table.out)
             chunks += self._again(self._table.full)
+        chunks += self._trials()
         self._seen = self._now
         return chunks
 
@@ -253,6 +261,12 @@ class Scheduler:
                 heapq.heappush(free, (held, name))
                 load += held
         return chunks
+
+    def _trials(self) -> list[Assignment]:
+        """One job for each new worker that asks."""
+        if not self._table.size:
+            return []
+        return [Assignment(name, (self._table.trial(name, self._now),)) for name in list(self._table.asking)]
 
     def _again(self, queue: dict[int, float]) -> list[Assignment]:
         """Issue failed or overdue jobs to workers that have room and do not hold them."""

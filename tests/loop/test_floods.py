@@ -178,7 +178,7 @@ def honest(endpoint: str, certs: Path, file: Path) -> Iterator[None]:
             yield
 
 
-def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_path: Path) -> None:
+def test_silent_instances_of_one_certificate_delay_no_round(certs: Path, tmp_path: Path) -> None:
     file, hashes, late = pole(tmp_path / "mine"), [], 0
     config = farm.configure(f"{file}:Pole", generations=200, pairs=15)
     for name in ("alone", "flooded"):
@@ -197,7 +197,4 @@ def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_p
                         before = time.monotonic()
         hashes.append(run.summary["parameters_sha256"])
     assert hashes[0] == hashes[1]
-    tries = 4.0 + np.log2(
-        1.0 + run.summary["seconds"]
-    )  # of a host that never answers; the machine may delay two rounds
-    assert late <= tries, f"{late} of 199 rounds were late, in {run.summary['seconds']} s"
+    assert late <= 3, f"{late} of 199 rounds were late; a busy machine delays some"

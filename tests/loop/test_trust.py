@@ -346,7 +346,7 @@ def test_a_liar_costs_time_and_no_number(
     certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture, lie: Late
 ) -> None:
     """The liar is alone at first, so that its lies are in the state when the second host comes."""
-    config, file = replace(config, generations=12), file_of(config)
+    config, file = replace(config, generations=40), file_of(config)
     place = checked(tls(), certs)
     with opened(config, tmp_path / "honest", place) as run, host(place.listen, certs, "a", file):
         honest = finished(run)
@@ -364,11 +364,11 @@ def test_a_liar_costs_time_and_no_number(
             assert run.learner.state.generation == 0, "the liar answered in the first generation"
             assert finished(run) == honest
     lines = run.learner.folder.progress()
-    assert [line.generation for line in lines] == list(range(1, 13)), "none is doubled"
-    assert [line.rollouts for line in lines] == [12 * each for each in range(1, 13)]
+    assert [line.generation for line in lines] == list(range(1, 41)), "none is doubled"
+    assert [line.rollouts for line in lines] == [12 * each for each in range(1, 41)]
     assert run.summary["undone"] == rows[-1]
     assert refused(caplog) == {"liar"}
-    assert len(run.learner.folder.parameters.rows()) == 12
+    assert len(run.learner.folder.parameters.rows()) == 40
 
 
 def test_a_run_goes_back_no_further_than_the_liars_first_answer(

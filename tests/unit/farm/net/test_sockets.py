@@ -1,7 +1,9 @@
 """This process's own connections."""
 
+import secrets
 import socket
 import sys
+import threading
 from contextlib import ExitStack
 
 import pytest
@@ -29,5 +31,13 @@ def test_a_silenced_connection_receives_nothing_and_stays_open(family: int, host
         far[0].settimeout(0.2)
         with pytest.raises(TimeoutError):
             far[0].recv(5)
-        far[0].sendall(b"still open")
-        assert near[0].recv(10) == b"still open"
+        sent = secrets.token_bytes(10_000_000)  # more than any buffer, so that near has to acknowledge it
+        sending = threading.Thread(target=far[0].sendall, args=(sent,), daemon=True)
+        far[0].settimeout(10.0)
+        sending.start()
+        near[0].settimeout(10.0)
+        got = bytearray()
+        while len(got) < len(sent):
+            got += near[0].recv(1_000_000)
+        sending.join(10.0)
+        assert got == sent

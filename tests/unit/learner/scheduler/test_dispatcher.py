@@ -160,10 +160,12 @@ def test_a_late_copy_of_a_worker_that_has_nothing_to_do_any_more(learner: Learne
     worker.answer(worker.results(first))
     collected.result(WAIT)
     worker.want(0)
-    worker.answer(worker.results(first))
     collected = learner.collect(jobs(1))
-    worker.want(5)
-    worker.work(1)
+    other = hire("b/1")
+    other.want(5)
+    chunk = other.chunk()
+    worker.answer(worker.results(first))
+    other.answer(other.results(chunk))
     collected.result(WAIT)
     assert dispatcher.notices.ignored == {"stale": 1}
 

@@ -81,12 +81,12 @@ def test_results_count_of_workers_that_were_given_the_job_only():
 def test_results_of_a_worker_that_was_given_nothing_may_be_of_an_earlier_round():
     scheduler = started(1, ["a", "b"])
     assert given(scheduler.assign(0.0)) == {"a": [0]}
-    assert (scheduler.useless("a"), scheduler.useless("b")) == (None, "unasked")
+    assert (scheduler.unread("a"), scheduler.unread("b")) == (None, "unasked")
     for _ in range(2):
         scheduler.begin(1)
-        assert (scheduler.useless("a"), scheduler.useless("b")) == ("stale", "unasked")
+        assert (scheduler.unread("a"), scheduler.unread("b")) == ("stale", "unasked")
     scheduler.lost("a")
-    assert scheduler.useless("a") == "unasked"
+    assert scheduler.unread("a") == "unasked"
 
 
 def test_a_worker_that_left_after_its_result_still_counts_and_the_job_is_not_sent_any_more():
@@ -404,23 +404,21 @@ def test_a_worker_that_hung_at_the_end_of_a_round_is_not_waited_for_again():
     assert given(scheduler.assign(1.1)) == {"b": [0]}
     scheduler.results("b", [0], 1.2)
     assert given(scheduler.assign(1.2)) == {"b": [1]}
-    scheduler.results("a", [0], 1.3)  # of the round gone by, perhaps: it lives
+    assert scheduler.unread("a") == "stale", "results of the round gone by: it lives"
     scheduler.begin(2)
     assert given(scheduler.assign(1.4)) == {"a": [0], "b": [1]}
 
 
-def test_no_copy_goes_to_a_worker_that_was_late_and_has_never_answered():
-    scheduler = started(2, ["a", "silent"], credits=1)
-    assert given(scheduler.assign(0.0)) == {"a": [0], "silent": [1]}
+def test_no_copy_goes_to_a_worker_that_is_late_and_has_never_answered():
+    scheduler = started(3, ["a", "s1", "s2"], credits=1)
+    assert given(scheduler.assign(0.0)) == {"a": [0], "s1": [1], "s2": [2]}
     scheduler.results("a", [0], 0.1)
+    for silent in ("s1", "s2"):
+        scheduler.want(silent, 9, 0.2)
     assert given(scheduler.assign(1.0)) == {"a": [1]}
+    assert scheduler.assign(1.05) == [], "a has no room, the silent ones have"
     scheduler.results("a", [1], 1.1)
-    scheduler.begin(2)
-    scheduler.want("silent", 9, 1.2)
-    assert given(scheduler.assign(1.2)) == {"a": [0], "silent": [1]}
-    assert scheduler.assign(2.5) == [], "a has no room, and silent has for both"
-    scheduler.results("a", [0], 2.6)
-    assert given(scheduler.assign(2.6)) == {"a": [1]}
+    assert given(scheduler.assign(1.1)) == {"a": [2]}
 
 
 def test_the_last_worker_is_asked_again():
@@ -509,30 +507,74 @@ def test_a_wrong_setting_is_named(name, value):
         SchedulerConfig(**{name: value})
 
 
-def test_instances_that_never_answer_make_no_chunk_smaller():
+def test_a_new_worker_is_given_one_job_that_others_do_as_well():
+    scheduler = started(40, ["a"], credits=8, seconds=0.01)
+    first = given(scheduler.assign(0.0))["a"]
+    scheduler.results("a", first, 0.1)
+    scheduler.want("b", 8, 0.1)
+    jobs = given(scheduler.assign(0.1))
+    assert jobs["b"] == [39]
+    scheduler.results("a", jobs["a"], 0.2)
+    scheduler.results("b", [39], 0.2)
+    assert len(given(scheduler.assign(0.2))["b"]) > 1, "it has answered"
+    assert 39 not in given(scheduler.assign(0.2)).values()
+
+
+def test_nobody_waits_for_workers_that_have_never_answered():
     silent = [f"liar/{i}" for i in range(100)]
-    scheduler = started(40, [*silent, "a/1"], credits=8, seconds=0.01)
-    scheduler.assign(0.0)
-    scheduler.begin(40)
+    scheduler = started(40, ["a"], credits=99, seconds=0.01)
+    scheduler.results("a", given(scheduler.assign(0.0))["a"], 0.1)
     for worker in silent:
         scheduler.want(worker, 8, 0.1)
-    assert scheduler.workers == {*silent, "a/1"}
-    jobs = given(scheduler.assign(0.1))
-    assert len(jobs) == 9, "eight of the silent host"
-    assert len(jobs["a/1"]) > 1
+    assert scheduler.workers == {*silent, "a"}
+    now, tried = 0.1, Counter()
+    for _ in range(400):
+        while not scheduler.complete:
+            jobs = given(scheduler.assign(now))
+            now += 0.1
+            assert jobs.pop("a", None), "there is always something to do"
+            assert all(len(indices) == 1 for indices in jobs.values())
+            tried.update(jobs.keys())
+            scheduler.results("a", list(range(40)), now)
+        scheduler.begin(40)
+        for worker in silent:
+            scheduler.want(worker, 8, now, idle=True)
+    assert set(tried) == set(silent)
+    assert set(tried.values()) == {2 * 6}, "the pauses between them double"
+    assert scheduler.reissued == 0
 
 
-def test_workers_of_a_host_take_part_as_others_of_it_answer():
-    names = [f"a/{i:02}" for i in range(40)]
-    scheduler = started(400, names, credits=1, seconds=0.01)
-    counts, now, jobs = [], 0.0, {}
-    for _ in range(6):
-        jobs |= given(scheduler.assign(now))
-        counts.append(len(jobs))
-        now += 0.01
-        for worker, indices in sorted(jobs.items()):
-            scheduler.results(worker, indices, now)
-        jobs = {}
-    assert counts == [8, 16, 32, 40, 40, 40]
-    scheduler.lost("a/00")
-    assert scheduler.workers == set(names[1:])
+def test_a_new_worker_that_answers_late_takes_part():
+    scheduler = started(1, ["a"])
+    scheduler.assign(0.0)
+    scheduler.results("a", [0], 0.1)
+    scheduler.want("b", 4, 0.1)
+    assert given(scheduler.assign(0.1)) == {"b": [0]}, "a round that waits for checks only: a job that is done"
+    assert scheduler.results("b", [0], 0.2) == ["tried"]
+    scheduler.want("c", 4, 0.2)
+    scheduler.begin(2)
+    assert given(scheduler.assign(0.2)) == {"a": [0], "b": [1], "c": [1]}
+    scheduler.begin(3)
+    assert scheduler.unread("c") == "stale"
+    assert given(scheduler.assign(0.3)) == {"a": [0], "b": [1], "c": [2]}
+
+
+def test_a_trial_that_came_too_late_is_repeated_when_the_next_round_begins():
+    scheduler = started(1, ["a"])
+    scheduler.results("a", given(scheduler.assign(0.0))["a"], 0.1)
+    scheduler.want("b", 4, 0.1)
+    for _ in range(2):
+        assert given(scheduler.assign(0.1))["b"] == [0]
+        scheduler.begin(1)
+    assert "b" not in given(scheduler.assign(0.1)), "it is to ask again"
+    scheduler.want("b", 4, 0.2, idle=True)
+    assert given(scheduler.assign(0.2))["b"] == [0]
+
+
+def test_when_those_that_answered_have_left_new_workers_take_part():
+    scheduler = started(2, ["a"], credits=1)
+    scheduler.results("a", given(scheduler.assign(0.0))["a"], 0.1)
+    scheduler.want("b", 4, 0.1)
+    scheduler.lost("a")
+    assert given(scheduler.assign(0.2)) == {"b": [1]}
+    assert scheduler.next_deadline(0.2) is not None, "not a trial"

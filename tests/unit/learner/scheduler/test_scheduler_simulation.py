@@ -42,6 +42,7 @@ class Farm:
         self.workers, self.live = {}, set()
         self.jobs, self.rounds, self.round = jobs, rounds, 0
         self.counted, self.held, self.handled = Counter(), {}, 0
+        self.answered = set()  # workers that nobody tries any more
         self.timer = math.inf
         self.scheduler.begin(jobs)
 
@@ -112,15 +113,19 @@ class Farm:
 
     def on_lost(self, worker):
         self.live.discard(worker.name)
+        self.answered.discard(worker.name)
         self.held.pop(worker.name, None)
         self.scheduler.lost(worker.name)
 
     def on_results(self, worker, number, indices):
-        if number != self.round:
+        now = number == self.round
+        if worker.name in self.live and (indices if now else self.scheduler.unread(worker.name) == "stale"):
+            self.answered.add(worker.name)
+        if not now:
             return
         verdicts = self.scheduler.results(worker.name, indices, self.now)
         for index, verdict in zip(indices, verdicts, strict=True):
-            assert verdict == ("doubled" if self.counted[index] else "new")
+            assert verdict in (("doubled", "tried") if self.counted[index] else ("new",))
             self.counted[index] += verdict == "new"
             self.held.get(worker.name, {}).pop(index, None)
 
@@ -138,7 +143,8 @@ class Farm:
             assert indices
             assert len(set(indices)) == len(indices)
             held = self.held.setdefault(name, {})
-            for index in indices:
+            tried = name not in self.answered and bool(self.answered)
+            for index in () if tried else indices:
                 assert not self.counted[index]
                 assert held.get(index, -math.inf) <= self.given_up()
                 held[index] = self.now
