@@ -106,11 +106,11 @@ def test_pushes_jumps_and_moving_goals_are_the_same_for_any_workers_and_repeated
 
 
 def test_evolution_strategies_learn_alike_by_any_workers_and_resumed(cart: Path, tmp_path: Path) -> None:
-    changed = {"algorithm": "es", "policy": "linear", "pairs": 6, "learning_rate_mu": 0.2, "generations": 20}
+    changed = {"algorithm": "es", "policy": "linear", "pairs": 6, "learning_rate_mu": 0.2, "generations": 10}
     config = configure(f"{cart}:Cart", **changed)
     one, two = (learnt(config, tmp_path / str(count), count, cart) for count in (1, 2))
     assert one["mean_policy_return"] > -9.73, "full force returns -9.723, standing still -10"
-    learnt(replace(config, generations=7), tmp_path / "half", 1, cart)
+    learnt(replace(config, generations=4), tmp_path / "half", 1, cart)
     whole = learnt(config, tmp_path / "half", 2, cart, resume=True)
     assert one["parameters_sha256"] == two["parameters_sha256"] == whole["parameters_sha256"]
 
@@ -118,7 +118,7 @@ def test_evolution_strategies_learn_alike_by_any_workers_and_resumed(cart: Path,
 def test_a_host_that_lies_by_a_last_bit_changes_nothing(
     cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    config = configure(f"{cart}:Cart", **{**SMALL, "generations": 40})  # long enough for all three to join
+    config = configure(f"{cart}:Cart", **SMALL)
     honest = learnt(config, tmp_path / "honest", 1, cart)
     shaded = learnt(config, tmp_path / "shaded", 3, cart, liars=1, audit=0.5)
     assert "host w0 gave different numbers than this machine" in caplog.text
@@ -127,7 +127,7 @@ def test_a_host_that_lies_by_a_last_bit_changes_nothing(
 
 def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(cart: Path, tmp_path: Path) -> None:
     config = configure(f"{cart}:Cart", **SMALL, policy="linear", normalise=True)
-    runs = [learnt(config, tmp_path / str(count), count, cart) for count in (1, 2, 3)]
+    runs = [learnt(config, tmp_path / str(count), count, cart) for count in (1, 3)]
     place = Placement(listen=free_endpoint(), record=False)
     with open_run(config, tmp_path / "death", place) as run, ExitStack() as others:
         mortal = others.enter_context(ExitStack())

@@ -38,14 +38,17 @@ class Lying:
 
 @contextmanager
 def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
-    """Workers on threads of this process, some of which lie; ended by an event."""
-    stop = threading.Event()
+    """Workers on threads of this process, some of which lie; all have asked for work when this returns."""
+    stop, asked = threading.Event(), threading.Semaphore(0)
     configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
 
     def serve(config: WorkerConfig, lies: bool) -> None:
         with connect(config.connect, None, stop.is_set) as session:
             worker = Worker(config, Lying(session) if lies else session)  # type: ignore[arg-type]
             worker.join()
+            while not worker.inbox.runs and not stop.is_set():
+                worker.turn()
+            asked.release()
             while not stop.is_set():
                 worker.turn()
             worker.close()
@@ -54,6 +57,8 @@ def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator
     try:
         for thread in threads:
             thread.start()
+        for _ in threads:
+            assert asked.acquire(timeout=30), "a worker has found no learner"
         yield
     finally:
         stop.set()

@@ -163,7 +163,8 @@ def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage) -> N
     assert len(asked) < 5
 
 
-def test_no_more_jobs_are_kept_than_were_asked_for(stage: Stage) -> None:
+def test_no_more_jobs_are_kept_than_were_asked_for(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "IDLE", 0.05)
     learner, worker = at_work(stage)
     most = 8 * CAPACITY
     learner.send(worker.id, *range(10, 10 + most))
