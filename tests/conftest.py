@@ -1,10 +1,18 @@
 """Options of the test suite."""
 
+import copy
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 
 import hypothesis
+import mujoco
+import numpy as np
 import pytest
+
+from farm.tasks.finger_gait import holding
+from farm.tasks.finger_gait.grasp import Grasping
+from farm.tasks.finger_gait.model import Hand
 
 hypothesis.settings.register_profile("any machine", deadline=None)  # time says nothing of what is tested
 hypothesis.settings.load_profile("any machine")
@@ -22,3 +30,24 @@ def _own_logging() -> Iterator[None]:
     yield
     root.setLevel(level)
     root.handlers[:] = handlers
+
+
+@pytest.fixture(scope="module")
+def grips_found_once() -> Iterator[None]:
+    """The search for a hand's grips, which takes longer than a rollout, is done once for each model in a module.
+
+    tests/unit/farm/tasks/finger_gait/test_rollouts.py says that what it finds does not depend on earlier questions.
+    """
+    known: dict[tuple[bytes, str], Grasping] = {}
+
+    def find(hand: Hand) -> Grasping:
+        model = np.empty(mujoco.mj_sizeModel(hand.model), np.uint8)
+        mujoco.mj_saveModel(hand.model, None, model)
+        key = model.tobytes(), f"{hand.object_name} {hand.pose}"
+        if key not in known:
+            known[key] = Grasping(replace(hand, model=copy.copy(hand.model)))  # tests may change the model
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(holding, "Grasping", find)
+        yield

@@ -20,6 +20,8 @@ from learner.commands.chain import ChainCommand, check_lengths
 from learner.run.config import configure
 from learner.run.setup import problem
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 Make = Callable[..., LoadedPolicy]
 GRIPS_OF_TWO = ("index+thumb", "index+middle+thumb")
 

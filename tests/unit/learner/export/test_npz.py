@@ -20,6 +20,8 @@ from learner.export import npz as export
 from learner.run.config import configure
 from learner.run.setup import start
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 EXAMPLE = Path(__file__).parents[4] / "examples" / "play_policy.py"
 SETTINGS: dict[str, dict[str, Any]] = {
     "direct": {"features": 30},

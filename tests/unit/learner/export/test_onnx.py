@@ -17,6 +17,8 @@ from learner.export import onnx
 from learner.run.config import configure
 from learner.run.setup import start
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 HOPPER = f"{Path(__file__).parents[4]}/examples/tasks/hopper.py:Hopper"
 SETTINGS: dict[str, dict[str, Any]] = {
     "direct": {"features": 300},

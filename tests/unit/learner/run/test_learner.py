@@ -28,6 +28,8 @@ from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.run.learner import REPLAY_EVERY, Learner
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 
 @pytest.fixture
 def pole(tmp_path: Path) -> str:

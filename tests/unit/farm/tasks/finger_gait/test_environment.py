@@ -22,6 +22,8 @@ from farm.tasks.finger_gait.rewards import RETURN_SCALE, WEIGHTS
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.loop import discounted
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 
 

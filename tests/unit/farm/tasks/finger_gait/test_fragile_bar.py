@@ -14,6 +14,8 @@ from farm.tasks.finger_gait.fragile_bar import BREAKS, HEIGHT, TERMS, WINDOW, Fr
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.loop import Batch, Rollouts, Seed, again
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 STEPS = FragileBar.steps
 MIDDLE = FINGERS.index("middle")
 SEEDS: list[Seed] = [(5, 0, 0, i) for i in range(24)]

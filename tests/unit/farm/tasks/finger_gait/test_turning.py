@@ -18,6 +18,8 @@ from farm.tasks.finger_gait.holding import CONTROL_PERIOD, SUBSTEPS, TIMESTEP
 from farm.tasks.finger_gait.turning import TERMS, Turning, TurningConfig, turned
 from farm.tasks.loop import Batch, again
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
+
 
 @pytest.fixture(scope="module")
 def gait():
