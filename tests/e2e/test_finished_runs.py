@@ -10,7 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from learner.commands.play import rollout
 from learner.export import npz as export
 from learner.run.folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("grips_found_once")
 GENERATIONS = 6
 PLAY_POLICY = Path(__file__).parents[2] / "examples" / "play_policy.py"
 
@@ -46,6 +47,22 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
     farm.call("run", "--name", "b", "--preset", "thesis", "--features", "60", "--seed", "5", *few)
     yield farm
     farm.close()
+
+
+Say = Callable[..., str]
+
+
+@pytest.fixture
+def say(done: Farm, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Say:
+    """What a command says, run in the folder of the runs; in this process, which has imported everything."""
+    monkeypatch.chdir(done.folder)
+
+    def call(*words: str, status: int = 0) -> str:
+        assert main(words) == status
+        said = capsys.readouterr()
+        return said.out + said.err
+
+    return call
 
 
 def folder(farm: Farm, name: str = "a") -> RunFolder:
@@ -92,14 +109,14 @@ def test_another_object(done: Farm, tmp_path: Path) -> None:
         again(done, object=str(tmp_path / "cannonball.xml"))
 
 
-def test_a_policy_that_is_not_stored(done: Farm, tmp_path: Path) -> None:
+def test_a_policy_that_is_not_stored(done: Farm, say: Say, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(folder(done).path, copy)
     head, _, rows = (copy / "parameters").read_bytes().partition(b"\n")
     size = len(rows) // GENERATIONS
     kept = b"".join(rows[g * size : (g + 1) * size] for g in (1, 3))  # of every second generation
     (copy / "parameters").write_bytes(head.replace(b'"every": 1', b'"every": 2') + b"\n" + kept)
-    said = done.call("replay", str(copy), "--generation", "3", status=2)
+    said = say("replay", str(copy), "--generation", "3", status=2)
     assert "generation 3 is not stored" in said
     assert "stored are 2 to 4 in steps of 2, the nearest is 2" in said
     assert len(said.splitlines()) == 1
@@ -126,10 +143,10 @@ def texts(path: Path, entity: str) -> list[str]:
     return found
 
 
-def test_rollouts_side_by_side(done: Farm, tmp_path: Path) -> None:
+def test_rollouts_side_by_side(done: Farm, say: Say, tmp_path: Path) -> None:
     path = tmp_path / "again.rrd"
     line = done.progress("a")[1]
-    said = done.call("replay", "runs/a", "--generation", "2", "--worst", "2", "--best", "1", "--to", str(path))
+    said = say("replay", "runs/a", "--generation", "2", "--worst", "2", "--best", "1", "--to", str(path))
     first, second, third, written = said.splitlines()
     assert f"return {line['return_max']:.3f}" in first
     assert f"return {line['return_min']:.3f}" in second
@@ -238,8 +255,8 @@ def test_an_mp4(done: Farm, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- compare
 
 
-def test_a_comparison_holds_each_runs_numbers(done: Farm) -> None:
-    said = done.call("compare", "runs/a", "runs/b", "--to", "c.rrd")
+def test_a_comparison_holds_each_runs_numbers(done: Farm, say: Say) -> None:
+    said = say("compare", "runs/a", "runs/b", "--to", "c.rrd")
     assert "written to c.rrd; look at it with: farm view c.rrd" in said
     path = done.folder / "c.rrd"
     (recording,) = RrdReader(path).recordings()
@@ -341,9 +358,9 @@ def returned(said: str) -> float:
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
-def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, name: str) -> None:
+def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, say: Say, name: str) -> None:
     path = done.folder / f"{name}.npz"
-    said = done.call("export", f"runs/{name}", str(path))
+    said = say("export", f"runs/{name}", str(path))
     assert f"written to {path}" in said
     with np.load(path, allow_pickle=False) as file:
         assert file["mu"].tobytes() == stored(done, name).mu.tobytes()
@@ -351,9 +368,9 @@ def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, na
     assert returned(bare(done, path)) == done.summary(name)["mean_policy_return"]
 
 
-def test_a_policy_is_exported_for_other_runtimes(done: Farm, tmp_path: Path) -> None:
+def test_a_policy_is_exported_for_other_runtimes(done: Farm, say: Say, tmp_path: Path) -> None:
     runtime = pytest.importorskip("onnxruntime")
-    done.call("export", "runs/a", str(tmp_path / "p.onnx"))
+    say("export", "runs/a", str(tmp_path / "p.onnx"))
     session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
     policy, mu = load(folder(done).path).problem.policy, stored(done).mu
     x = np.full((1, policy.spec.observation), 0.5)
