@@ -336,6 +336,7 @@ def all_but_the_best(values: np.ndarray) -> np.ndarray:
 
 UNDONE = {
     "the last bit": Late(LIES["the last bit"], 4),
+    "one percent": Late(LIES["one percent"], 4),
     "one message in three": Late(LIES["the last bit"], 4, lambda sent: sent % 3 == 0),
     "all but its best": Late(shifted(all_but_the_best), 4),
 }
