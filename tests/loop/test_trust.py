@@ -347,17 +347,30 @@ def test_a_liar_costs_time_and_no_number(
     certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture, lie: Late
 ) -> None:
     """The liar is alone at first, so that its lies are in the state when the second host comes."""
-    config, file = replace(config, generations=40), file_of(config)
+    config, file = replace(config, generations=12), file_of(config)
     place = checked(tls(), certs)
     with opened(config, tmp_path / "honest", place) as run, host(place.listen, certs, "a", file):
         honest = finished(run)
     place, rows, hosts = checked(tls(), certs), list[int](), ExitStack()
+    joining, answered = threading.Event(), threading.Event()
+
+    def waiting(said: Any) -> Any:
+        if joining.is_set():  # the second host builds the task first, which takes longer than the run
+            answered.wait(30)
+        return lie(said)
+
+    def answering(said: Any) -> Any:
+        if isinstance(said, Results):
+            answered.set()
+        return said
+
     with hosts:
         with opened(config, tmp_path / "r", place) as run:
-            hosts.enter_context(host(place.listen, certs, "liar", file, lie))
+            hosts.enter_context(host(place.listen, certs, "liar", file, waiting))
             learning = run.learn()
             rows.extend(next(learning).generation for _ in range(6))  # at least one lie is in them
-            hosts.enter_context(host(place.listen, certs, "a", file))
+            joining.set()
+            hosts.enter_context(host(place.listen, certs, "a", file, answering))
             with pytest.raises(RolledBack):
                 rows.extend(report.generation for report in learning)
         assert rows[-1] >= 6
@@ -365,11 +378,11 @@ def test_a_liar_costs_time_and_no_number(
             assert run.learner.state.generation == 0, "the liar answered in the first generation"
             assert finished(run) == honest
     lines = run.learner.folder.progress()
-    assert [line.generation for line in lines] == list(range(1, 41)), "none is doubled"
-    assert [line.rollouts for line in lines] == [12 * each for each in range(1, 41)]
+    assert [line.generation for line in lines] == list(range(1, 13)), "none is doubled"
+    assert [line.rollouts for line in lines] == [12 * each for each in range(1, 13)]
     assert run.summary["undone"] == rows[-1]
     assert refused(caplog) == {"liar"}
-    assert len(run.learner.folder.parameters.rows()) == 40
+    assert len(run.learner.folder.parameters.rows()) == 12
 
 
 def test_a_run_goes_back_no_further_than_the_liars_first_answer(
