@@ -61,7 +61,7 @@ def _many_results(session: Session, _: str) -> None:
 
 
 def _some_results(session: Session, _: str) -> None:
-    """600 small results per second, for which no machine is cut off."""
+    """600 small results per second."""
     while True:
         session.publish(keys.result("farm", "run", "liar/1"), b"x" * 2000)
         time.sleep(1 / 600)
