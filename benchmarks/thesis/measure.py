@@ -21,7 +21,8 @@ from farm.policies.fourier import FeaturesConfig, Projected
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskSpec
 from farm.tasks.finger_gait.hand import LOWER, UPPER
-from farm.tasks.finger_gait.holding import SUCCESS_STEPS, Perturbation
+from farm.tasks.finger_gait.holding import SUCCESS_STEPS
+from farm.tasks.finger_gait.sensing import Perturbation
 from farm.tasks.finger_gait.task import FingerGait
 from farm.tasks.loop import Seed
 from learner.again.chain import chain

@@ -136,7 +136,7 @@ def _observed(config: FingerGaitConfig) -> tuple[FloatArray, FloatArray]:
         joints = np.full((1, len(JOINTS)), joint * config.joints_scale)
         images = np.full((1, len(FINGERS), TAXELS), force * config.tactile_scale)
         points = np.full((1, len(FINGERS), 3), point * config.contacts_scale)
-        return STATES[config.state].observe(Felt(joints, images, points))[0]
+        return STATES[config.state].observe(Felt(joints, images, points, behind=joints))[0]
 
     return x(-JOINT_BOUND, 0.0, -1.0), x(JOINT_BOUND, FORCE_BOUND, 1.0)
 

@@ -18,7 +18,7 @@ from farm.errors import ConfigError
 from farm.settings import setting
 from farm.sim.channels import Channel
 from farm.sim.sim import Sim
-from farm.tasks.base import Record, Score, TaskConfig
+from farm.tasks.base import Record, Score
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
 from farm.tasks.finger_gait.holding import (
     LEAST_COSINE,
@@ -26,12 +26,12 @@ from farm.tasks.finger_gait.holding import (
     PRESSES,
     SUCCESS_STEPS,
     HandTask,
-    Perturbation,
     distance,
     stayed,
 )
 from farm.tasks.finger_gait.observations import STATES
 from farm.tasks.finger_gait.rewards import cut
+from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
 
 TERMS: Final = ("force", "grip", "crush", "pose", "action", "drop")
 """Names of the reward's terms."""
@@ -56,13 +56,14 @@ _ACTION: Final = 0.2  # penalty per squared change of the targets [1 / rad^2]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FragileBarConfig(TaskConfig):
+class FragileBarConfig(SensingConfig):
     """The fragile bar's settings."""
 
     gamma: float = setting(1.0, above=0.0, most=1.0)
     """Discount factor of the return, per control step."""
     state: str = "forces"
-    """State base, the controller's input x: forces | cop | joints | joints+contacts | tactile | joints+tactile."""
+    """State base, the controller's input x: forces | cop | joints | joints+contacts | tactile | joints+tactile |
+    zeroed."""
     joint_bias: float = setting(0.05, least=0.0, most=1.0)
     """Joint readings are wrong by U(-joint_bias, joint_bias), drawn for each joint and rollout [rad]."""
     action: Literal["offset", "absolute", "increment"] = "increment"
@@ -101,9 +102,8 @@ class FragileBar(HandTask):
         super().prepare(sim, rngs)
 
     def _drawn(self, rng: np.random.Generator) -> Perturbation:
-        drawn = Perturbation.draw(rng, self.steps, friction=_FRICTION, mass=_MASS, displacement=_DISPLACEMENT)
-        drawn.noise[:] += rng.uniform(-self.config.joint_bias, self.config.joint_bias, len(JOINTS))
-        return drawn
+        wider: dict[str, Any] = {"friction": _FRICTION, "mass": _MASS, "displacement": _DISPLACEMENT}
+        return Perturbation.draw(rng, self.steps, self.config, **wider)
 
     def score(self, record: Record) -> Score:
         """Reward terms, and success: the force is in its range at the last steps, and the bar never broke."""

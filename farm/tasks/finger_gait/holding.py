@@ -5,7 +5,6 @@ TIMESTEP the controller sets joint targets.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, cast
 
@@ -17,10 +16,11 @@ from farm.errors import ConfigError
 from farm.sim.channels import Quantity
 from farm.sim.sim import Sim
 from farm.tasks.base import Camera, Channel, Task, TaskSpec
-from farm.tasks.finger_gait import model, touch
+from farm.tasks.finger_gait import model, sensing, touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, POSES, TIP_RADIUS, UPPER
 from farm.tasks.finger_gait.observations import STATES, Felt
+from farm.tasks.finger_gait.sensing import Perturbation
 
 TIMESTEP: Final = 0.01
 """Length of a physics step [s]."""
@@ -55,15 +55,6 @@ TURNED: Final = np.deg2rad(6.0)
 TURNED_COSINE: Final = float(elementary.cos(np.array(0.5 * TURNED)))
 """Cosine of half of that."""
 
-SCALE: Final = (0.8, 1.2)
-"""Perturbation: friction and mass are multiplied by U(SCALE)."""
-
-DISPLACEMENT: Final = 0.002
-"""Perturbation: the frozen object is displaced by U(-, +) along each axis [m]."""
-
-JOINT_NOISE: Final = 0.01
-"""Perturbation: standard deviation of the joint readings [rad]."""
-
 CLOSING: Final = 100
 """Physics steps in which a grip is closed around the frozen object."""
 
@@ -79,43 +70,6 @@ HOLD: Final = 200
 TARGET_LIMIT: Final = 1e6  # [rad]; keeps an unclipped target in MuJoCo's range
 _COLOURS: Final = ((86, 180, 233), (0, 158, 115), (204, 121, 167))  # of the fingers
 _SHADES: Final = (1.25, 0.95, 0.65)  # of a finger's joints, first to last
-
-
-@dataclass(frozen=True)
-class Perturbation:
-    """Perturbed conditions of one rollout, from the freeze on."""
-
-    friction: float
-    """Factor of every friction coefficient."""
-    mass: float
-    """Factor of the object's mass and inertia."""
-    displacement: FloatArray
-    """Of the frozen object [m], (3,)."""
-    noise: FloatArray
-    """Added to the joint readings in the state [rad], (T, 8)."""
-
-    @classmethod
-    def draw(
-        cls,
-        rng: np.random.Generator,
-        steps: int,
-        *,
-        friction: tuple[float, float] = SCALE,
-        mass: tuple[float, float] = SCALE,
-        displacement: float = DISPLACEMENT,
-    ) -> "Perturbation":
-        """Draw the conditions, always as many numbers and in the same order."""
-        return cls(
-            friction=float(rng.uniform(*friction)),
-            mass=float(rng.uniform(*mass)),
-            displacement=rng.uniform(-displacement, displacement, 3),
-            noise=rng.normal(0.0, JOINT_NOISE, (steps, len(JOINTS))),
-        )
-
-    @classmethod
-    def none(cls, steps: int) -> "Perturbation":
-        """Nominal conditions."""
-        return cls(1.0, 1.0, np.zeros(3), np.zeros((steps, len(JOINTS))))
 
 
 class HandTask(Task):
@@ -147,7 +101,7 @@ class HandTask(Task):
 
     def files(self) -> dict[str, str]:
         """Hand, objects, and what the task adds."""
-        return model.files(self.objects, self.pose)
+        return model.files(self.objects, self.pose, self.config.stiffness)
 
     def mjcf(self) -> str:
         """One text of them, with the first object."""
@@ -182,6 +136,11 @@ class HandTask(Task):
     def observations(self) -> tuple[Quantity, ...]:  # type: ignore[override]  # a setting's
         """The state base's numbers."""
         return STATES[self.config.state].quantities(self.scales)
+
+    @property
+    def zeroed(self) -> bool:
+        """Whether a rollout begins with steps in which the hand holds still and finds its servos' zero."""
+        return self.config.state in STATES and STATES[self.config.state].zeroed
 
     def spec(self) -> TaskSpec:
         """The task's specification, found without closing a grip."""
@@ -231,12 +190,13 @@ class HandTask(Task):
         if self.config.friction != 1.0 or any(each is not nominal for each in drawn):
             self._set_conditions(sim, drawn)
         self._close(sim, self.start_commands[sim.which], np.stack([each.displacement for each in drawn]))
-        sim.own["noise"] = np.stack([each.noise for each in drawn])
+        for name in ("noise", "force_noise", "lost"):
+            sim.own[name] = np.stack([getattr(each, name) for each in drawn])
         sim.own["target"] = self.start_commands[sim.which]
         sim.own["released"] = sim.qpos[:, len(JOINTS) :].copy()
 
     def _drawn(self, rng: np.random.Generator) -> Perturbation:
-        return Perturbation.draw(rng, self.steps)
+        return Perturbation.draw(rng, self.steps, self.config)
 
     def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
         friction, mass, inertia = (sim.expand(f) for f in ("geom_friction", "body_mass", "body_inertia"))
@@ -274,19 +234,31 @@ class HandTask(Task):
     def observe(self, sim: Sim) -> FloatArray:
         """The state base's x, (B, d)."""
         state, (own, place, force) = STATES[self.config.state], self.scales
-        joints = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)]
-        images = points = joints  # unused by a state base without touch
+        joints = self.joints(sim)
+        images = points = behind = joints  # unused by a state base without touch
         if state.touch:
-            felt = self.measure(sim)
-            images = touch.images(felt)
+            images = self.images(sim)
             points = touch.contact_points(images) * place
             images = images * force
-        return state.observe(Felt(joints * own, images, points))
+        if self.zeroed:
+            behind = sensing.deflections(sim, joints)
+        return state.observe(Felt(joints * own, images, points, behind))
+
+    def joints(self, sim: Sim) -> FloatArray:
+        """The joint readings (B, 8) [rad]."""
+        return np.asarray(sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)])
+
+    def images(self, sim: Sim) -> FloatArray:
+        """What the fingertips read, (B, 3, 18) [N]; to be called once in a control step."""
+        images = touch.images(self.measure(sim))
+        return sensing.read(sim, images, self.config) if self.config.numb else images
 
     def act(self, sim: Sim, action: FloatArray) -> FloatArray:
         """Joint targets of raw actions (B, 8) [rad], finite."""
         base = {"offset": self.start_commands[sim.which], "absolute": 0.0, "increment": sim.own["target"]}[self.action]
         targets = base + action
+        if self.zeroed and sim.t < sensing.ZERO:
+            targets = sim.own["target"].copy()
         targets[np.isnan(targets)] = 0.0
         low, high = (LOWER, UPPER) if self.clip else (-TARGET_LIMIT, TARGET_LIMIT)
         sim.own["target"] = np.minimum(np.maximum(targets, low), high)

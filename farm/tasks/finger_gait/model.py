@@ -33,17 +33,17 @@ def objects() -> list[str]:
     return sorted(file.stem for file in folder().glob("objects/*.xml"))
 
 
-def files(names: Sequence[str], pose: str) -> dict[str, str]:
+def files(names: Sequence[str], pose: str, stiffness: float = 1.0) -> dict[str, str]:
     """The files of the model by name: hand, the task's additions, and objects given by name or file, at least one.
 
-    Hand and objects are set up for a pose, one of POSES.
+    Hand and objects are set up for a pose, one of POSES; the servos' stiffness is multiplied by a factor.
 
     Raises:
       ConfigError: an object does not exist.
     """
     parts = {name: (folder() / name).read_text("utf-8") for name in ("hand.xml", "finger_gait.xml")}
     own = {object_file(i): _object(name) for i, name in enumerate(names)}
-    return posed({**parts, **own}, POSES[pose])
+    return posed({**parts, **own}, POSES[pose], stiffness)
 
 
 def object_file(index: int) -> str:
@@ -62,13 +62,16 @@ def _object(name: str) -> str:
         raise ConfigError(f"cannot read the object {path}: {error}") from None
 
 
-def posed(sources: Mapping[str, str], pose: Pose) -> dict[str, str]:
-    """The files with links turned and the objects placed for a pose."""
+def posed(sources: Mapping[str, str], pose: Pose, stiffness: float = 1.0) -> dict[str, str]:
+    """The files with links turned, the objects placed for a pose, and the servos' stiffness multiplied by a factor."""
     hand, out = _parsed(sources, "hand.xml"), dict(sources)
-    if pose.turned or pose.options:
+    if pose.turned or pose.options or stiffness != 1.0:
         for name, quat in pose.turned.items():
             _body(hand, name).set("quat", quat)
         hand.find("option").attrib.update(pose.options)  # type: ignore[union-attr]
+        if stiffness != 1.0:
+            servo: ET.Element = hand.find("default/position")  # type: ignore[assignment]
+            servo.set("kp", repr(stiffness * float(servo.attrib["kp"])))
         out["hand.xml"] = ET.tostring(hand, encoding="unicode")
     for file in (name for name in sources if name.startswith(OBJECT)):
         thing = _parsed(sources, file)

@@ -1,9 +1,9 @@
-"""The hand's sensor values, and the state bases that select from them: the thesis' four (3.5.3), and two of forces.
+"""The hand's sensor values, and the state bases that select from them: the thesis' four (3.5.3), and three more.
 
 Pure functions of batches. A new state base is one line in STATES.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,9 @@ from farm.tasks.finger_gait.hand import FINGERS, JOINTS, LOWER, UPPER
 from farm.tasks.finger_gait.touch import TAXELS
 
 _COUNT: Final = len(FINGERS)
-_SIZES: Final = {"joints": len(JOINTS), "images": TAXELS * _COUNT, "points": 3 * _COUNT, "forces": _COUNT}
+_SIZES: Final = {
+    "joints": len(JOINTS), "images": TAXELS * _COUNT, "points": 3 * _COUNT, "forces": _COUNT, "behind": len(JOINTS),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,8 @@ class Felt:
     """c [N], (..., 3, 18)"""
     points: FloatArray
     """CP, the contact points [radii], (..., 3, 3)"""
+    behind: FloatArray = field(default_factory=lambda: np.empty(0))
+    """The servos' deflections from their zero [rad], (..., 8)"""
 
     @property
     def forces(self) -> FloatArray:
@@ -66,13 +70,19 @@ class StateBase:
                 for axis in axes
             ],
             "forces": [Quantity(f"{finger} force", *forces) for finger in FINGERS],
+            "behind": [Quantity(f"{name} deflection", "rad") for name in JOINTS],
         }
         return tuple(each for part in self.parts for each in known[part])
 
     @property
     def touch(self) -> bool:
         """Whether it needs taxels or contact points, which take time to compute."""
-        return self.parts != ("joints",)
+        return self.parts not in (("joints",), ("behind",))
+
+    @property
+    def zeroed(self) -> bool:
+        """Whether it begins by holding still to find the servos' zero."""
+        return "behind" in self.parts
 
     def observe(self, felt: Felt) -> FloatArray:
         """The observation x at B times, (B, d)."""
@@ -92,5 +102,6 @@ STATES: Final[dict[str, StateBase]] = {
     "joints+tactile": StateBase(("joints", "images")),
     "forces": StateBase(("forces",)),
     "cop": StateBase(("points", "forces")),
+    "zeroed": StateBase(("behind",)),
 }
-"""State bases by name; 8, 17, 54, 62, 3 and 12 numbers. The first four are the thesis'."""
+"""State bases by name; 8, 17, 54, 62, 3, 12 and 8 numbers. The first four are the thesis'."""

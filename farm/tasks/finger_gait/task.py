@@ -16,7 +16,7 @@ from farm.errors import ConfigError
 from farm.settings import Texts, setting
 from farm.sim.model_files import Files
 from farm.sim.sim import Sim
-from farm.tasks.base import Record, Score, TaskConfig
+from farm.tasks.base import Record, Score
 from farm.tasks.finger_gait import rewards, touch
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, POSES, UPPER
 from farm.tasks.finger_gait.holding import (
@@ -35,12 +35,13 @@ from farm.tasks.finger_gait.holding import (
 )
 from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
+from farm.tasks.finger_gait.sensing import SensingConfig
 
 _MOST_MOTION: Final = 20.0  # of the squares of a step: a lost object is punished by other terms
 
 
 @dataclass(frozen=True, kw_only=True)
-class FingerGaitConfig(TaskConfig):
+class FingerGaitConfig(SensingConfig):
     """The finger gait's settings."""
 
     gamma: float = setting(0.95, above=0.0, most=1.0)
@@ -59,7 +60,8 @@ class FingerGaitConfig(TaskConfig):
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
     state: str = "joints"
-    """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile | forces | cop."""
+    """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile | forces | cop |
+    zeroed."""
     reward: str = "full"
     """Reward: basic (thesis 3.3: joints, action) | full (3.5: tactile image and contact points as well) |
     limited (full, no action punished for more than its joint's range)."""

@@ -15,10 +15,11 @@ from farm.arrays import BoolArray, FloatArray
 from farm.settings import setting
 from farm.sim.channels import Camera, Quantity
 from farm.sim.sim import Sim
-from farm.tasks.base import Record, Score, TaskConfig
+from farm.tasks.base import Record, Score
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, HandTask, distance
 from farm.tasks.finger_gait.rewards import cut
+from farm.tasks.finger_gait.sensing import SensingConfig
 
 TERMS: Final = ("turn", "speed", "pose", "action", "drop")
 """Names of the reward terms."""
@@ -33,7 +34,7 @@ _FASTEST: Final = 3.0  # multiple of the wanted speed at which the penalty stops
 
 
 @dataclass(frozen=True, kw_only=True)
-class TurningConfig(TaskConfig):
+class TurningConfig(SensingConfig):
     """Settings of turning."""
 
     state: Literal["phase", "phase+joints", "phase+forces", "phase+joints+forces"] = "phase+forces"
@@ -81,10 +82,10 @@ class Turning(HandTask):
         phase = 2.0 * np.pi * _HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
         seen = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
         if "joints" in self.config.state:
-            noise = sim.own["noise"][:, min(sim.t, self.steps - 1)]
-            seen.append(sim.qpos[:, : len(JOINTS)] + noise - self.start_commands[sim.which])
+            seen.append(self.joints(sim) - self.start_commands[sim.which])
         if "forces" in self.config.state:
-            seen.append(_FORCE * self.measure(sim)["force"].sum(axis=-1))
+            exact = not self.config.numb
+            seen.append(_FORCE * (self.measure(sim)["force"] if exact else self.images(sim)).sum(axis=-1))
         return np.concatenate(seen, axis=1)
 
     def ended(self, sim: Sim) -> BoolArray:

@@ -15,9 +15,10 @@ from farm.tasks.base import Record
 from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, GRIPS, LOWER, UPPER
-from farm.tasks.finger_gait.holding import CLOSING, PRESSES, RAMP, SETTLE, SUBSTEPS, Perturbation, moved, touching
+from farm.tasks.finger_gait.holding import CLOSING, PRESSES, RAMP, SETTLE, SUBSTEPS, moved, touching
 from farm.tasks.finger_gait.observations import Felt
 from farm.tasks.finger_gait.rewards import WEIGHTS
+from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.loop import Rollouts, discounted
 
@@ -131,7 +132,8 @@ def plain_observation(task, joints, *felt):
 def plain_rollout(made, theta, seed):
     """Returns, steps, actions and frames of one rollout, stepped on its own."""
     task, steps = made.task, made.task.steps
-    own = Perturbation.none(steps) if seed is None else Perturbation.draw(np.random.default_rng(seed), steps)
+    drawn = Perturbation.draw(np.random.default_rng(seed), steps, SensingConfig())
+    own = Perturbation.none(steps) if seed is None else drawn
     changed = copy.copy(loaded("bar").model)
     body = changed.body("object").id
     changed.geom_friction[:] *= own.friction

@@ -16,9 +16,9 @@ def parts(count=3):
     return joints, images, points
 
 
-def test_there_are_the_four_of_the_thesis_and_two_of_forces():
-    assert {name: state.size for name, state in STATES.items()} == {**SIZES, "forces": 3, "cop": 12}
-    assert {name for name, state in STATES.items() if not state.touch} == {"joints"}
+def test_there_are_the_four_of_the_thesis_two_of_forces_and_one_of_deflections():
+    assert {name: state.size for name, state in STATES.items()} == {**SIZES, "forces": 3, "cop": 12, "zeroed": 8}
+    assert {name for name, state in STATES.items() if not state.touch} == {"joints", "zeroed"}
 
 
 @pytest.mark.parametrize("name", SIZES)
