@@ -94,6 +94,8 @@ class Policy:
         mujoco.mj_setState(self.model, self.data, self.p["state"], self.p["state_kind"])
         self.x, self.last, self.released = self.p["x"], self.p["start_command"], self.data.qpos[8:].copy()
         self.memory = self.p.get("memory")  # of a policy that has one
+        self.t, self.zero = 0, np.zeros(8)
+        self.behind()
 
     def act(self) -> np.ndarray:
         """Compute one action (8,) [rad] and set the servos' targets from it."""
@@ -104,6 +106,8 @@ class Policy:
         base = {"offset": self.p["start_command"], "absolute": 0.0, "increment": self.last}[self.p["action"]]
         target = base + a
         target[np.isnan(target)] = 0.0
+        if self.t < self.p["zero_steps"]:  # the hand holds still and finds its servos' zero
+            target = self.last
         self.last = np.minimum(np.maximum(target, self.p["lower"]), self.p["upper"])
         self.data.ctrl[:] = self.last
         return a
@@ -174,11 +178,13 @@ class Policy:
         a = self.act()
         for _ in range(self.p["substeps"]):
             mujoco.mj_step(self.model, self.data)
+        self.t += 1
         joints, (images, points, held) = self.data.qpos[:8].copy(), self.feel()
         parts = {"joints": joints * self.p["joints_scale"], "contacts": points.ravel() * self.p["contacts_scale"]}
         parts["tactile"] = images.ravel() * self.p["tactile_scale"]
         parts["forces"] = (images * self.p["tactile_scale"]).sum(axis=-1)
         parts["cop"] = np.concatenate([parts["contacts"], parts["forces"]])
+        parts["zeroed"] = self.behind()
         self.x = np.concatenate([parts[part] for part in self.p["input"].split("+")])
         punished = np.minimum(np.abs(a), self.p["punished_to"])
         wrong = (
@@ -190,6 +196,14 @@ class Policy:
         terms = [-w * (v.ravel() * v.ravel()).sum() for w, v in zip(self.p["weights"], wrong, strict=True)]
         moved = [self.moved()] if self.p["motion"] else []
         return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"], *moved])), held
+
+    def behind(self) -> np.ndarray:
+        """The servos' deflections from their mean over the first steps, as forces (8,) [N]; zero in these steps."""
+        behind = self.last - self.data.qpos[:8]
+        if self.t < self.p["zero_steps"]:
+            self.zero = self.zero + behind / self.p["zero_steps"]
+            return np.zeros(8)
+        return (behind - self.zero) * self.p["deflection_scale"]
 
     def moved(self) -> float:
         """The penalty for the object's shift and turn since its release."""

@@ -241,7 +241,7 @@ class HandTask(Task):
             points = touch.contact_points(images) * place
             images = images * force
         if self.zeroed:
-            behind = sensing.deflections(sim, joints)
+            behind = sensing.deflections(sim, joints, self.config.stiffness)
         return state.observe(Felt(joints * own, images, points, behind))
 
     def joints(self, sim: Sim) -> FloatArray:

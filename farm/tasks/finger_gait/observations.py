@@ -30,7 +30,7 @@ class Felt:
     points: FloatArray
     """CP, the contact points [radii], (..., 3, 3)"""
     behind: FloatArray = field(default_factory=lambda: np.empty(0))
-    """The servos' deflections from their zero [rad], (..., 8)"""
+    """The servos' deflections from their zero [N], (..., 8)"""
 
     @property
     def forces(self) -> FloatArray:
@@ -70,7 +70,7 @@ class StateBase:
                 for axis in axes
             ],
             "forces": [Quantity(f"{finger} force", *forces) for finger in FINGERS],
-            "behind": [Quantity(f"{name} deflection", "rad") for name in JOINTS],
+            "behind": [Quantity(f"{name} deflection", "N") for name in JOINTS],
         }
         return tuple(each for part in self.parts for each in known[part])
 

@@ -25,6 +25,9 @@ DISPLACEMENT: Final = 0.002
 ZERO: Final = 4
 """Control steps in which the state base `zeroed` holds still and averages the servos' deflections."""
 
+DEFLECTED: Final = 3.0 / 0.05
+"""Force at a lever of 50 mm, about a fingertip's distance from its joints, that deflects a nominal servo [N/rad]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SensingConfig(TaskConfig):
@@ -117,14 +120,15 @@ def read(sim: Sim, images: FloatArray, errors: SensingConfig) -> FloatArray:
     return np.asarray(reading * (noisy / np.where(total > 0, total, 1.0)))
 
 
-def deflections(sim: Sim, joints: FloatArray) -> FloatArray:
-    """How far joint readings (B, 8) are behind their targets, less the mean of this over the first ZERO steps [rad].
+def deflections(sim: Sim, joints: FloatArray, stiffness: float) -> FloatArray:
+    """How far joint readings (B, 8) are behind their targets, less the mean of this over the first ZERO steps.
 
-    A constant error of the readings cancels. Zero in these steps; called once in each control step.
+    A constant error of the readings cancels. As a force [N]: what would deflect the servo so far at a lever of 50 mm.
+    Zero in the first steps; called once in each control step.
     """
     behind = sim.own["target"] - joints
     zero = sim.own.get("zero", np.zeros_like(behind))
     if sim.t < ZERO:
         sim.own["zero"] = zero + behind / ZERO
         return np.zeros_like(behind)
-    return np.asarray(behind - zero)
+    return np.asarray((behind - zero) * (DEFLECTED * stiffness))

@@ -35,7 +35,7 @@ from farm.tasks.finger_gait.holding import (
 )
 from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
-from farm.tasks.finger_gait.sensing import SensingConfig
+from farm.tasks.finger_gait.sensing import DEFLECTED, ZERO, SensingConfig
 
 _MOST_MOTION: Final = 20.0  # of the squares of a step: a lost object is punished by other terms
 
@@ -248,6 +248,8 @@ class FingerGait(HandTask):
             "joints_scale": config.joints_scale,
             "contacts_scale": config.contacts_scale,
             "tactile_scale": config.tactile_scale,
+            "zero_steps": ZERO if self.zeroed else 0,
+            "deflection_scale": DEFLECTED * config.stiffness,
             "taxels": touch.DIRECTIONS,
             "kappa": touch.KAPPA,
             "weights": rewards.factors(config.reward, weights, goal),
