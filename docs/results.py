@@ -224,7 +224,8 @@ def touch(path: Path) -> str:
     return (
         f"it helps learning, and is not necessary: learnt with three contact forces, {int((felt >= 95.0).sum())} of "
         f"{len(felt)} seeds succeed on at least 95 % of the starts (median {np.median(felt):.3g} %); learnt without "
-        f"touch the best median is {best:.3g} %; a hand-written controller without touch has {zeroed[0]:.3g} %"
+        f"touch the best median is {best:.3g} %; a hand-written controller without touch has {zeroed[0]:.3g} %. It is "
+        "needed if joint readings drift, or servos are stiff"
     )
 
 

@@ -50,6 +50,16 @@ def test_the_page_of_own_tasks_shows_the_recorded_table() -> None:
     assert done.stdout in (results / "own-tasks.md").read_text("utf-8")
 
 
+def test_the_map_of_touch_shows_the_recorded_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import touch_map
+
+    results = FOLDER.parent / "docs/results"
+    found = json.loads((results / "touch/map.json").read_text("utf-8"))
+    assert touch_map.tables(found) in (results / "touch.md").read_text("utf-8")
+    assert touch_map.least(200, 146) == pytest.approx(0.2, abs=0.02), "of 1.0 - 0.73"
+
+
 @pytest.mark.slow
 def test_ctrl_c_ends_a_script_with_one_line() -> None:
     command = [sys.executable, "-u", FOLDER / "early.py"]
@@ -91,6 +101,24 @@ def test_the_fragile_bar_needs_no_touch(monkeypatch: pytest.MonkeyPatch) -> None
     finally:
         runner.close()
     assert success.mean() >= 0.95
+
+
+@pytest.mark.slow
+def test_a_kalman_filter_feels_without_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import touch_map
+
+    cell = {"joint_drift": 0.002, "joint_noise": 0.02, "joint_bias": 0.2}
+    runner = problem(configure("fragile-bar", **cell)).runner()
+    try:
+        closing = touch_map.play(runner, touch_map.FITS, None, 0.0, 0.02)
+        (kalman,) = touch_map.Kalman.fitted(closing, cell)
+        starts = [(2, 0, 78, i) for i in range(64)]
+        seeing, still = (touch_map.play(runner, starts, each, 0.02).success for each in (kalman, None))
+    finally:
+        runner.close()
+    assert seeing.mean() >= 0.75
+    assert still.mean() == 0.0
 
 
 def interrupt(config: RunConfig, path: Path, after: int) -> None:
