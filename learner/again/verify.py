@@ -101,7 +101,7 @@ def stored(folder: RunFolder) -> Stored:
     rows = {int(row["generation"]): row for row in kept if row["generation"] <= last}
     seen = problem.spec.observation if config.policy_config.normalise else 0
     every = folder.parameters.every(len(at.state["mu"]), config.generations, seen)
-    links, before = folder.chain.read(), chain.first(config)
+    links, before = folder.chain.read(), chain.first(config, at.config)
     for generation in range(1, last + 1):
         if generation not in lines:
             raise Differs(f"{folder.path}: generation {generation} differs: progress.jsonl has no line of it")
@@ -196,7 +196,7 @@ def verify_all(
                 _agree_bits(
                     run.folder, report.generation, run.rows[report.generation], vars(state), "the repetition"
                 )  # fmt: skip
-            if again.learner.at.chain != run.links[report.generation].digest:
+            if chain.state_of(again.learner.at) != run.links[report.generation].state:
                 where = f"{run.folder.path}: generation {report.generation} differs"
                 raise Differs(f"{where}: the state after it has another digest in chain")
             yield report.generation, report.progress.rollouts - done

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from farm.arrays import FloatArray
 from farm.net import codec
@@ -34,10 +34,18 @@ class Link:
     """Of the checkpoint after it."""
 
 
-def first(config: RunConfig) -> str:
-    """The digest before the first generation: of all settings but those of the run's end, without folders."""
-    settings = configs.flat(config).items()
-    table = {name: str(value).rpartition("/")[2] for name, value in settings if name not in configs.AT_THE_END}
+def first(config: RunConfig, written: Mapping[str, Any] | None = None) -> str:
+    """The digest before the first generation: of all settings but those of the run's end, without folders.
+
+    Of a run that an earlier release has `written` down (its config.json), settings that it did not have are left out.
+    """
+    settings = configs.flat(config)
+    if written is not None:
+        parts = [written, *(values for values in written.values() if isinstance(values, Mapping))]
+        known = {name.replace("_", "-") for part in parts for name in part}
+        settings = {name: value for name, value in settings.items() if name in known}
+    left_out = configs.AT_THE_END
+    table = {name: str(value).rpartition("/")[2] for name, value in settings.items() if name not in left_out}
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
 
 
