@@ -135,14 +135,19 @@ def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
     assert dispatcher.notices.ignored == {"bad": 4}
 
 
-def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
-    dispatcher = learner.show()
-    worker = hire("a/1")
+def a_round_of_one_job(learner: Learner, worker: Worker) -> Chunk:
+    """Collect a job that a worker has answered."""
     worker.want(5)
     collected = learner.collect(jobs(1))
-    first = worker.chunk()
-    worker.answer(worker.results(first))
+    chunk = worker.chunk()
+    worker.answer(worker.results(chunk))
     collected.result(WAIT)
+    return chunk
+
+
+def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
+    dispatcher, worker = learner.show(), hire("a/1")
+    first = a_round_of_one_job(learner, worker)
     collected = learner.collect(jobs(1))
     chunk = worker.chunk()
     worker.answer(worker.results(first, 0, value=-9.0))
@@ -152,13 +157,8 @@ def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
 
 
 def test_a_late_copy_of_a_worker_that_has_nothing_to_do_any_more(learner: Learner, hire: Hire) -> None:
-    dispatcher = learner.show()
-    worker = hire("a/1")
-    worker.want(5)
-    collected = learner.collect(jobs(1))
-    first = worker.chunk()
-    worker.answer(worker.results(first))
-    collected.result(WAIT)
+    dispatcher, worker = learner.show(), hire("a/1")
+    first = a_round_of_one_job(learner, worker)
     worker.want(0)
     collected = learner.collect(jobs(1))
     other = hire("b/1")
