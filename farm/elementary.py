@@ -44,6 +44,7 @@ _HALF_TURNS, _HALF = _constants(1.0 / math.pi, 0.5)
 _EVEN, _ODD = _constants(1.5 * 2.0**52, 1.5 * 2.0**52 + 1.0)  # last bit of a whole number's sum with them: is it odd?
 _LAST_TO_SIGN: Final = np.array(63)
 _LARGE: Final = 1e6  # above this, products with the parts of pi are not exact
+_USUAL: Final = 700.0  # up to this magnitude every function's result is an ordinary number
 
 _QUARTER: Final = np.array(0.25, dtype=np.float32)
 _TURNS: Final = tuple(
@@ -53,28 +54,28 @@ _TURNS: Final = tuple(
 _LN2: Final = _constants(*map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
 _COTH: Final = _constants(-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 / 6, 2.0)
 _DOUBLINGS, _ONE, _TWO = _constants(float.fromhex("0x1.71547652b82fep+0"), 1.0, 2.0)
-_LEAST, _MOST = _constants(-750.0, 750.0)  # exp of the first is zero, exp of the second overflows
+_LEAST, _MOST = _constants(-_LARGE, _LARGE)
 _FLAT: Final = np.array(40.0)  # largest 2|x|: above it 1 - tanh(|x|) < 2^-54
 
 
 def exp(x: FloatArray) -> FloatArray:
     """e^x of any array, (...) -> (...)."""
-    return _blockwise(_exp, x)
+    return _apply(_exp, x)
 
 
 def tanh(x: FloatArray) -> FloatArray:
     """Hyperbolic tangent of any array, (...) -> (...)."""
-    return _blockwise(_tanh, x)
+    return _apply(_tanh, x)
 
 
 def cos(x: AnyArray) -> FloatArray:
     """Cosine of any array [rad], (...) -> (...); nan for elements that are not finite."""
-    return _blockwise(_cos, x)
+    return _apply(_cos, x, math.cos)
 
 
 def sin(x: FloatArray) -> FloatArray:
     """Sine of any array [rad], (...) -> (...); nan for elements that are not finite."""
-    return _blockwise(_sin, x)
+    return _apply(_sin, x, math.sin)
 
 
 def cos_turns(x: AnyArray) -> AnyArray:
@@ -90,105 +91,111 @@ def cos_turns(x: AnyArray) -> AnyArray:
     return value
 
 
-def _blockwise(function: Callable[[FloatArray, FloatArray], None], x: AnyArray) -> FloatArray:
-    """Call function(x, out) on parts of at most _BLOCK elements."""
+def _apply(
+    function: Callable[[FloatArray, FloatArray], None], x: AnyArray, otherwise: Callable[[float], float] | None = None
+) -> FloatArray:
+    """Call function(x, out); on parts, silenced and with another function for what is too large, only where needed.
+
+    A control step has few numbers: what costs time is the number of numpy's calls, not the numbers.
+    """
     flat = np.asarray(x, dtype=np.float64).ravel()
     out = np.empty(flat.size)
+    if 0 < flat.size <= _BLOCK and np.maximum.reduce(np.abs(flat)) <= _USUAL:  # false for nan
+        function(flat, out)
+        return out.reshape(np.shape(x))
     with np.errstate(all="ignore"):
         for first in range(0, flat.size, _BLOCK):
             part = slice(first, first + _BLOCK)
-            function(flat[part], out[part])
+            function(np.minimum(np.maximum(flat[part], _LEAST), _MOST), out[part])
+            if otherwise is not None:
+                _replace(otherwise, flat[part], out[part])
     return out.reshape(np.shape(x))
 
 
+def _replace(function: Callable[[float], float], x: FloatArray, out: FloatArray) -> None:
+    """Use the C library's function for arguments that are too large for ours; this is rare and may be slow."""
+    usual = np.abs(x) <= _LARGE
+    if not usual.all():
+        for i in np.flatnonzero(~usual):
+            out[i] = function(x[i]) if math.isfinite(x[i]) else math.nan
+
+
 def _exp(x: FloatArray, out: FloatArray) -> None:
-    np.minimum(x, _MOST, out=out)
-    np.maximum(out, _LEAST, out=out)
-    power = _grown(out)
+    power = _grow(x, out)
     out += _ONE
-    np.ldexp(out, power, out=out)
+    np.ldexp(out, power, out)
 
 
 def _tanh(x: FloatArray, out: FloatArray) -> None:
     """(e^2|x| - 1) / (e^2|x| + 1), with a numerator that is not a difference of nearly equal numbers."""
-    np.abs(x, out=out)
+    np.abs(x, out)
     out += out
     np.minimum(out, _FLAT, out=out)
-    whole = np.ldexp(_ONE, _grown(out))
+    whole = np.ldexp(_ONE, _grow(out, out))
     out *= whole
     whole -= _ONE
     out += whole
-    np.add(out, _TWO, out=whole)
+    np.add(out, _TWO, whole)
     out /= whole
-    np.copysign(out, x, out=out)
+    np.copysign(out, x, out)
 
 
-def _grown(x: FloatArray) -> "np.ndarray[tuple[int, ...], np.dtype[np.intc]]":
-    """Replace x = k ln 2 + r by e^r - 1, in place, and return k."""
-    power = x * _DOUBLINGS
-    np.rint(power, out=power)
-    scratch = np.empty_like(x)
-    for part in _LN2:
-        np.multiply(power, part, out=scratch)
-        x -= scratch
-    square = x * x
-    _polynomial(_COTH, square, scratch)
-    scratch -= x
-    x /= scratch
-    x += x
-    return power.astype(np.intc)
+def _grow(x: FloatArray, out: FloatArray) -> "np.ndarray[tuple[int, ...], np.dtype[np.intc]]":
+    """Of x = k ln 2 + r, put e^r - 1 into `out`, which may be x, and return k."""
+    whole = x * _DOUBLINGS
+    np.rint(whole, whole)
+    power = whole.astype(np.intc)
+    scratch = whole * _LN2[0]
+    np.subtract(x, scratch, out)
+    whole *= _LN2[1]
+    out -= whole
+    np.multiply(out, out, scratch)
+    _polynomial(_COTH, scratch, whole)
+    whole -= out
+    out /= whole
+    out += out
+    return power
 
 
 def _cos(x: FloatArray, out: FloatArray) -> None:
     """cos(x) = (-1)^k sin((k + 1/2) pi - x), k = floor(x / pi)."""
     half_turns = x * _HALF_TURNS
-    np.floor(half_turns, out=half_turns)
+    np.floor(half_turns, half_turns)
     odd = half_turns + _EVEN
     half_turns += _HALF
     _sine(x, half_turns, odd, out)
-    _otherwise(math.cos, x, out, odd)
 
 
 def _sin(x: FloatArray, out: FloatArray) -> None:
     """sin(x) = -(-1)^k sin(k pi - x), k = rint(x / pi)."""
     half_turns = x * _HALF_TURNS
-    np.rint(half_turns, out=half_turns)
-    odd = half_turns + _ODD
-    _sine(x, half_turns, odd, out)
-    _otherwise(math.sin, x, out, odd)
+    np.rint(half_turns, half_turns)
+    _sine(x, half_turns, half_turns + _ODD, out)
 
 
 def _sine(x: FloatArray, half_turns: FloatArray, odd: FloatArray, out: FloatArray) -> None:
-    """(-1)^odd sin(half_turns pi - x); of `odd` only the last bit counts, and the array is overwritten."""
-    np.multiply(half_turns, _PI[0], out=out)
+    """(-1)^odd sin(half_turns pi - x); of `odd` only the last bit counts. Arrays but x are overwritten."""
+    np.multiply(half_turns, _PI[0], out)
     out -= x
-    scratch = np.empty_like(out)
-    for part in _PI[1:]:
-        np.multiply(half_turns, part, out=scratch)
-        out += scratch
+    square = half_turns * _PI[1]
+    out += square
+    half_turns *= _PI[2]
+    out += half_turns
     sign, bits = odd.view(np.int64), out.view(np.int64)
     sign <<= _LAST_TO_SIGN
     bits ^= sign
-    np.multiply(out, out, out=scratch)
-    _polynomial(_SINE, scratch, odd)
-    odd *= scratch
+    np.multiply(out, out, square)
+    _polynomial(_SINE, square, odd)
+    odd *= square
     odd *= out
     out += odd
 
 
 def _polynomial(coefficients: tuple[AnyArray, ...], z: AnyArray, out: AnyArray) -> None:
     """Horner's scheme, the highest power's coefficient first."""
-    np.multiply(z, coefficients[0], out=out)
-    for coefficient in coefficients[1:-1]:
+    first, *middle, last = coefficients
+    np.multiply(z, first, out)
+    for coefficient in middle:
         out += coefficient
         out *= z
-    out += coefficients[-1]
-
-
-def _otherwise(function: Callable[[float], float], x: FloatArray, out: FloatArray, scratch: FloatArray) -> None:
-    """Use the C library's function for arguments that are too large for ours; this is rare and may be slow."""
-    np.abs(x, out=scratch)
-    if np.maximum.reduce(scratch) <= _LARGE:
-        return
-    for i in np.flatnonzero(~(scratch <= _LARGE)):
-        out[i] = function(x[i]) if math.isfinite(x[i]) else math.nan
+    out += last

@@ -28,8 +28,8 @@ class Moments:
         """(B, 1 + 2 d)"""
         self._size = size
 
-    def add(self, rows: IntArray, x: FloatArray) -> None:
-        """Add an observation (n, d) to each of some rollouts (n,)."""
+    def add(self, rows: slice | IntArray, x: FloatArray) -> None:
+        """Add an observation (n, d) to each of some rollouts (n,) or of all."""
         table, mean, squares = self.table, slice(1, 1 + self._size), slice(1 + self._size, None)
         with np.errstate(over="ignore", invalid="ignore"):  # `usable` and `merged` leave out values that are not finite
             table[rows, 0] += 1.0

@@ -210,6 +210,6 @@ def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str,
                 config = FeaturesConfig(features=count)
                 spec = TaskSpec(observation=size, action=1, steps=1, period=1.0)
                 policy = Projected(config, spec, Projected.draw(config, spec, seeds.features(trial)))
-                mapped = np.stack([policy.features(state) for state in states])
+                mapped = policy.features(states)
                 error[i, j] += np.abs(mapped @ mapped.T - np.exp(-squares / 2)).max() / folder.shown(experiment)
     return {"error": error, "sizes": np.array(SIZES), "features": np.array(counts)}

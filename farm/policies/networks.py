@@ -103,8 +103,7 @@ class Linear(Policy):
         for inputs, units in pairwise(self._sizes):
             end = first + units * (inputs + self._bias)
             rows = theta[:, first:end].reshape(len(theta), units, inputs + self._bias)
-            # A different memory order would change the rounding of sums.
-            yield np.ascontiguousarray(rows[:, :, :inputs]), rows[:, :, -1] if self._bias else None
+            yield rows[:, :, :inputs], rows[:, :, -1] if self._bias else None
             first = end
 
 
@@ -148,5 +147,6 @@ class Mlp(Linear):
 
 def affine(weights: FloatArray, bias: FloatArray | None, x: FloatArray) -> FloatArray:
     """W x + b of weights (B, units, inputs), biases (B, units) or None, and x (B, inputs), (B, units)."""
-    out = (weights * np.ascontiguousarray(x)[:, None, :]).sum(axis=-1)
+    # A different memory order would change the rounding of sums.
+    out: FloatArray = np.multiply(weights, x[:, None, :], order="C").sum(axis=-1)
     return out if bias is None else out + bias

@@ -10,7 +10,7 @@ import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.sim.interfaces import Rebound
-from farm.sim.sim import failed_rows, own_value
+from farm.sim.sim import as_rows, failed_rows, own_value
 
 CAPACITY = 64
 """Number of rollouts that are stepped together."""
@@ -90,7 +90,7 @@ class BatchEngine:
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number."""
-        return failed_rows(self._batch.state[ids])
+        return failed_rows(self._batch.state[as_rows(ids)])
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Forces of contacts on every body of rows, (n, nbody, 6)."""

@@ -74,6 +74,7 @@ class Sim:
         self.which: IntArray = np.arange(0)
         """Which of `models` each rollout has, (B,)."""
         self._ids: IntArray = np.arange(0)
+        self._rows: slice | IntArray = slice(0)  # the same, for arrays
         self._source: IntArray | None = None  # rows that outputs are read from, until the first step
         self._expanded: dict[str, AnyArray] = {}
         self._nominal: dict[str, AnyArray] = {}  # the models' own values of them, (M, ...)
@@ -112,7 +113,7 @@ class Sim:
                 self._constants()
                 self.engine.forward(self._ids)
             return values[: len(self)]
-        self._now[name] = taken = self._rows(values)
+        self._now[name] = taken = self._taken(values)
         return taken
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -120,19 +121,17 @@ class Sim:
             raise AttributeError(f"sim.{name} is written in place: sim.{name}[:] = ...; keep your values in sim.own")
         super().__setattr__(name, value)
 
-    def _rows(self, values: AnyArray) -> AnyArray:
+    def _taken(self, values: AnyArray) -> AnyArray:
         """The rows still going, read-only."""
-        rows = self._ids if self._source is None or values.flags.writeable else self._source
-        whole = rows[-1] == len(rows) - 1 and self._source is None if len(rows) else False
-        taken = values[: len(rows)] if whole else values[rows]  # rows rise: the last one tells whether some are gone
-        taken = taken.view()
+        taken = values[self._rows if self._source is None or values.flags.writeable else self._source].view()
         taken.flags.writeable = False
         return taken
 
     def begin(self, count: int, which: IntArray | None = None) -> None:
         """Begin `count` rollouts at the model's own start, with `which` model each (None: the first); arrays can be
         written until `start`."""  # noqa: D205, D209
-        self._ids, self._source, several = np.arange(count), None, len(self.models) > 1
+        self._ids, self._rows, self._source = np.arange(count), slice(count), None
+        several = len(self.models) > 1
         self.which = np.zeros(count, dtype=int) if which is None else which
         if several:
             self.engine.assign(self.which)  # type: ignore[attr-defined]  # it has several models
@@ -163,7 +162,7 @@ class Sim:
         self._live = False
         if not shared:
             return
-        self._ids = np.arange(len(sources))
+        self._ids, self._rows = np.arange(len(sources)), slice(len(sources))
         self.engine.copy(sources)
         for values in self._expanded.values():
             values[: len(sources)] = values[sources]
@@ -299,7 +298,7 @@ class Sim:
 
     def control(self, values: FloatArray) -> None:
         """Set the controls, (B, nu)."""
-        self.engine.field("ctrl")[self._ids] = values
+        self.engine.field("ctrl")[self._rows] = values
         self._now.pop("ctrl", None)
 
     @contextmanager
@@ -319,7 +318,7 @@ class Sim:
     def write(self, states: Mapping[str, AnyArray]) -> None:
         """Write states (n, ...) by name; outputs follow in the next physics step."""
         for name, values in states.items():
-            self.engine.field(name)[self._ids] = values
+            self.engine.field(name)[self._rows] = values
             self._now.pop(name, None)
 
     def blown_up(self) -> BoolArray:
@@ -329,6 +328,7 @@ class Sim:
     def keep(self, going: BoolArray) -> None:
         """Remove the finished rollouts, (B,)."""
         self._ids, self._now, self.which = self._ids[going], {}, self.which[going]
+        self._rows = as_rows(self._ids)
         self.own = {name: values[going] for name, values in self.own.items()}
 
     def _moved(self) -> None:
@@ -339,6 +339,11 @@ class Sim:
         if self._dirty:
             self.engine.set_const(self._ids)
             self._dirty = False
+
+
+def as_rows(ids: IntArray) -> slice | IntArray:
+    """An index of rows whose ids rise, (n,): a slice if they are the first n, as it is faster and needs no copy."""
+    return slice(len(ids)) if len(ids) and ids[-1] == len(ids) - 1 else ids
 
 
 def own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a number or an array

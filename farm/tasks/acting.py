@@ -53,8 +53,10 @@ class Acting:
           TaskError: a policy with memory does not give actions and memories (n, m).
         """
         rows = np.arange(len(self._all)) if rows is None else rows
-        if not np.array_equal(rows, self._rows):
-            self._prepared, self._rows = self._all[rows], rows
+        if rows is not self._rows:
+            if not np.array_equal(rows, self._rows):
+                self._prepared = self._all[rows]
+            self._rows = rows
         if self._memory is None:
             action: AnyArray = self._policy.act(self._prepared, x)
             return action

@@ -124,6 +124,8 @@ class Batch:
         self.which = sim.which
         """Which of the task's models each has, (B,)"""
         count, self.active = len(seeds), np.arange(len(seeds))
+        self.rows: slice | IntArray = slice(None)
+        """Indices of the active rollouts; a slice, which is faster, while all are active"""
         self.start = {name: np.array(values) for name, values in self._measured().items()}  # the originals are live
         """Measured values at the starts, by name, (B, ...)"""
         frames = (count, task.steps * self._parts)
@@ -154,8 +156,7 @@ class Batch:
         task, sim, t = self.task, self.sim, self.sim.t
         if self._actions is None:
             self._actions = np.zeros((len(self._steps), task.steps, action.shape[1]))
-        rows = self._rows()
-        self._actions[rows, t] = action
+        self._actions[self.rows, t] = action
         with sim.writing() as states:
             width = sim.engine.field("ctrl").shape[1]  # an environment's actions need not be the model's controls
             sim.control(shaped("act", task.act(sim, action), (len(sim), width)))
@@ -163,17 +164,13 @@ class Batch:
         for part in range(self._parts):
             sim.step(self._substeps)
             for name, values in self._measured().items():
-                self.frames[name][rows, t * self._parts + part] = values
+                self.frames[name][self.rows, t * self._parts + part] = values
         sim.t += 1
         failed = sim.blown_up()
         self._reward(action, t, failed)
         ended = task.ended(sim)
         ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)
         self._conclude(failed, ended & ~failed, t)
-
-    def _rows(self) -> slice | IntArray:
-        """Indices of the active rollouts; a slice, which is faster, if all are active."""
-        return slice(None) if len(self.active) == len(self._steps) else self.active
 
     def _measured(self) -> dict[str, FloatArray]:
         """The values kept of this frame, (n, ...) each."""
@@ -197,7 +194,9 @@ class Batch:
         terms = given if isinstance(given, dict) else {"reward": given}
         if not terms:
             raise TaskError("reward gave no terms; expected an array, or arrays by name")
-        values = np.stack([shaped(f"reward {n}", v, (len(self.sim),)) for n, v in terms.items()], axis=1)
+        values = np.empty((len(self.sim), len(terms)))
+        for column, (name, term) in enumerate(terms.items()):
+            values[:, column] = shaped(f"reward {name}", term, (len(self.sim),))
         if self.terms is None:
             self.names = tuple(terms)
             self.terms = np.zeros((len(self._steps), self.task.steps, len(terms)))
@@ -207,26 +206,26 @@ class Batch:
         if not np.isfinite(values).all():
             bad = next(n for n, column in zip(terms, values.T, strict=True) if not np.isfinite(column).all())
             raise TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine")
-        self.terms[self._rows(), t] = values
+        self.terms[self.rows, t] = values
 
     def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
         """Remove the finished rollouts; all end with the last step."""
-        over = failed | ended
-        last = t + 1 == self.task.steps
-        if last or over.any():
+        over, last = failed | ended, t + 1 == self.task.steps
+        some = bool(over.any())
+        if some or last:
             success = None if scores(self.task) else self.task.success(self.sim)
             if success is not None:
                 success = shaped("success", success, (len(self.sim),)).astype(bool)
                 done = over | last
                 self._success[self.active[done]] = (success & ~failed)[done]
-        if not over.any():
+        if not some:
             return
         self._steps[self.active[over]] = t + 1
         self._failed[self.active[failed]], self._ended[self.active[ended]] = True, True
         frames = slice(t * self._parts, (t + 1) * self._parts)
         for values in self.frames.values():
             values[self.active[failed], frames] = 0.0  # discard the numbers of unstable states
-        self.active = self.active[~over]
+        self.active = self.rows = self.active[~over]
         self.sim.keep(~over)
 
     @property
@@ -299,10 +298,10 @@ def _run(
         x = batch.observe()
         if moments:
             seen = seen or Moments(len(seeds), x.shape[1])
-            seen.add(batch.active, x)
+            seen.add(batch.rows, x)
         if observed:
             kept = kept if kept.ndim > 2 else np.zeros((len(seeds), task.steps, x.shape[1]), "<f4")
-            kept[batch.active, sim.t] = single(x)
+            kept[batch.rows, sim.t] = single(x)
         action = acting.act(x, batch.active)
         columns = np.shape(action)[1:2] or (sim.model.nu,)
         batch.step(shaped("act of the policy", action, (len(batch.active), *columns)))
