@@ -21,13 +21,15 @@ cos and sin, 3 for tanh; 2e-7 for cos_turns.
 
 import math
 from collections.abc import Callable
-from typing import Final
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 
 from farm.arrays import AnyArray, FloatArray
 
 _BLOCK: Final = 8192  # elements per block: they and the intermediate results stay in a core's cache
+_FEW: Final = 256  # elements whose result is remembered for a while
 
 
 def _constants(*values: float) -> tuple[FloatArray, ...]:
@@ -94,22 +96,35 @@ def cos_turns(x: AnyArray) -> AnyArray:
 def _apply(
     function: Callable[[FloatArray, FloatArray], None], x: AnyArray, otherwise: Callable[[float], float] | None = None
 ) -> FloatArray:
-    """Call function(x, out); on parts, silenced and with another function for what is too large, only where needed.
+    """What function(x, out) puts out; `otherwise` replaces it where x is too large for it."""
+    flat = np.asarray(x, dtype=np.float64).ravel()
+    if flat.size <= _FEW:
+        return _recent(function, otherwise, flat.tobytes()).reshape(np.shape(x)).copy()
+    return _computed(function, otherwise, flat).reshape(np.shape(x))
+
+
+@lru_cache(maxsize=16)
+def _recent(function: Any, otherwise: Any, numbers: bytes) -> FloatArray:  # noqa: ANN401  as `_apply` has them
+    """The result of a few numbers, remembered: tasks ask for the same goal in `observe`, `reward` and `measure`."""
+    return _computed(function, otherwise, np.frombuffer(numbers))
+
+
+def _computed(function: Any, otherwise: Any, x: FloatArray) -> FloatArray:  # noqa: ANN401  as `_apply` has them
+    """What a function puts out of x (n,); silently, and in parts that fit a cache, only where needed.
 
     A control step has few numbers: what costs time is the number of numpy's calls, not the numbers.
     """
-    flat = np.asarray(x, dtype=np.float64).ravel()
-    out = np.empty(flat.size)
-    if 0 < flat.size <= _BLOCK and np.maximum.reduce(np.abs(flat)) <= _USUAL:  # false for nan
-        function(flat, out)
-        return out.reshape(np.shape(x))
+    out = np.empty(x.size)
+    if 0 < x.size <= _BLOCK and np.maximum.reduce(np.abs(x)) <= _USUAL:  # false for nan
+        function(x, out)
+        return out
     with np.errstate(all="ignore"):
-        for first in range(0, flat.size, _BLOCK):
+        for first in range(0, x.size, _BLOCK):
             part = slice(first, first + _BLOCK)
-            function(np.minimum(np.maximum(flat[part], _LEAST), _MOST), out[part])
+            function(np.minimum(np.maximum(x[part], _LEAST), _MOST), out[part])
             if otherwise is not None:
-                _replace(otherwise, flat[part], out[part])
-    return out.reshape(np.shape(x))
+                _replace(otherwise, x[part], out[part])
+    return out
 
 
 def _replace(function: Callable[[float], float], x: FloatArray, out: FloatArray) -> None:

@@ -150,6 +150,16 @@ def test_the_argument_is_left_alone(name):
     np.testing.assert_array_equal(x, before)
 
 
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("count", [3, 1000])
+def test_a_result_belongs_to_the_caller(name, count):
+    x = np.linspace(-2.0, 2.0, count)
+    first = FUNCTIONS[name](x)
+    wanted = first.copy()
+    first[:] = 9.0  # the same numbers again, which may be remembered
+    np.testing.assert_array_equal(FUNCTIONS[name](x), wanted)
+
+
 # ---------------------------------------------------------------- turns, single precision
 
 
