@@ -6,7 +6,6 @@ pictures at /NAME/LABEL (and with places points on their bodies, at /world/BODY/
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
@@ -18,7 +17,7 @@ from farm.sim.channels import Channel
 from farm.sim.marks import ARROW_RADIUS, POINT_RADIUS
 from farm.sim.scene import Scene
 from farm.tasks.base import TaskSpec
-from learner.recording.curves import lighter, lines, pack, palette, ramp
+from learner.recording.curves import Columns, lighter, lines, pack, palette, ramp, scalars
 from learner.recording.solids import rotate
 
 STATES: Final = ("off", "on")
@@ -28,16 +27,6 @@ _TEXT: Final = (230, 230, 230)
 _SHADES: Final = 32  # of a scale
 _OFF: Final = (52, 54, 58)
 _ARROW: Final = (255, 255, 255)  # of arrows without colours
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Rows of one entity, to be sent together."""
-
-    entity: str
-    columns: rr.ComponentColumnList
-    rows: IntArray | None = None
-    """Which frames the rows belong to; None: all of them."""
 
 
 class ChannelDrawing:
@@ -184,10 +173,10 @@ def title(channel: Channel) -> str:
     return f"{name[:1].upper()}{name[1:]}" + (f" [{channel.unit}]" if channel.unit else "")
 
 
-def trace(values: AnyArray, top: float) -> rr.DepthImage:
-    """A rollout's trace (T, K) as a picture of K rows and T columns, brightest at `top`."""
-    image = np.ascontiguousarray(values.T, dtype=np.float32)
-    return rr.DepthImage(image, depth_range=(0.0, top), **_STYLE)
+def pictures(traces: Sequence[AnyArray]) -> rr.ComponentColumnList:
+    """Traces (T, K) of rollouts as pictures of K rows and T columns, one after another."""
+    pixels = [np.ascontiguousarray(values.T, dtype=np.float32).reshape(-1) for values in traces]
+    return rr.DepthImage.columns(buffer=np.stack(pixels).view(np.uint8))
 
 
 def scale(entity: str, width: int, height: int, top: float, unit: str) -> Iterator[tuple[str, Any]]:
@@ -207,8 +196,10 @@ def labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Po
 
 
 def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
-    """Labels of a trace's picture: names of its rows, its duration, and its colours."""
+    """Style and labels of a trace's pictures: names of their rows, their duration, and their colours."""
     steps, rows = spec.trace
+    size = rr.components.ImageFormat(width=steps, height=rows, channel_datatype="F32")
+    yield entity, rr.DepthImage.from_fields(format=size, depth_range=(0.0, spec.traced[0].top), **_STYLE)
     first, places, texts = 0, [], []
     for channel in spec.traced:
         each = int(np.prod(channel.shape[1:]))
@@ -221,12 +212,6 @@ def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
     texts += ["0", f"{steps * spec.period:g} s"]
     yield f"{entity}/axes", labels(places, texts)
     yield from scale(entity, steps, rows, spec.traced[0].top, spec.traced[0].unit)
-
-
-def scalars(values: FloatArray) -> rr.ComponentColumnList:
-    """Curves (F, n) as columns."""
-    count, width = values.shape
-    return rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(count, width))
 
 
 def changes(states: AnyArray) -> IntArray:

@@ -1,8 +1,8 @@
-"""Colours, and the curves of a run: their names, and a generation's values as Rerun entities."""
+"""Colours, and the curves of a run: their names, and the values of its generations as Rerun entities."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle, islice
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -10,6 +10,7 @@ import rerun as rr
 
 from farm.arrays import FloatArray, IntArray
 from farm.net.stats import GenerationStats
+from farm.net.telemetry import Report
 from farm.sim.channels import Measure
 
 Colour = tuple[int, int, int]
@@ -29,6 +30,22 @@ PALETTE: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 _RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
     [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
 )
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Rows of one entity, to be sent together."""
+
+    entity: str
+    columns: rr.ComponentColumnList
+    rows: IntArray | None = None
+    """Which frames, or generations, the rows belong to; None: all of them."""
+
+
+def scalars(values: FloatArray) -> rr.ComponentColumnList:
+    """Curves (F, n) as columns."""
+    count, width = values.shape
+    return rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(count, width))
 
 
 def palette(count: int) -> list[Colour]:
@@ -97,25 +114,38 @@ def static(*, success: bool, measures: Sequence[Measure] = ()) -> list[tuple[str
     return own + [(entity, names) for entity, names, _ in _CURVES]
 
 
-def statistics(stats: GenerationStats, rate: float) -> list[tuple[str, Any]]:
-    """Statistics of a generation's exploring rollouts; `rate` is theirs [1/s]."""
-    band = rr.Measurements.from_fields(values=[stats.return_mean], variances=[stats.return_std**2])
-    own: list[tuple[str, Any]] = [("/learning/return_std", band)]
-    if stats.success_rate is not None:
-        own.append(("/learning/success", rr.Scalars([stats.success_rate])))
-    own += _measures("/learning/measures", stats.measures)
-    return own + [(entity, rr.Scalars(values(stats, rate))) for entity, _, values in _CURVES]
+def statistics(reports: Sequence[Report]) -> Iterator[Columns]:
+    """Curves of some generations' exploring rollouts."""
+    stats = [report.progress for report in reports]
+    means, variances = [each.return_mean for each in stats], [each.return_std**2 for each in stats]
+    yield Columns("/learning/return_std", rr.Measurements.columns(values=means, variances=variances))
+    yield from _known("/learning/success", [each.success_rate for each in stats])
+    yield from _measures("/learning/measures", [each.measures for each in stats])
+    for entity, _, values in _CURVES:
+        yield Columns(entity, scalars(np.array([values(each.progress, each.rate) for each in reports], dtype=float)))
 
 
-def _measures(entity: str, values: Mapping[str, float | None]) -> list[tuple[str, Any]]:
-    """Curves of measures; a gap where all rollouts failed."""
-    return [(f"{entity}/{name}", rr.Scalars([value])) for name, value in values.items() if value is not None]
+def mean_policies(stats: Sequence[GenerationStats]) -> Iterator[Columns]:
+    """Curves of the mean policies of some generations: returns, measures, and success if the task defines it."""
+    yield from _known("/learning/mean_policy/return", [each.mean_policy_return for each in stats])
+    yield from _known("/learning/mean_policy/success", [each.mean_policy_success for each in stats])
+    yield from _measures("/learning/mean_policy/measures", [each.mean_policy_measures for each in stats])
 
 
-def mean_policy(
-    value: float, success: bool | None, measures: Mapping[str, float | None] = MappingProxyType({})
-) -> list[tuple[str, Any]]:
-    """The return of a mean policy, its measures, and whether it succeeds (None if the task does not define success)."""
-    succeeds = [] if success is None else [("/learning/mean_policy/success", rr.Scalars([float(success)]))]
-    found = _measures("/learning/mean_policy/measures", measures)
-    return [("/learning/mean_policy/return", rr.Scalars([value])), *succeeds, *found]
+def last_policy(value: float, success: bool | None) -> Iterator[Columns]:
+    """The same of a finished run's last policy."""
+    yield from _known("/learning/mean_policy/return", [value])
+    yield from _known("/learning/mean_policy/success", [success])
+
+
+def _measures(entity: str, several: Sequence[Mapping[str, float | None]]) -> Iterator[Columns]:
+    """Curves of measures, by name; a gap where all rollouts failed."""
+    for name in several[0]:
+        yield from _known(f"{entity}/{name}", [each.get(name) for each in several])
+
+
+def _known(entity: str, values: Sequence[float | None]) -> Iterator[Columns]:
+    """A curve of those values that are known."""
+    rows = [row for row, value in enumerate(values) if value is not None]
+    if rows:
+        yield Columns(entity, scalars(np.array([[values[row]] for row in rows], dtype=float)), np.array(rows))

@@ -18,8 +18,8 @@ from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
 from farm.tasks.standard import start
 from learner.recording.blueprint import FOLLOWED, Eye
-from learner.recording.channels import ChannelDrawing, Columns, path, scalars
-from learner.recording.curves import lines
+from learner.recording.channels import ChannelDrawing, path
+from learner.recording.curves import Columns, lines, scalars
 from learner.recording.solids import solid, xyzw
 from learner.run.setup import Problem
 
@@ -37,6 +37,7 @@ class Drawing:
         """Draw a scene with its task's channels; seen from a camera, or (None) from the side of the moving bodies."""
         self.scene, self.spec, self.camera = scene, spec, camera
         self._channels = {channel.name: ChannelDrawing(channel, scene) for channel in spec.channels}
+        self._some = [each for each in scene.geometries() if each.models]  # that not every model has
 
     @classmethod
     def of(cls, problem: Problem) -> "Drawing":
@@ -112,7 +113,7 @@ class Drawing:
             if name not in self.scene.fixed:
                 moved = rr.Transform3D.columns(translation=poses[:, :3], quaternion=xyzw(poses[:, 3:]))
                 yield Columns(f"/world/{name}", moved)
-        for geometry in (each for each in self.scene.geometries() if each.models):  # a scale of 0 hides it
+        for geometry in self._some:  # a scale of 0 hides it
             there = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)
             yield Columns(_entity(geometry), rr.Transform3D.columns(scale=np.repeat(there[:, None], 3, axis=1)))
         yield Columns("/reward/terms", scalars(rollout.terms))

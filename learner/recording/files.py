@@ -54,20 +54,26 @@ def set_aside(path: Path) -> None:
 
 
 def last_generation(path: Path) -> int:
-    """The last generation in a recording's files, 0 if there are none; truncated files are repaired first.
+    """The last generation in a recording's files, 0 if there are none; truncated files are repaired.
 
     Raises:
       ConfigError: they cannot be read.
     """
-    from rerun.chunk import RrdReader
-
-    if parts(path):
+    try:
+        return _last_generation(path)
+    except Exception:  # Rerun's reader raises many types
         compact(path)
     try:
-        chunks = (chunk for part in parts(path) for chunk in RrdReader(part).stream())
-        batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == _EACH_GENERATION]
-    except Exception as error:  # Rerun's reader raises many types
+        return _last_generation(path)
+    except Exception as error:
         raise ConfigError(f"cannot read {path}: {error}; move it away, or choose a different --out") from None
+
+
+def _last_generation(path: Path) -> int:
+    from rerun.chunk import RrdReader
+
+    chunks = (chunk for part in parts(path) for chunk in RrdReader(part).stream())
+    batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == _EACH_GENERATION]
     columns = [batch.column("generation") for batch in batches if "generation" in batch.schema.names]
     return max((number for column in columns for number in column.cast("int64").to_pylist()), default=0)
 

@@ -18,7 +18,7 @@ import logging
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,14 +28,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from farm.arrays import AnyArray, FloatArray
+from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report
 from farm.sim.trajectory import Trajectory, joined
 from learner.recording import blueprint, curves
 from learner.recording.blueprint import Eye
-from learner.recording.channels import axes, trace
+from learner.recording.channels import axes, pictures
+from learner.recording.curves import Columns
 from learner.recording.drawing import Drawing
 from learner.recording.files import compact, with_layout
 from learner.recording.replay import record_replay
@@ -46,6 +47,7 @@ from learner.recording.rows import (
     flush,
     log_static,
     markdown,
+    markdowns,
     row,
     send,
     send_gaps,
@@ -56,7 +58,7 @@ from learner.recording.rows import (
 log = logging.getLogger(__name__)
 
 HOLD: Final = 0.5
-"""Rollouts of this duration are written together: writing a row costs much more than its data [s]."""
+"""Generations of this duration are written together: writing a row costs much more than its data [s]."""
 RESERVE: Final = 32 << 20
 """Free disk space below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
@@ -100,7 +102,8 @@ class Recorder:
         spec, scene = drawing.spec, drawing.scene
         self._path, self._horizon, self._generation = path, spec.steps * spec.period, done
         self._last = time.time() - self._horizon
-        self._held: list[_Held] = []
+        self._reports: list[tuple[float, Report]] = []  # that are held back, with when they came [s since the epoch]
+        self._held: list[_Held] = []  # and their rollouts
         self._broken = False
         self._finished: rrb.Blueprint | None = None
         self._drawing, self._again = drawing, again
@@ -130,7 +133,7 @@ class Recorder:
         log_static(self._stream, static)
 
     def generation(self, report: Report) -> None:
-        """Record a finished generation; its rollout may be held back for HOLD, or until `settle` or `close`.
+        """Record a finished generation; it may be held back for HOLD, or until `settle` or `close`.
 
         The traces `best` and `worst` (T, K) are drawn as pictures; `all` (S, T, K) is kept bit by bit. K are the
         traced channels' values side by side, see `farm.tasks.base.flat`.
@@ -140,32 +143,27 @@ class Recorder:
           OSError: the file cannot be written (a full disk); what it has stays.
         """
         self._check_space()
-        stats, sample = report.progress, report.sample
-        if sample is not None:
-            self._drawing.check(sample)
-        self._generation, before, now = stats.generation, stats.generation - 1, time.time()
-        at = self._at(now)
-        self._send(at, curves.statistics(stats, report.rate))
-        learnt = (stats.mean_policy_return, stats.mean_policy_success, stats.mean_policy_measures)
-        self._send(self._at(now, before), curves.mean_policy(*learnt))
-        if self._again is not None:
-            self._stream.send_columns("/again", at, row(markdown(self._again(stats))))
+        if report.sample is not None:
+            self._drawing.check(report.sample)
         for name, values in report.traces.items():
-            self._stream.send_columns(f"/traces/{name}", at, row(self._trace(name, values)))
-        if sample is not None:
-            self._hold(sample, before, now)
+            if values.shape[-2:] != self._drawing.spec.trace:
+                expected = self._drawing.spec.trace
+                raise ValueError(f"trace {name} of shape {values.shape}, expected {expected} for each rollout")
+        self._generation, now = report.generation, time.time()
+        self._reports.append((now, report))
+        if report.sample is not None:
+            self._hold(report.sample, report.generation - 1, now)
         self._last = now
-        if self._held and now - self._held[0].since >= HOLD:
-            self._draw()
-        self._flush()
+        if now - self._reports[0][0] >= HOLD:
+            self.settle()
 
     def settle(self) -> None:
-        """Write the rollouts that are held back.
+        """Write what is held back.
 
         Raises:
           OSError: the file takes no more.
         """
-        if self._held:
+        if self._reports or self._held:
             self._draw()
             self._flush()
 
@@ -178,7 +176,8 @@ class Recorder:
         """
         self._drawing.check(rollout)
         now = time.time()
-        self._send(self._at(now), curves.mean_policy(rollout.value, rollout.success))
+        for part in curves.last_policy(rollout.value, rollout.success):
+            self._stream.send_columns(part.entity, self._at(now), part.columns)
         self._hold(rollout, self._generation, now)
         self._finished = blueprint.finished(self._drawing.spec, self._eye, self._generation)
         self._stream.send_blueprint(self._finished)
@@ -206,17 +205,15 @@ class Recorder:
         if self._path is not None and merge and compact(self._path) and self._finished is not None:
             with_layout(self._path, partial(self._finished.save, APPLICATION))
 
-    def _trace(self, name: str, values: AnyArray) -> Any:  # noqa: ANN401  (archetypes have no public base)
-        """A trace as an archetype; see `generation`."""
-        spec = self._drawing.spec
-        if values.shape[-2:] != spec.trace:
-            raise ValueError(f"trace {name} of shape {values.shape}, expected {spec.trace} for each rollout")
-        if name != "all":
-            return trace(values, spec.traced[0].top)
-        return rr.Tensor(np.ascontiguousarray(values, dtype=np.float32), dim_names=("rollout", "step", "value"))
-
     def _draw(self) -> None:
-        """Send the rollouts that are held back, all rows of an entity together."""
+        """Send what is held back, all rows of an entity together."""
+        waiting, self._reports = self._reports, []
+        if waiting:
+            wall, reports = np.array([came for came, _ in waiting]), [report for _, report in waiting]
+            numbers = np.array([report.generation for report in reports])
+            send(self._stream, self._columns(reports), "generation", numbers, numbers * self._horizon, wall)
+            before, policies = numbers - 1, curves.mean_policies([report.progress for report in reports])
+            send(self._stream, policies, "generation", before, before * self._horizon, wall)
         held, self._held = self._held, []
         if not held:
             return
@@ -229,6 +226,22 @@ class Recorder:
         whole = self._horizon - 0.5 * self._drawing.spec.period
         if early := [one.sim[-1] + SEAM for one in held if one.rollout.times[-1] < whole]:
             send_gaps(self._stream, self._drawing.gaps(len(early)), np.array(early))
+
+    def _columns(self, reports: Sequence[Report]) -> Iterator[Columns]:
+        """What some generations have beside rollouts."""
+        yield from curves.statistics(reports)
+        if self._again is not None:
+            yield Columns("/again", markdowns([self._again(report.progress) for report in reports]))
+        for name in ("best", "worst"):
+            rows = [row for row, report in enumerate(reports) if name in report.traces]
+            if rows:
+                drawn = pictures([reports[row].traces[name] for row in rows])
+                yield Columns(f"/traces/{name}", drawn, np.array(rows))
+        for number, report in enumerate(reports):
+            if "all" in report.traces:
+                values = np.ascontiguousarray(report.traces["all"], dtype=np.float32)
+                tensor = rr.Tensor(values, dim_names=("rollout", "step", "value"))
+                yield Columns("/traces/all", rr.ComponentColumnList(row(tensor)), np.array([number]))
 
     def _flush(self) -> None:
         """Wait until every row is in the file: a kill loses only what is held back or waits to be recorded."""
@@ -247,20 +260,16 @@ class Recorder:
             text = f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are needed"
             raise OSError(errno.ENOSPC, text)
 
-    def _send(self, at: list[rr.TimeColumn], values: Iterable[tuple[str, Any]]) -> None:
-        for entity, archetype in values:
-            self._stream.send_columns(entity, at, row(archetype))
-
     def _hold(self, rollout: Trajectory, generation: int, now: float) -> None:
         """Hold back a mean policy's rollout, to be written together with the next ones."""
         start = generation * self._horizon
         wall = now + (rollout.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
         sim = np.minimum(start + rollout.times, start + self._horizon - SEAM)
-        self._held.append(_Held(now, generation, sim, wall, rollout))
+        self._held.append(_Held(generation, sim, wall, rollout))
 
-    def _at(self, now: float, generation: int | None = None) -> list[rr.TimeColumn]:
-        """Start of a generation (None: the one recorded last) that is recorded now [s since the epoch]."""
-        numbers = np.array([self._generation if generation is None else generation])
+    def _at(self, now: float) -> list[rr.TimeColumn]:
+        """Start of the generation recorded last; now [s since the epoch]."""
+        numbers = np.array([self._generation])
         return times("generation", numbers, numbers * self._horizon, np.array([now]))
 
 
@@ -268,8 +277,6 @@ class Recorder:
 class _Held:
     """A rollout that is held back."""
 
-    since: float
-    """When it was recorded [s since the epoch]."""
     generation: int
     sim: FloatArray
     """Its frames' times on sim_time [s], (F,)"""

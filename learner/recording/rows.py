@@ -1,6 +1,6 @@
 """Opens Rerun recordings and writes rows to them: several at once, on our own timelines."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,12 +9,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from farm.arrays import FloatArray, IntArray
-from learner.recording.channels import Columns
+from learner.recording.curves import Columns
 from learner.recording.files import next_part
 
 FLUSH: Final = 30.0
 """How long rows may take to reach the file before the recording counts as broken [s]."""
 APPLICATION: Final = "rolloutfarm"
+_MARKDOWN: Final = "text/markdown"
 
 
 def begin(
@@ -74,7 +75,12 @@ def log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) 
 
 def markdown(text: str) -> rr.TextDocument:
     """A text with headings, tables and code."""
-    return rr.TextDocument(text, media_type="text/markdown")
+    return rr.TextDocument(text, media_type=_MARKDOWN)
+
+
+def markdowns(texts: Sequence[str]) -> rr.ComponentColumnList:
+    """Such texts as columns, a row each."""
+    return rr.TextDocument.columns(text=texts, media_type=[_MARKDOWN] * len(texts))
 
 
 def row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no public base)

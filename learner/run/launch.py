@@ -374,21 +374,24 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     if not (place.record or place.serve):
         return None
     from learner.recording.drawing import Drawing
-    from learner.recording.files import parts
+    from learner.recording.files import last_generation
     from learner.recording.run import open_recording
 
     path = learner.folder.recording if place.record else None
-    begun = path is not None and bool(parts(path))
+    recorded = 0
+    if path is not None:
+        with suppress(ConfigError):  # it cannot be read: it stays as it is, and what follows is recorded beside it
+            recorded = last_generation(path)
     opened = stack.enter_context(open_recording(
         path, run=learner.run, config=learner.config, serve=place.serve, drawing=Drawing.of(learner.problem),
-        done=learner.state.generation if begun else 0, folder=learner.folder.path,
+        done=learner.state.generation if recorded else 0, folder=learner.folder.path,
     ))  # fmt: skip
-    if not begun:  # the curves of a run that was not recorded before
-        rollouts, seconds = 0, 0.0
-        for stats in learner.folder.progress():
-            rate = (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-9)
+    rollouts, seconds = 0, 0.0
+    for stats in learner.folder.progress():  # the curves of what was not recorded, or was lost when the run was killed
+        rate = (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-9)
+        if stats.generation > recorded:
             opened.put(Report(progress=stats, rate=rate))
-            rollouts, seconds = stats.rollouts, stats.seconds
+        rollouts, seconds = stats.rollouts, stats.seconds
     return opened
 
 

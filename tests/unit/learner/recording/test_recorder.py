@@ -38,6 +38,7 @@ if limit:
 try:
     for stats, traces in calls:
         recorder.generation(Report(progress=stats, rate=1.0, traces=traces))
+    recorder.settle()
 except OSError:
     recorder.close()
     print("noticed")
