@@ -51,6 +51,8 @@ class Loggers:
 
     def generation(self, stats: GenerationStats) -> None:
         """Log a generation, without unknown values."""
+        if not self._open:
+            return
         values = asdict(stats)
         for kind in ("measures", "mean_policy_measures"):
             values |= {f"{kind}_{name}": value for name, value in values.pop(kind).items()}

@@ -377,8 +377,7 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     from learner.recording.files import last_generation
     from learner.recording.run import open_recording
 
-    path = learner.folder.recording if place.record else None
-    recorded = 0
+    path, recorded = learner.folder.recording if place.record else None, 0
     if path is not None:
         with suppress(ConfigError):  # it cannot be read: it stays as it is, and what follows is recorded beside it
             recorded = last_generation(path)

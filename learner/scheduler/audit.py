@@ -289,10 +289,11 @@ class Audit:
 
     def _answered(self, by: np.ndarray) -> list[str]:
         """The hosts of these parties, in order."""
-        return list(dict.fromkeys(self._parties[at].host for at in np.unique(by[by >= 0]).tolist()))
+        return list(dict.fromkeys(self._parties[at].host for at in sorted({*by.tolist()} - {-1})))
 
     def _jobs_of(self, name: str) -> np.ndarray:
-        return np.flatnonzero(np.isin(self._by, [at for at, party in enumerate(self._parties) if party.host == name]))
+        mine = np.array([*(party.host == name for party in self._parties), False])  # -1: nobody's
+        return np.flatnonzero(mine[self._by])
 
     def _choose(self, results: RoundResults, *, end: bool) -> list[int]:
         """The jobs that are drawn; and of each host that is due its best and another, if none of the others is."""

@@ -129,6 +129,16 @@ def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
     assert generations(folder / "run.rrd") == list(range(1, 31))
 
 
+def test_a_killed_run_has_the_curves_of_every_generation_once(farm: Farm) -> None:
+    """The last half second's generations are lost with the process, and written when the run continues."""
+    process = farm.start("run", *SMALL[:-1], "30")
+    farm.wait_for(lambda: len(farm.progress("r")) >= 5)
+    process.kill()
+    process.wait()
+    farm.call("run", "--resume", "runs/r")
+    assert generations(farm.folder / "runs" / "r" / "run.rrd") == list(range(1, 31))
+
+
 def test_a_run_that_is_first_recorded_later_has_the_curves_of_its_beginning(farm: Farm) -> None:
     farm.call("run", *SMALL, "--no-record")
     farm.call("run", "--resume", "runs/r", "--generations", "6")
