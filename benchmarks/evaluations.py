@@ -3,32 +3,77 @@
 import functools
 import os
 import time
+from pathlib import Path
+from typing import Any
 
+import mujoco.batch
 import numpy as np
 
 from farm.arrays import FloatArray
 from farm.rollouts import Runner
-from learner.run.config import configure
+from farm.tasks.finger_gait.holding import CLOSING, SUBSTEPS
+from farm.tasks.loop import Batch, again
+from learner.run.config import RunConfig, configure
 from learner.run.setup import problem
 
+HERE = Path(__file__).parent
 STILL = 50.0
-"""Value of every parameter: so far from every joint position that the kernel is zero and no rollout ends early."""
+"""Value of every parameter of the gait's policy: so far from every joint position that no rollout ends early."""
+
+
+TASKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "gait": ("finger-gait", {}),
+    "arm": (f"{HERE.parent / 'examples/tasks/arm.py'}:Arm", {"normalise": False}),  # no other tool has a normaliser
+    "zero": (f"{HERE / 'zero_cost.py'}:ZeroCost", {"policy": "linear"}),
+}
+"""Task and settings of a kind of evaluation; `zero` takes no time."""
+
+
+def config(kind: str, **more: Any) -> RunConfig:  # noqa: ANN401
+    """Configuration of a kind of evaluation."""
+    task, settings = TASKS[kind]
+    return configure(task, **settings, **more)
 
 
 @functools.cache
-def runner() -> Runner:
-    """The finger gait of the default preset, built once in each process."""
-    return problem(configure(preset=os.environ.get("PRESET", "default"))).runner()
+def runner(kind: str) -> Runner:
+    """What evaluates it, built once in each process."""
+    return problem(config(kind)).runner()
 
 
-def gait(theta: FloatArray) -> FloatArray:
+def theta(kind: str, rows: int) -> FloatArray:
+    """Parameters to evaluate, (rows, P)."""
+    noise = 0.02 * np.random.default_rng(0).standard_normal((rows, runner(kind).size))
+    return noise + STILL if kind == "gait" else noise
+
+
+def evaluate(kind: str, parameters: FloatArray) -> FloatArray:
     """Returns of rollouts with parameters (B, P); both rollouts of a pair have the same perturbed start."""
-    return runner().rollouts(theta, [(row // 2,) for row in range(len(theta))]).returns
+    if kind == "zero":
+        return np.asarray(parameters.sum(axis=1))
+    return runner(kind).rollouts(parameters, [(row // 2,) for row in range(len(parameters))]).returns
 
 
-def nothing(theta: FloatArray) -> FloatArray:
-    """Evaluations that take no time."""
-    return np.asarray(theta.sum(axis=1))
+def steps(kind: str) -> float:
+    """Physics steps of a rollout; the gait's include its half of those that close the grip of a pair."""
+    task = runner(kind).task
+    return task.steps * SUBSTEPS + CLOSING / 2 if kind == "gait" else task.steps * task.substeps
+
+
+@functools.cache
+def _bare(kind: str, count: int, threads: int) -> mujoco.batch.Batch:
+    sim, task = runner(kind).sim, runner(kind).task
+    rows = np.arange(count) % 64
+    again(lambda: Batch(task, sim, [(int(row) // 2,) for row in range(64)]))
+    bare = mujoco.batch.Batch(sim.model, count, threads)
+    for name in ("qpos", "qvel", "ctrl", "eq_active", "mocap_pos", "mocap_quat"):
+        bare.bind(name)[:] = getattr(sim, name)[rows]
+    return bare
+
+
+def physics(kind: str, count: int, threads: int) -> None:
+    """The physics steps of so many rollouts, and nothing else."""
+    _bare(kind, count, threads).step(nstep=int(steps(kind)))
 
 
 def pid(_: int = 0) -> int:

@@ -1,14 +1,15 @@
-"""Compares the farm with a process pool, Ray, EvoTorch on Ray, and Dask; one table.
+"""Compares the farm with a process pool, joblib, Ray, EvoTorch on Ray, and Dask; one table, and a file of its numbers.
 
-    python benchmarks/peers.py [--turns 3] [--only NAME]
+    python benchmarks/peers.py [--turns 10] [--names pool,run] [--out docs/results/tables/peers.json] [--table]
 
-The backends run in turn, several times, each time in a separate process. All evaluate the same: generations of 15 and
-of 100 mirrored pairs of the finger gait with perturbed starts, held still so that no rollout ends early, and
-generations of empty evaluations. Their rate of physics steps is divided by that of MuJoCo alone with two threads,
-measured in the same process just before and after. The other tools get each worker's half of a generation in one call,
-which is fastest for them, and do not update or save anything. The time of `farm run` includes updates, checkpoints
-and, as users type it, the recording. Tools that are not installed are left out: `pip install ray distributed evotorch`
-installs all.
+Each backend is a process that stays; they work in turns of about a second, one after another, because the speed of a
+shared machine changes within seconds. All evaluate the same: generations of 15 and of 100 mirrored pairs of the finger
+gait, held still so that no rollout ends early, and of the arm of examples/; and generations of empty evaluations. The
+speed of a turn is that relative to the same physics steps by `mujoco.batch` with two threads in the same round of
+turns; processor time is that of a backend's processes together. The other tools get each worker's half of a generation
+in one call, which is fastest for them, and do not update or save anything. `farm run` updates, saves and, as users type
+it, records; it also simulates its mean policy, which counts as a rollout. Tools that are not installed are left out:
+`pip install ray distributed evotorch joblib` installs all.
 """
 
 import argparse
@@ -25,187 +26,222 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import evaluations
 import mujoco
-import mujoco.batch
 import numpy as np
-from evaluations import STILL, gait, nothing, pid
+from evaluations import evaluate, pid, theta
 
 import farm
 from farm.arrays import FloatArray
+from farm.errors import FarmError
 from farm.net.session import free_endpoint
 from farm.rollouts import Runner
 from farm.sim.engines import BatchEngine
-from farm.tasks.finger_gait.holding import CLOSING, SUBSTEPS
-from farm.tasks.loop import Batch, again
-from learner.run.config import RunConfig, configure
 from learner.run.launch import Placement, open_run
 from learner.run.setup import problem
 
-PAIRS = (15, 100)
-SECONDS = 1.0  # duration of each measurement
-GIVE_UP = 10.0  # [s] after which an evaluation counts as hanging
-ZERO = Path(__file__).with_name("zero_cost.py")
-
-Evaluate = Callable[[Any, FloatArray], FloatArray]
-"""Evaluates `gait` or `nothing` for all rows."""
+ROUNDS: Final = (("gait", 15), ("gait", 100), ("arm", 15), ("arm", 100), ("zero", 15), ("zero", 100))
+"""Kinds of evaluations, and pairs of a generation."""
+SECONDS: Final = 1.0  # of a turn
+GIVE_UP: Final = 10.0  # [s] after which an evaluation counts as hanging
+WORKERS: Final = 2
 
 
 def main() -> None:
-    """Print the table; with --only, lines of JSON of one backend."""
+    """Measure what is asked for, and print the table of the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--only", choices=BACKENDS)
-    parser.add_argument("--kill", action="store_true", help="with --only: kill a worker as well")
+    parser.add_argument("--turns", type=int, default=10)
+    parser.add_argument("--names", type=lambda text: text.split(","), default=list(BACKENDS))
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--table", type=Path, help="print the table of such a file, and measure nothing")
+    parser.add_argument("--only", choices=BACKENDS, help=argparse.SUPPRESS)
     parser.add_argument("--begun", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.only:
-        _of_one(arguments.only, arguments.begun or time.time(), kill=arguments.kill)
+        _serve(arguments.only, arguments.begun)
         return
-    print(
-        f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, MuJoCo {mujoco.__version__}"
-    )
-    there = {}
-    for name, (what, package, _) in BACKENDS.items():
-        if importlib.util.find_spec(package) is None:
-            print(f"{what} is left out: {package} is not installed")
-        else:
-            there[name] = what
-    turns = [{name: _turn(name, kill=turn == 0) for name in there} for turn in range(arguments.turns)]
-    print(
-        "\n| | 30 rollouts | 200 rollouts | 30 empty jobs [ms] | 200 [ms] | first result [s] | memory [MB] ",
-        end="",
-    )
-    print("| if a worker is killed |\n|---|---|---|---|---|---|---|---|")
-    for name, what in there.items():
-        rows = [turn[name] for turn in turns]
-        cells = [
-            "-" if key not in rows[0] else f"{statistics.median(row[key] for row in rows):{form}}"
-            for key, form in COLUMNS.items()
-        ]
-        print(f"| {what} | {' | '.join(cells)} | {rows[0].get('killed', '-')} |")
+    if not arguments.table:
+        found = _measured(arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}])
+        if arguments.out:
+            arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+    else:
+        found = json.loads(arguments.table.read_text())
+    print("\n".join(table(found)))
 
 
-COLUMNS = {"gait15": ".2f", "gait100": ".2f", "zero15": ".2f", "zero100": ".2f", "first": ".1f", "memory": ".0f"}
+def table(found: dict[str, Any]) -> Iterator[str]:
+    """The lines of the table: medians of the turns, lowest to highest in parentheses."""
+    yield f"{found['machine']}; {found['turns']} turns"
+    yield ""
+    heads = [f"{kind}, {2 * pairs}" for kind, pairs in ROUNDS if kind != "zero"]
+    yield f"| | {' | '.join(heads)} | core-ms at 30 | 30 empty [ms] | 200 [ms] | first [s] | MB | a killed worker |"
+    yield f"|---|{'---|' * (len(heads) + 6)}"
+    for name, own in found["backends"].items():
+        speeds, rounds = [], own["rounds"]
+        for kind, pairs in ROUNDS:
+            key = f"{kind}{pairs}"
+            if kind != "zero":
+                pairs_of_turns = zip(found["backends"]["threads"]["rounds"][key], rounds[key], strict=True)
+                turns = [bare["wall"] / turn["wall"] for bare, turn in pairs_of_turns]
+                speeds.append(f"{statistics.median(turns):.2f} ({min(turns):.2f} to {max(turns):.2f})")
+        empty = (
+            [f"{1e3 * statistics.median(turn['wall'] for turn in rounds[f'zero{pairs}']):.2f}" for pairs in (15, 100)]
+            if "zero15" in rounds
+            else ["-", "-"]
+        )
+        cores = f"{1e3 * statistics.median(turn['cores'] for turn in rounds['gait15']):.0f}"
+        cells = [*speeds, cores, *empty, f"{own['first']:.1f}", f"{own['memory']:.0f}", own.get("killed", "-")]
+        yield f"| {BACKENDS[name][0]} | {' | '.join(cells)} |"
 
 
-def _turn(name: str, *, kill: bool) -> dict[str, Any]:
-    """Run one backend in a separate process; return its results."""
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, __file__, "--only", name, "--begun", str(time.time())]
-    command += ["--kill"] if kill else []
-    said: dict[str, Any] = {}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ, "PYTHONPATH": path}
-    ) as process:
-        assert process.stdout is not None
-        try:
-            for line in process.stdout:
-                if line.startswith("{"):
-                    said |= json.loads(line)
-        except KeyboardInterrupt:
-            os.killpg(process.pid, signal.SIGKILL)  # Ctrl-C does not reach a session of its own
-            raise
-    print(name, json.dumps(said), file=sys.stderr, flush=True)
-    return said
+def _measured(turns: int, names: list[str]) -> dict[str, Any]:
+    there = {name: BACKENDS[name] for name in names if importlib.util.find_spec(BACKENDS[name][1])}
+    for name in names:
+        if name not in there:
+            print(f"{BACKENDS[name][0]} is left out: {BACKENDS[name][1]} is not installed", file=sys.stderr)
+    found: dict[str, Any] = {
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, "
+        f"MuJoCo {mujoco.__version__}, {time.strftime('%Y-%m-%d')}",
+        "turns": turns,
+        "backends": {name: {"rounds": {}} for name in there},
+    }
+    with ExitStack() as stack:
+        backends: dict[str, _Backend] = {}
+        for name in there:  # one after another: the time of the first result counts
+            backends[name] = stack.enter_context(_Backend(name))
+            found["backends"][name] |= backends[name].ask("start")
+        for kind, pairs in ROUNDS:
+            able = {name: backend for name, backend in backends.items() if kind != "zero" or name not in PHYSICS}
+            own = {name: [] for name in able}
+            for backend in able.values():
+                backend.ask(f"open {kind} {pairs}")
+            for turn in range(turns):
+                for name, backend in able.items():
+                    own[name].append(backend.ask("turn"))
+                print(f"{kind}, {pairs} pairs: {turn + 1} of {turns} turns", file=sys.stderr, flush=True)
+            for name, each in own.items():
+                found["backends"][name]["rounds"][f"{kind}{pairs}"] = each
+        for name, backend in backends.items():
+            found["backends"][name] |= backend.ask("kill")
+    return found
+
+
+class _Backend:
+    """A backend in its own process and session."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+        command = [sys.executable, __file__, "--only", name, "--begun", str(time.time())]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, "PYTHONPATH": path, "TOKENIZERS_PARALLELISM": "false"},
+        )  # fmt: skip
+
+    def ask(self, words: str) -> dict[str, Any]:
+        """Let it do something; what it says of that."""
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None
+        assert stdout is not None
+        with suppress(BrokenPipeError):
+            stdin.write(words + "\n")
+            stdin.flush()
+        for line in stdout:
+            if line.startswith("{"):  # others are a tool's own
+                return dict(json.loads(line))
+        if words != "kill":  # which may end it with its workers
+            raise FarmError(f"{self._name} ended; see its messages above")
+        return {}
+
+    def __enter__(self) -> "_Backend":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+# ---------------------------------------------------------------- in a backend's process
+
+
+def _serve(name: str, begun: float) -> None:
+    with BACKENDS[name][2]() as (generation, kill):
+        kind, pairs = "gait", 15
+        for line in sys.stdin:
+            match line.split():
+                case ["start"]:
+                    generation("gait" if name in PHYSICS else "zero", 15)
+                    first = time.time() - begun
+                    generation("gait", 15)
+                    _say(first=first, memory=_family()[1])
+                case ["open", kind, number]:
+                    pairs = int(number)
+                    for _ in range(3):
+                        generation(kind, pairs)
+                    _say()
+                case ["turn"]:
+                    _say(**_turn(partial(generation, kind, pairs), more=name in RUNS, pairs=pairs))
+                case ["kill"]:
+                    _killed(kill)
+
+
+def _turn(call: Callable[[], object], *, more: bool, pairs: int) -> dict[str, float]:
+    """Wall time and processor time of a generation [s]."""
+    count, cores, begun = 0, _family()[0], time.perf_counter()
+    while time.perf_counter() - begun < SECONDS:
+        call()
+        count += 1
+    wall, cores = time.perf_counter() - begun, _family()[0] - cores
+    of_pairs = 2 * pairs / (2 * pairs + more)  # that of a run has one rollout more
+    return {"wall": wall / count * of_pairs, "cores": cores / count * of_pairs}
 
 
 def _say(**values: object) -> None:
     print(json.dumps(values), flush=True)
 
 
-def _of_one(name: str, begun: float, *, kill: bool) -> None:
-    os.environ["TOKENIZERS_PARALLELISM"] = "false"
-    with BACKENDS[name][2]() as (generation, killed):
-        generation("zero", 15)
-        _say(first=time.time() - begun)
-        generation("gait", 15)
-        _say(memory=_memory())
-        for pairs in PAIRS:
-            _say(**{f"zero{pairs}": 1e3 * statistics.median(_times(lambda: generation("zero", pairs)))})  # noqa: B023
-        before = _physics()
-        rates = {}
-        for pairs in PAIRS:
-            taken = _times(lambda: generation("gait", pairs))  # noqa: B023
-            rates[pairs] = _steps(pairs, mean=name == "run") / statistics.mean(taken)
-        physics = (before + _physics()) / 2
-        _say(**{f"gait{pairs}": rate / physics for pairs, rate in rates.items()})
-        if kill and killed is not None:
-            _say(killed=f"it hangs (given up after {GIVE_UP:.0f} s)")
-            _killed(*killed)
-
-
-def _times(call: Callable[[], object]) -> list[float]:
-    """Durations of repeated calls [s], without the first."""
-    call()
-    taken: list[float] = []
-    while sum(taken) < SECONDS:
-        begun = time.perf_counter()
-        call()
-        taken.append(time.perf_counter() - begun)
-    return taken
-
-
-def _steps(pairs: int, *, mean: bool) -> int:
-    """Physics steps of a generation, including those that close the grip before each start."""
-    return (2 * pairs + mean) * configured().steps * SUBSTEPS + (pairs + mean) * CLOSING
-
-
-def configured() -> Any:  # noqa: ANN401  the finger gait
-    """The task."""
-    return evaluations.runner().task
-
-
-def _physics() -> float:
-    """Physics steps per second of MuJoCo alone, two threads, from the gait's start."""
-    sim, count, steps = evaluations.runner().sim, 64, 200
-    again(lambda: Batch(configured(), sim, [(row // 2,) for row in range(count)]))
-    bare = mujoco.batch.Batch(sim.model, count, 2)
-    for name in ("qpos", "qvel", "ctrl", "eq_active", "mocap_pos", "mocap_quat"):
-        bare.bind(name)[:] = getattr(sim, name)
-    return count * steps / statistics.mean(_times(lambda: bare.step(nstep=steps)))
-
-
-def _memory() -> float:
-    """Proportional set size of this process and all its descendants [MB]."""
-    parents = {}
+def _family() -> tuple[float, float]:
+    """Processor time [s] and proportional set size [MB] of this process and all its descendants."""
+    parents, spent = {}, {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
-            try:
-                parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            except OSError:
-                continue
+            with suppress(OSError):
+                words = (entry / "stat").read_text().rpartition(")")[2].split()
+                parents[int(entry.name)], spent[int(entry.name)] = int(words[1]), int(words[11]) + int(words[12])
     family, size = {os.getpid()}, 0
     while len(family) > size:
         size = len(family)
         family |= {child for child, parent in parents.items() if parent in family}
-    total = 0
+    memory = 0
     for each in family:
-        try:
+        with suppress(OSError):
             lines = Path(f"/proc/{each}/smaps_rollup").read_text().splitlines()
-        except OSError:
-            continue
-        total += sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-    return total / 1024
+            memory += sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    return sum(spent[each] for each in family) / os.sysconf("SC_CLK_TCK"), memory / 1024
 
 
-def _killed(evaluate: Callable[[], FloatArray], victim: Callable[[], int]) -> None:
-    """Kill a worker during an evaluation, and print what happens."""
+def _killed(kill: "Kill") -> None:
+    """Kill a worker during an evaluation, and say what happens."""
+    if kill is None:
+        _say()
+        return
+    work, victim = kill
     before = time.perf_counter()
-    alone = evaluate()
+    alone = work()
     undisturbed = time.perf_counter() - before
-    signal.signal(signal.SIGALRM, lambda *_: os.killpg(0, signal.SIGKILL))
+    signal.signal(signal.SIGALRM, _hangs)
     signal.setitimer(signal.ITIMER_REAL, GIVE_UP)
     killer = subprocess.Popen(["/bin/sh", "-c", f"sleep {0.4 * undisturbed}; kill -9 {victim()}"])
     before = time.perf_counter()
     try:
-        found = evaluate()
+        found = work()
     except Exception as error:
         _say(killed=type(error).__name__)
         return
@@ -216,48 +252,85 @@ def _killed(evaluate: Callable[[], FloatArray], victim: Callable[[], int]) -> No
     _say(killed=f"{same}, {seconds - undisturbed:+.1f} s")
 
 
+def _hangs(*_: object) -> None:
+    _say(killed=f"it hangs (given up after {GIVE_UP:.0f} s)")
+    os.killpg(0, signal.SIGKILL)
+
+
 # ---------------------------------------------------------------- backends
 
 Kill = tuple[Callable[[], FloatArray], Callable[[], int]] | None
-Opened = Iterator[tuple[Callable[[str, int], object], Kill]]
+Generation = Callable[[str, int], object]
+Opened = Iterator[tuple[Generation, Kill]]
+Evaluate = Callable[[str, FloatArray], FloatArray]
+"""Returns of all rows of a kind."""
 
 
-def _theta(rows: int) -> FloatArray:
-    return STILL + 0.02 * np.random.default_rng(0).standard_normal((rows, evaluations.runner().size))
+def _pooled(call: Evaluate, victim: Callable[[], int] | None) -> tuple[Generation, Kill]:
+    """The function that runs a generation of a kind and number of pairs, and how to kill a worker during one."""
+    kill = None if victim is None else ((lambda: call("gait", theta("gait", 600))), victim)
+    return (lambda kind, pairs: call(kind, theta(kind, 2 * pairs))), kill
 
 
-def _pooled(evaluate: Evaluate, victim: Callable[[], int] | None) -> tuple[Callable[[str, int], object], Kill]:
-    """Return the function that runs a generation of a kind and number of pairs, and how to kill a worker during one."""
-    what = {"gait": gait, "zero": nothing}
-    thetas = {pairs: _theta(2 * pairs) for pairs in (*PAIRS, 300)}
-    kill = None if victim is None else ((lambda: evaluate(gait, thetas[300])), victim)
-    return lambda kind, pairs: evaluate(what[kind], thetas[pairs]), kill
-
-
-def _halves(theta: FloatArray) -> list[FloatArray]:
+def _halves(rows: FloatArray) -> list[FloatArray]:
     """Split rows into one part per worker; pairs stay together."""
-    half = (len(theta) // 2 + 1) // 2 * 2
-    return [theta[:half], theta[half:]]
+    half = (len(rows) // 2 + 1) // 2 * 2
+    return [rows[:half], rows[half:]]
+
+
+@contextmanager
+def of_threads() -> Opened:
+    """Bare physics, two threads."""
+    yield lambda kind, pairs: evaluations.physics(kind, 2 * pairs, WORKERS), None
+
+
+@contextmanager
+def of_processes() -> Opened:
+    """Bare physics, two processes."""
+    with multiprocessing.get_context("spawn").Pool(WORKERS) as pool:
+        yield lambda kind, pairs: pool.starmap(evaluations.physics, [(kind, pairs, 1)] * WORKERS, 1), None
 
 
 @contextmanager
 def of_loop() -> Opened:
     """The closed loop in this process without a farm, on two threads."""
-    found = problem(configure())
-    own = Runner(found.task, found.policy, lambda model: BatchEngine(model, 200, 2))
+    runners: dict[str, Runner] = {}
 
-    def evaluate(what: Any, theta: FloatArray) -> FloatArray:  # noqa: ANN401
-        return own.rollouts(theta, [(row // 2,) for row in range(len(theta))]).returns if what is gait else what(theta)
+    def call(kind: str, rows: FloatArray) -> FloatArray:
+        if kind == "zero":
+            return evaluate(kind, rows)
+        if kind not in runners:
+            made = problem(evaluations.config(kind))
+            runners[kind] = Runner(made.task, made.policy, lambda model: BatchEngine(model, 200, WORKERS))
+        return runners[kind].rollouts(rows, [(row // 2,) for row in range(len(rows))]).returns
 
-    yield _pooled(evaluate, None)
+    yield _pooled(call, None)
 
 
 @contextmanager
 def of_multiprocessing() -> Opened:
     """The standard library's pool."""
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
+    with multiprocessing.get_context("spawn").Pool(WORKERS) as pool:
         victim = pool.map(pid, range(2), 1)[0]
-        yield _pooled(lambda what, theta: np.concatenate(pool.map(what, _halves(theta), 1)), lambda: victim)
+
+        def call(kind: str, rows: FloatArray) -> FloatArray:
+            return np.concatenate(pool.starmap(evaluate, [(kind, half) for half in _halves(rows)], 1))
+
+        yield _pooled(call, lambda: victim)
+
+
+@contextmanager
+def of_joblib() -> Opened:
+    """Joblib with its default, loky."""
+    from joblib import Parallel, delayed
+
+    with Parallel(n_jobs=WORKERS, max_nbytes=None) as pool:
+        victim = pool(delayed(pid)(number) for number in range(2))[0]
+
+        def call(kind: str, rows: FloatArray) -> FloatArray:
+            return np.concatenate(pool(delayed(evaluate)(kind, half) for half in _halves(rows)))
+
+        yield _pooled(call, lambda: victim)
 
 
 @contextmanager
@@ -266,21 +339,21 @@ def of_ray() -> Opened:
     import ray
 
     class Actor:
-        def evaluate(self, what: Any, theta: FloatArray) -> FloatArray:  # noqa: ANN401
-            return what(theta)
+        def evaluate(self, kind: str, rows: FloatArray) -> FloatArray:
+            return evaluate(kind, rows)
 
         def pid(self) -> int:
             return os.getpid()
 
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    actors = [ray.remote(Actor).remote() for _ in range(2)]
+    ray.init(num_cpus=WORKERS, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    actors = [ray.remote(Actor).remote() for _ in range(WORKERS)]
 
-    def evaluate(what: Any, theta: FloatArray) -> FloatArray:  # noqa: ANN401
-        halves = zip(actors, _halves(theta), strict=True)
-        return np.concatenate(ray.get([actor.evaluate.remote(what, half) for actor, half in halves]))
+    def call(kind: str, rows: FloatArray) -> FloatArray:
+        halves = zip(actors, _halves(rows), strict=True)
+        return np.concatenate(ray.get([actor.evaluate.remote(kind, half) for actor, half in halves]))
 
     try:
-        yield _pooled(evaluate, lambda: ray.get(actors[0].pid.remote()))
+        yield _pooled(call, lambda: ray.get(actors[0].pid.remote()))
     finally:
         ray.shutdown()
 
@@ -293,21 +366,25 @@ def of_evotorch() -> Opened:
     from evotorch import Problem
     from evotorch.algorithms import PGPE
 
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init(num_cpus=WORKERS, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
 
-    def search(what: Any, pairs: int) -> Any:  # noqa: ANN401
-        problem = Problem(
-            "max", lambda batch: torch.as_tensor(what(batch.numpy())), vectorized=True, num_actors=2,
-            solution_length=evaluations.runner().size, initial_bounds=(STILL, STILL), dtype=torch.float64,
+    def search(kind: str, pairs: int) -> Any:  # noqa: ANN401
+        middle = float(evaluations.STILL) if kind == "gait" else 0.0
+        learnt = Problem(
+            "max", lambda batch: torch.as_tensor(evaluate(kind, batch.numpy())), vectorized=True, num_actors=WORKERS,
+            solution_length=evaluations.runner(kind).size, initial_bounds=(middle, middle), dtype=torch.float64,
         )  # fmt: skip
         rates = {"center_learning_rate": 0.0, "stdev_learning_rate": 0.0, "stdev_init": 0.02}
-        return PGPE(problem, popsize=2 * pairs, optimizer="sgd", **rates)
+        return PGPE(learnt, popsize=2 * pairs, optimizer="sgd", **rates)
 
     searches: dict[tuple[str, int], Any] = {}
 
     def generation(kind: str, pairs: int) -> None:
         if (kind, pairs) not in searches:
-            searches[kind, pairs] = search({"gait": gait, "zero": nothing}[kind], pairs)
+            for other in searches.values():
+                other.problem.kill_actors()
+            searches.clear()
+            searches[kind, pairs] = search(kind, pairs)
         searches[kind, pairs].step()
 
     try:
@@ -321,33 +398,29 @@ def of_dask() -> Opened:
     """Dask's distributed scheduler on this machine."""
     from distributed import Client
 
-    with Client(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="ERROR") as client:
+    with Client(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None, silence_logs="ERROR") as client:
 
-        def evaluate(what: Any, theta: FloatArray) -> FloatArray:  # noqa: ANN401
-            return np.concatenate(client.gather(client.map(what, _halves(theta), pure=False)))
+        def call(kind: str, rows: FloatArray) -> FloatArray:
+            return np.concatenate(client.gather(client.map(partial(evaluate, kind), _halves(rows), pure=False)))
 
-        yield _pooled(evaluate, lambda: next(iter(client.run(os.getpid).values())))
+        yield _pooled(call, lambda: next(iter(client.run(os.getpid).values())))
 
 
 @contextmanager
 def of_pool() -> Opened:
     """`farm.Farm`."""
     with ExitStack() as stack:
-        pools: dict[Any, farm.Farm] = {}
+        pools: dict[str, farm.Farm] = {}
 
-        def evaluate(what: Any, theta: FloatArray) -> FloatArray:  # noqa: ANN401
-            if what not in pools:  # one pool at a time, so that there are only two workers
+        def call(kind: str, rows: FloatArray) -> FloatArray:
+            if kind not in pools:  # one pool at a time, so that there are only two workers
                 stack.close()
                 pools.clear()
-                own = ("finger-gait", {"preset": "default"}) if what is gait else (f"{ZERO}:ZeroCost", _LINEAR)
-                pools[what] = stack.enter_context(farm.Farm(own[0], workers=2, **own[1]))
-            pool = pools[what]
-            return pool.map(theta[:, : pool.size], [row // 2 for row in range(len(theta))] if what is gait else None)
+                task, settings = evaluations.TASKS[kind]
+                pools[kind] = stack.enter_context(farm.Farm(task, workers=WORKERS, **settings))
+            return pools[kind].map(rows, [row // 2 for row in range(len(rows))] if kind != "zero" else None)
 
-        yield _pooled(evaluate, lambda: pools[gait].worker_pids[0])
-
-
-_LINEAR: Any = {"policy": "linear"}
+        yield _pooled(call, lambda: pools["gait"].worker_pids[0])
 
 
 @contextmanager
@@ -357,8 +430,13 @@ def of_run(*, record: bool) -> Opened:
     with tempfile.TemporaryDirectory() as folder:
 
         def begun(kind: str, pairs: int) -> Any:  # noqa: ANN401
-            place = Placement(workers=2, listen=free_endpoint(), record=record)
-            with open_run(_config(kind, pairs), Path(folder) / secrets.token_hex(4), place) as run:
+            config = evaluations.config(kind, generations=100_000)
+            still = {"learning_rate_mu": 0.0, "learning_rate_sigma": 0.0, "initial_sigma": 0.02}
+            middle = {"initial_mu": evaluations.STILL} if kind == "gait" else {}
+            own = replace(config.algorithm_config, pairs=pairs, **still, **middle)
+            place = Placement(workers=WORKERS, listen=free_endpoint(), record=record)
+            path = Path(folder) / secrets.token_hex(4)
+            with open_run(replace(config, algorithm_config=own), path, place) as run:
                 yield from run.learn()
 
         def generation(kind: str, pairs: int) -> None:
@@ -376,24 +454,20 @@ def of_run(*, record: bool) -> Opened:
                 each.close()
 
 
-def _config(kind: str, pairs: int) -> RunConfig:
-    rates = {"learning_rate_mu": 0.0, "learning_rate_sigma": 0.0, "initial_sigma": 0.02}
-    if kind == "zero":
-        return configure(f"{ZERO}:ZeroCost", policy="linear", pairs=pairs, generations=100_000)
-    config = configure()
-    still = replace(config.algorithm_config, pairs=pairs, initial_mu=STILL, **rates)
-    return replace(config, algorithm_config=still, generations=100_000)
-
-
-BACKENDS = {
+PHYSICS: Final = ("threads", "processes")
+RUNS: Final = ("run", "recorded")
+BACKENDS: Final[dict[str, tuple[str, str, Callable[[], Any]]]] = {
+    "threads": ("physics alone, `mujoco.batch`, 2 threads", "mujoco", of_threads),
+    "processes": ("physics alone, `mujoco.batch`, 2 processes", "mujoco", of_processes),
     "loop": ("closed loop, one process, 2 threads", "farm", of_loop),
     "multiprocessing": ("multiprocessing.Pool(2)", "multiprocessing", of_multiprocessing),
+    "joblib": ("joblib with loky, 2 jobs", "joblib", of_joblib),
     "ray": ("Ray, 2 actors", "ray", of_ray),
     "evotorch": ("EvoTorch's PGPE on Ray, 2 actors", "evotorch", of_evotorch),
     "dask": ("Dask, 2 workers", "distributed", of_dask),
     "pool": ("`farm.Farm`, 2 workers", "farm", of_pool),
     "run": ("`farm run --no-record`, 2 workers, learning", "farm", partial(of_run, record=False)),
-    "recorded": ("`farm run`, 2 workers, learning and recording", "rerun", partial(of_run, record=True)),
+    "recorded": ("`farm run`, as typed: learning and recording", "rerun", partial(of_run, record=True)),
 }
 
 
