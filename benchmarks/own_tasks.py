@@ -79,10 +79,18 @@ class Rollouts:
         """Returns (B,) of candidates (B, P)."""
         starts = [streams.training(self.config.seed, self.rounds, row) for row in range(len(thetas))]
         jobs = Jobs.exploring(np.ascontiguousarray(thetas, dtype=np.float64), (1,), starts)
-        given = self.runner.run(np.zeros(self.size), jobs, normaliser=self._normaliser())
-        self.moments = merged(self.moments, given.moments)
+        returns, moments = self.simulated(jobs)
+        self.moments = merged(self.moments, moments)
         self.done, self.rounds = self.done + len(thetas), self.rounds + 1
-        return given.returns
+        return returns
+
+    def simulated(self, jobs: Jobs) -> tuple[FloatArray, FloatArray]:
+        """Returns (S,) and moments of the observations (S, 1 + 2 d) of jobs around 0."""
+        given = self.runner.run(np.zeros(self.size), jobs, normaliser=self._normaliser())
+        return given.returns, given.moments
+
+    def reached(self, mean: FloatArray) -> None:
+        """A search's mean (P,) before each of its generations."""
 
     def score(self, theta: FloatArray) -> float:
         """The mean return of a candidate (P,) from the starts of the score."""
@@ -105,13 +113,18 @@ def constant(task: str, seed: int, _: int, tries: int = 300, starts: int = 10) -
 
 
 def evotorch(task: str, seed: int, rollouts: int) -> float:
-    """PGPE with ClipUp; settings of the library's own linear policy for a walking robot, with a smaller population."""
+    """PGPE with ClipUp."""
+    trial = Rollouts(task, seed)
+    return trial.score(by_evotorch(trial, seed, rollouts))
+
+
+def by_evotorch(trial: Rollouts, seed: int, rollouts: int) -> FloatArray:
+    """The final mean; settings of the library's own linear policy for a walking robot, with a smaller population."""
     import torch
     from evotorch import Problem
     from evotorch.algorithms import PGPE
 
     torch.set_num_threads(1)
-    trial = Rollouts(task, seed)
     learnt = Problem(
         "max", lambda batch: torch.as_tensor(trial(batch.numpy())), vectorized=True, seed=seed,
         solution_length=trial.size, initial_bounds=(0.0, 0.0), dtype=torch.float64,
@@ -122,21 +135,28 @@ def evotorch(task: str, seed: int, rollouts: int) -> float:
     )  # fmt: skip
     while trial.done < rollouts:
         search.step()
-    return trial.score(search.status["center"].numpy().astype(np.float64))
+        trial.reached(search.status["center"].numpy().astype(np.float64))
+    return search.status["center"].numpy().astype(np.float64)
 
 
 def ars(task: str, seed: int, rollouts: int) -> float:
-    """Augmented random search as sb3-contrib implements it: its own update, with the rollouts made here."""
+    """Augmented random search."""
+    trial = Rollouts(task, seed, policy="linear", bias=False)
+    return trial.score(by_ars(trial, seed, rollouts))
+
+
+def by_ars(trial: Rollouts, seed: int, rollouts: int) -> FloatArray:
+    """The final mean as sb3-contrib learns it: its own update, with the rollouts made here."""
     import gymnasium
     import torch
     from sb3_contrib import ARS
 
     torch.set_num_threads(1)
-    trial = Rollouts(task, seed, policy="linear", bias=False)
     shape = trial.problem.spec.observation, trial.problem.spec.action
 
     class Made(ARS):
         def evaluate_candidates(self, candidate_weights: Any, *_: object) -> Any:  # noqa: ANN401
+            trial.reached(self.weights.numpy().astype(np.float64))
             returned = torch.as_tensor(trial(candidate_weights.numpy().astype(np.float64)), dtype=torch.float32)
             self.num_timesteps += len(candidate_weights)
             return returned
@@ -150,7 +170,7 @@ def ars(task: str, seed: int, rollouts: int) -> float:
 
     found = Made("LinearPolicy", Spaces(), seed=seed, device="cpu")
     found.learn(rollouts)
-    return trial.score(found.weights.numpy().astype(np.float64))
+    return found.weights.numpy().astype(np.float64)
 
 
 def pycma(task: str, seed: int, rollouts: int) -> float:
