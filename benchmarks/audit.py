@@ -8,7 +8,6 @@ rate is that of the generations until both hosts have passed 240 checks, and of 
 
 import argparse
 import math
-import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -63,8 +62,8 @@ def _learnt(config: RunConfig, audit: float, most: float) -> tuple[list[float], 
     times, checks, known = list[float](), list[int](), 0
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder) / "run", place) as run:
         with (
-            LocalWorkers(1, [*flags, "--name", "a"], dict(os.environ)),
-            LocalWorkers(1, [*flags, "--name", "b"], dict(os.environ)),
+            LocalWorkers(1, [*flags, "--name", "a"]),
+            LocalWorkers(1, [*flags, "--name", "b"]),
         ):
             for _ in run.learn():
                 times.append(time.perf_counter())

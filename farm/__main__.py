@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from farm import __version__
 from farm.errors import ConfigError, FarmError, Interrupted, RunError, printable
+from farm.processes import ONE_THREAD
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -43,6 +44,8 @@ def _run(words: Sequence[str], *, own: bool) -> int:
     if name == "--version":
         sys.stdout.write(f"rolloutfarm {__version__}\n")
         return 0
+    if name == "worker":
+        os.environ.update(ONE_THREAD)  # before numpy is imported: its processes may be forks of this one
     from farm import plugins
 
     command = plugins.find("commands", name).target

@@ -1,20 +1,97 @@
-"""Worker processes on this machine: started as subprocesses, never forked, stopped by pid."""
+"""Worker processes on this machine: subprocesses, or forks of a process that has no threads yet; stopped by pid."""
 
+import gc
 import logging
+import os
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
-from typing import Any, Final
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NoReturn
 
 log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.5  # [s] for a worker to leave before it is killed
 _RESTARTS: Final = 20  # a worker that keeps dying is not restarted forever
-_ENVIRONMENT: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+"""Environment of a worker: the cores are divided among processes."""
+
+Main = Callable[[Sequence[str]], int]
+"""A program, from its arguments to its exit status."""
 
 
-def end(processes: "Sequence[subprocess.Popen[Any]]", grace: float) -> None:
+class Forked:
+    """A process forked from this one that runs a program; the part of `subprocess.Popen` that its owner needs.
+
+    It shares the memory of what this process has imported. A process with threads (Zenoh's, Rerun's, CUDA's) must not
+    fork: they would be gone, and what they have locked would stay locked.
+    """
+
+    def __init__(self, main: Main, arguments: Sequence[str]) -> None:
+        """Start it, in a session of its own; its standard input closes when this process ends."""
+        read, write = os.pipe()
+        both = (signal.SIGINT, signal.SIGTERM)  # the child must not handle them as this process does
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, both)
+        self.pid = os.fork()
+        if not self.pid:
+            os.dup2(read, 0)
+            for number in both:
+                signal.signal(number, signal.SIG_DFL)
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            _become(main, arguments)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        os.close(read)
+        self.stdin = os.fdopen(write, "wb", 0)
+        self._status: int | None = None
+
+    def poll(self) -> int | None:
+        """Its exit status, negative if a signal ended it; None while it runs."""
+        if self._status is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._status = os.waitstatus_to_exitcode(status) if pid else None
+        return self._status
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait until it ends; a TimeoutExpired if it does not within some seconds."""
+        until = None if timeout is None else time.monotonic() + timeout
+        while (status := self.poll()) is None:
+            if until is not None and time.monotonic() >= until:
+                raise subprocess.TimeoutExpired(str(self.pid), timeout or 0.0)
+            time.sleep(0.01)  # as subprocess does
+        return status
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self._send(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it."""
+        self._send(signal.SIGKILL)
+
+    def _send(self, number: signal.Signals) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+
+def _become(main: Main, arguments: Sequence[str]) -> NoReturn:
+    """Be another program, in a forked process."""
+    try:
+        os.setsid()  # Ctrl-C on the terminal does not reach it
+        os.closerange(3, os.sysconf("SC_OPEN_MAX"))  # its siblings' inputs: they would stay open with it
+        logging.getLogger().handlers.clear()
+        status = main(arguments)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def end(processes: "Sequence[subprocess.Popen[Any] | Forked]", grace: float) -> None:
     """Ask processes to leave; those still running after this number of seconds are killed."""
     for process in processes:
         process.terminate()
@@ -28,21 +105,32 @@ def end(processes: "Sequence[subprocess.Popen[Any]]", grace: float) -> None:
 
 
 class LocalWorkers:
-    """K processes `python -m workers`; one that dies is replaced."""
+    """K worker processes; one that dies is replaced."""
 
-    def __init__(self, processes: int, arguments: Sequence[str], environment: dict[str, str]) -> None:
-        """Start them with these arguments; they end when this process does, however it ends."""
-        self._command = [sys.executable, "-P", "-m", "workers", *arguments, "--exit-with-parent"]
-        # One thread per process: the cores are divided among processes.
-        self._environment = {**environment, **dict.fromkeys(_ENVIRONMENT, "1")}
+    def __init__(self, processes: int, arguments: Sequence[str], main: Main | None = None) -> None:
+        """Start them with these arguments; they end when this process does, however it ends.
+
+        Args:
+          processes: how many.
+          arguments: of `python -m workers`.
+          main: what that runs, if this process may fork; None: the processes are new ones.
+        """
+        self._arguments, self._main = [*arguments, "--exit-with-parent"], main
         self._restarts = 0
         self._missed: set[int] = set()
+        if main:
+            gc.freeze()  # a collection in a fork would otherwise copy what it shares
         self._processes = [self._start() for _ in range(processes)]
 
-    def _start(self) -> "subprocess.Popen[bytes]":
+    def _start(self) -> "subprocess.Popen[bytes] | Forked":
+        if self._main and threading.active_count() == 1:
+            return Forked(self._main, self._arguments)
         # Its standard input is a pipe that is never written to: it closes when this process ends.
         # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its workers.
-        return subprocess.Popen(self._command, stdin=subprocess.PIPE, env=self._environment, start_new_session=True)
+        command = [sys.executable, "-P", "-m", "workers", *self._arguments]
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, env={**os.environ, **ONE_THREAD}, start_new_session=True
+        )
 
     @property
     def pids(self) -> list[int]:

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from farm import settings as arguments
@@ -29,13 +30,13 @@ class Process(Settings):
     """DEBUG, INFO, WARNING or ERROR."""
 
 
-def main() -> int:
+def main(words: Sequence[str]) -> int:
     """Serve until SIGTERM, Ctrl-C, or the end of the parent; exit status."""
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     try:
-        process = arguments.parse(Process, sys.argv[1:], "python -m workers")
+        process = arguments.parse(Process, words, "python -m workers")
         handler = logging.StreamHandler()
         handler.setFormatter(Formatter("%(levelname).1s worker %(process)d: %(message)s"))
         logging.basicConfig(level=process.log_level, handlers=[handler])
@@ -62,4 +63,4 @@ def _watch_parent(stop: threading.Event) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

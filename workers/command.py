@@ -1,6 +1,7 @@
 """`farm worker`: worker processes on this machine."""
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,6 +11,7 @@ from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError
 from farm.processes import LocalWorkers
 from farm.settings import Settings, setting
+from workers import __main__ as worker_process
 from workers.config import WorkerConfig
 
 
@@ -30,7 +32,12 @@ def main(words: Sequence[str]) -> int:
     command = arguments.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
     processes = command.processes or _cores()
-    with stop_flag("leaving") as stop, LocalWorkers(processes, _flags(command), dict(os.environ)) as pool:
+    # This process has no threads; what it has imported all of them share. Devices want processes of their own.
+    shared = sys.platform == "linux" and command.worker.backend == "cpu"
+    with (
+        stop_flag("leaving") as stop,
+        LocalWorkers(processes, _flags(command), worker_process.main if shared else None) as pool,
+    ):
         while not stop.wait(0.2):
             ended = pool.tend()
             if ended and not pool.pids:

@@ -8,7 +8,6 @@ for report in farm.learn(farm.RunConfig(seed=3), "runs/first", workers=2):
 
 import importlib.util
 import logging
-import os
 import secrets
 import socket
 import time
@@ -286,7 +285,7 @@ def dispatch(
     if place.workers:
         flags = [*_worker_flags(place, problem), "--backend", place.backend]
         flags += ["--log-level", "WARNING"]  # the learner reports their state
-        tend.pool = stack.enter_context(LocalWorkers(place.workers, flags, dict(os.environ)))
+        tend.pool = stack.enter_context(LocalWorkers(place.workers, flags))
     return dispatcher, tend.pool
 
 

@@ -191,7 +191,7 @@ def _workers(
     files = sorted({str(file) for kind, name in chosen if (file := plugins.find(kind, name).file)})
     own = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
     own += [word for file in files for word in ("--allow-file", file)]
-    return stack.enter_context(LocalWorkers(sharing.processes, own, dict(os.environ)))
+    return stack.enter_context(LocalWorkers(sharing.processes, own))
 
 
 def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], shown: Shown) -> _Learner:
