@@ -44,8 +44,8 @@ def _run(words: Sequence[str], *, own: bool) -> int:
     if name == "--version":
         sys.stdout.write(f"rolloutfarm {__version__}\n")
         return 0
-    if name == "worker":
-        os.environ.update(ONE_THREAD)  # before numpy is imported: its processes may be forks of this one
+    if name in ("run", "worker"):
+        os.environ.update(ONE_THREAD)  # before numpy is imported: workers may be forks of this process
     from farm import plugins
 
     command = plugins.find("commands", name).target

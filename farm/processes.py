@@ -1,15 +1,18 @@
 """Worker processes on this machine: subprocesses, or forks of a process that has no threads yet; stopped by pid."""
 
+import ctypes
 import gc
+import importlib
+import json
 import logging
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, Final, NoReturn
 
 log = logging.getLogger(__name__)
@@ -19,18 +22,35 @@ _RESTARTS: Final = 20  # a worker that keeps dying is not restarted forever
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """Environment of a worker: the cores are divided among processes."""
 
-Main = Callable[[Sequence[str]], int]
-"""A program, from its arguments to its exit status."""
+
+@contextmanager
+def forks(count: int) -> "Iterator[list[Forked]]":
+    """Processes that wait to become workers; none if this process must not fork: call it before there are threads.
+
+    What this process has imported they share. But threads (Zenoh's, Rerun's, CUDA's, those of linear algebra) would be
+    gone in a fork, and what they have locked would stay locked.
+    """
+    made = _forks(count)
+    try:
+        yield made
+    finally:
+        end(made, _GRACE)
+
+
+def _forks(count: int) -> "list[Forked]":
+    if not count or sys.platform != "linux" or len(os.listdir("/proc/self/task")) > 1:  # noqa: PTH208
+        return []
+    gc.collect()
+    with suppress(AttributeError):  # of the GNU C library: what is free now would be copied when forks use it
+        ctypes.CDLL(None).malloc_trim(0)
+    gc.freeze()  # a collection in a fork would copy what it shares
+    return [Forked() for _ in range(count)]
 
 
 class Forked:
-    """A process forked from this one that runs a program; the part of `subprocess.Popen` that its owner needs.
+    """A process forked from this one; the part of `subprocess.Popen` that its owner needs."""
 
-    It shares the memory of what this process has imported. A process with threads (Zenoh's, Rerun's, CUDA's) must not
-    fork: they would be gone, and what they have locked would stay locked.
-    """
-
-    def __init__(self, main: Main, arguments: Sequence[str]) -> None:
+    def __init__(self) -> None:
         """Start it, in a session of its own; its standard input closes when this process ends."""
         read, write = os.pipe()
         both = (signal.SIGINT, signal.SIGTERM)  # the child must not handle them as this process does
@@ -41,11 +61,16 @@ class Forked:
             for number in both:
                 signal.signal(number, signal.SIG_DFL)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            _become(main, arguments)
+            _become_worker()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         os.close(read)
         self.stdin = os.fdopen(write, "wb", 0)
         self._status: int | None = None
+
+    def begin(self, arguments: Sequence[str]) -> None:
+        """Let it be `python -m workers` with these arguments."""
+        with suppress(BrokenPipeError):  # it was killed
+            self.stdin.write(json.dumps(arguments).encode() + b"\n")
 
     def poll(self) -> int | None:
         """Its exit status, negative if a signal ended it; None while it runs."""
@@ -76,13 +101,18 @@ class Forked:
             os.kill(self.pid, number)
 
 
-def _become(main: Main, arguments: Sequence[str]) -> NoReturn:
-    """Be another program, in a forked process."""
+def _become_worker() -> NoReturn:
+    """Wait for arguments, and be a worker, in a forked process; it ends if there are none."""
+    status = 0
     try:
         os.setsid()  # Ctrl-C on the terminal does not reach it
         os.closerange(3, os.sysconf("SC_OPEN_MAX"))  # its siblings' inputs: they would stay open with it
         logging.getLogger().handlers.clear()
-        status = main(arguments)
+        line = b""
+        while not line.endswith(b"\n") and (byte := os.read(0, 1)):
+            line += byte
+        if line:
+            status = importlib.import_module("workers.__main__").main(json.loads(line))
     except BaseException:
         traceback.print_exc()
         status = 1
@@ -107,24 +137,26 @@ def end(processes: "Sequence[subprocess.Popen[Any] | Forked]", grace: float) -> 
 class LocalWorkers:
     """K worker processes; one that dies is replaced."""
 
-    def __init__(self, processes: int, arguments: Sequence[str], main: Main | None = None) -> None:
+    def __init__(self, processes: int, arguments: Sequence[str], forked: Sequence[Forked] = ()) -> None:
         """Start them with these arguments; they end when this process does, however it ends.
 
         Args:
           processes: how many.
           arguments: of `python -m workers`.
-          main: what that runs, if this process may fork; None: the processes are new ones.
+          forked: processes that wait; without any, all are new ones.
         """
-        self._arguments, self._main = [*arguments, "--exit-with-parent"], main
+        self._arguments, self._forks = [*arguments, "--exit-with-parent"], bool(forked)
         self._restarts = 0
         self._missed: set[int] = set()
-        if main:
-            gc.freeze()  # a collection in a fork would otherwise copy what it shares
-        self._processes = [self._start() for _ in range(processes)]
+        waiting = [each for each in forked if each.poll() is None][:processes]
+        for each in waiting:
+            each.begin(self._arguments)
+        self._processes = [*waiting, *(self._start() for _ in range(processes - len(waiting)))]
 
     def _start(self) -> "subprocess.Popen[bytes] | Forked":
-        if self._main and threading.active_count() == 1:
-            return Forked(self._main, self._arguments)
+        for each in _forks(1) if self._forks else ():
+            each.begin(self._arguments)
+            return each
         # Its standard input is a pipe that is never written to: it closes when this process ends.
         # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its workers.
         command = [sys.executable, "-P", "-m", "workers", *self._arguments]

@@ -1,7 +1,6 @@
 """`farm worker`: worker processes on this machine."""
 
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -9,9 +8,8 @@ from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError
-from farm.processes import LocalWorkers
+from farm.processes import LocalWorkers, forks
 from farm.settings import Settings, setting
-from workers import __main__ as worker_process
 from workers.config import WorkerConfig
 
 
@@ -32,11 +30,11 @@ def main(words: Sequence[str]) -> int:
     command = arguments.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
     processes = command.processes or _cores()
-    # This process has no threads; what it has imported all of them share. Devices want processes of their own.
-    shared = sys.platform == "linux" and command.worker.backend == "cpu"
+    may_fork = command.worker.backend == "cpu"  # devices want processes of their own
     with (
+        forks(processes if may_fork else 0) as forked,
         stop_flag("leaving") as stop,
-        LocalWorkers(processes, _flags(command), worker_process.main if shared else None) as pool,
+        LocalWorkers(processes, _flags(command), forked) as pool,
     ):
         while not stop.wait(0.2):
             ended = pool.tend()

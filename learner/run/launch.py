@@ -25,7 +25,7 @@ from farm.net.session import Session, free_endpoint
 from farm.net.telemetry import Report, RunEnd
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LISTEN
-from farm.processes import LocalWorkers
+from farm.processes import Forked, LocalWorkers, forks
 from farm.sim.model_files import by_digest
 from farm.sim.trajectory import Trajectory
 from learner.algorithms import Diverged
@@ -224,6 +224,8 @@ def open_run(
             problem, at = start(config, folder.name, numbers=place.numbers)
         if place.workers:
             problem.runner().close()  # reports early what no worker could simulate
+        # Devices want processes of their own.
+        forked = stack.enter_context(forks(place.workers if place.backend == "cpu" else 0))
         link = stack.enter_context(connected(place, problem, stopped))
         _check_alone(link, place, folder.name, stopped)
         if not resume:
@@ -245,7 +247,9 @@ def open_run(
                 raise RunError(f"cannot write to {folder.path}: {error.strerror}") from None
             raise
         admission = Admission(learner.canary, at.expelled, mixed=place.mixed)
-        dispatcher, pool = dispatch(stack, link, place, problem, folder.name, admission, config.generations, stopped)
+        dispatcher, pool = dispatch(
+            stack, link, place, problem, folder.name, admission, config.generations, stopped, forked
+        )
         publisher = stack.enter_context(closing(Publisher(link, place.farm, dispatcher.incarnation, learner)))
         yield Run(learner, dispatcher, publisher, recording, pool, loggers)
 
@@ -266,11 +270,11 @@ def dispatch(
     name: str,
     admission: Admission,
     generations: int,
-    stopped: Callable[[], bool], *, steps: bool = False,
+    stopped: Callable[[], bool], forked: Sequence[Forked] = (), *, steps: bool = False,
 ) -> tuple[Dispatcher, LocalWorkers | None]:  # fmt: skip
     """Publish a problem on the network under a name, and start its local workers; the stack closes all.
 
-    With `steps` the traces of all rounds are of that kind.
+    Workers are `forked` processes or new ones. With `steps` the traces of all rounds are of that kind.
     """
     tend = _Tending(stopped)
     for digest, source in problem.sources.items() if place.tls else ():
@@ -283,9 +287,8 @@ def dispatch(
         link, place.farm, spec, generations, join, tend, admission, problem.shapes(steps=steps), place.scheduler, judge
     )
     if place.workers:
-        flags = [*_worker_flags(place, problem), "--backend", place.backend]
-        flags += ["--log-level", "WARNING"]  # the learner reports their state
-        tend.pool = stack.enter_context(LocalWorkers(place.workers, flags))
+        flags = [*_worker_flags(place, problem), "--backend", place.backend, "--log-level", "WARNING"]
+        tend.pool = stack.enter_context(LocalWorkers(place.workers, flags, forked))  # the learner reports their state
     return dispatcher, tend.pool
 
 
@@ -333,10 +336,9 @@ def connected(place: Placement, problem: Problem, stopped: Callable[[], bool]) -
 
 
 def _worker_flags(place: Placement, problem: Problem) -> list[str]:
-    endpoints = place.connect or (place.listen,)
     farm = ["--farm", place.farm] if place.farm != "farm" else []
     files = [word for path in problem.files for word in ("--allow-file", str(path))]
-    return [*(word for endpoint in endpoints for word in ("--connect", endpoint)), *farm, *files]
+    return [*(word for each in place.connect or (place.listen,) for word in ("--connect", each)), *farm, *files]
 
 
 def how_to_join(place: Placement, problem: Problem) -> str:
@@ -377,9 +379,8 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     from learner.recording.run import open_recording
 
     path, recorded = learner.folder.recording if place.record else None, 0
-    if path is not None:
-        with suppress(ConfigError):  # it cannot be read: it stays as it is, and what follows is recorded beside it
-            recorded = last_generation(path)
+    with suppress(ConfigError):  # it cannot be read: it stays as it is, and what follows is recorded beside it
+        recorded = 0 if path is None else last_generation(path)
     opened = stack.enter_context(open_recording(
         path, run=learner.run, config=learner.config, serve=place.serve, drawing=Drawing.of(learner.problem),
         done=learner.state.generation if recorded else 0, folder=learner.folder.path,
