@@ -3,6 +3,7 @@
 import functools
 import os
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ HERE = Path(__file__).parent
 STILL = 50.0
 """Value of every parameter of the gait's policy: so far from every joint position that no rollout ends early."""
 
+STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "eq_active", "mocap_pos", "mocap_quat")
 
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "gait": ("finger-gait", {}),
@@ -54,6 +56,16 @@ def evaluate(kind: str, parameters: FloatArray) -> FloatArray:
     return runner(kind).rollouts(parameters, [(row // 2,) for row in range(len(parameters))]).returns
 
 
+def serve(end: Connection) -> None:
+    """Evaluate what comes through a pipe, until it closes."""
+    while True:
+        try:
+            kind, parameters = end.recv()
+        except EOFError:
+            return
+        end.send(evaluate(kind, parameters))
+
+
 def steps(kind: str) -> float:
     """Physics steps of a rollout; the gait's include its half of those that close the grip of a pair."""
     task = runner(kind).task
@@ -61,19 +73,21 @@ def steps(kind: str) -> float:
 
 
 @functools.cache
-def _bare(kind: str, count: int, threads: int) -> mujoco.batch.Batch:
+def _bare(kind: str, count: int, threads: int) -> tuple[mujoco.batch.Batch, list[tuple[FloatArray, FloatArray]]]:
+    """A batch of simulations, and its states, each with the values that it has when a rollout begins."""
     sim, task = runner(kind).sim, runner(kind).task
     rows = np.arange(count) % 64
     again(lambda: Batch(task, sim, [(int(row) // 2,) for row in range(64)]))
     bare = mujoco.batch.Batch(sim.model, count, threads)
-    for name in ("qpos", "qvel", "ctrl", "eq_active", "mocap_pos", "mocap_quat"):
-        bare.bind(name)[:] = getattr(sim, name)[rows]
-    return bare
+    return bare, [(bare.bind(name), np.array(getattr(sim, name)[rows])) for name in STATE]
 
 
 def physics(kind: str, count: int, threads: int) -> None:
-    """The physics steps of so many rollouts, and nothing else."""
-    _bare(kind, count, threads).step(nstep=int(steps(kind)))
+    """The physics steps of so many rollouts, and nothing else; each begins as a rollout does."""
+    bare, states = _bare(kind, count, threads)
+    for state, begun in states:
+        state[:] = begun
+    bare.step(nstep=int(steps(kind)))
 
 
 def pid(_: int = 0) -> int:

@@ -11,10 +11,12 @@ a farm whose learner has a core of its own. Zenoh's threads are missing; `scalin
 import argparse
 import heapq
 import itertools
+import operator
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -47,12 +49,14 @@ class Network:
 
     dropped = 0
 
-    def __init__(self, config: RunConfig, workers: int, pair: float, latency: float) -> None:
-        """Let all workers ask for work."""
+    def __init__(
+        self, config: RunConfig, workers: int, latency: float, duration: Callable[[int], float], *, one_host: bool
+    ) -> None:
+        """Let all workers ask for work; `duration` is that of a chunk with a number of rollouts [s]."""
         problem = setup.problem(config)
         self._work = scaling.MadeUp(problem.task, problem.policy)
         self._mu, self._traces = np.zeros(problem.policy.size), config.traces
-        self._pair, self._latency = pair, latency
+        self._duration, self._latency = duration, latency
         self.events, self.rates = self, Rates()
         self._begun = time.thread_time()
         self._waited = 0.0
@@ -61,7 +65,8 @@ class Network:
         self._number = itertools.count()  # orders messages with the same time
         self._free = {f"host-{i}/1": 0.0 for i in range(workers)}  # the time at which each has done its chunks
         for name in self._free:
-            want = WorkRequest(worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=name, cores=1)
+            host = "host" if one_host else name
+            want = WorkRequest(worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=host, cores=1)
             self._send(0.0, Event("worker", keys.worker_token(FARM, name), b""))
             self._send(0.0, Event("want", keys.want(FARM, name), codec.encode(want)))
 
@@ -100,7 +105,7 @@ class Network:
             if name not in self._free:
                 return
             chunk = codec.decode(payload, Chunk)
-            done = max(self._free[name], now + self._latency) + self._pair * chunk.rollouts.sum() / 2
+            done = max(self._free[name], now + self._latency) + self._duration(int(chunk.rollouts.sum()))
             self._free[name] = done
             head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": name}
             jobs = chunk.take(np.argsort(chunk.indices).tolist())
@@ -121,11 +126,27 @@ class Network:
         return []
 
 
-def measure(workers: int, pair: float, latency: float, seconds: float) -> tuple[int, float, float]:
-    """Pairs of a generation, efficiency of the workers, and the learner's processor time per pair [s]."""
-    pairs = max(scaling.PAIRS, scaling.PAIRS * workers // 64)
+def measure(
+    workers: int,
+    pairs: int,
+    latency: float,
+    seconds: float,
+    duration: Callable[[int], float],
+    *,
+    one_host: bool = False,
+) -> tuple[float, float]:
+    """Duration of a generation, and the learner's processor time in it [s].
+
+    Args:
+      workers: how many.
+      pairs: of a generation.
+      latency: of a message [s].
+      seconds: virtual time in which it is measured.
+      duration: of a chunk with a number of rollouts [s].
+      one_host: all workers are on one host, so that no job is repeated by another host.
+    """
     config = configure("finger-gait", pairs=pairs, generations=10**6)
-    network = Network(config, workers, pair, latency)
+    network = Network(config, workers, latency, duration, one_host=one_host)
 
     @contextmanager
     def listen(*_: object, **__: object) -> Iterator[Network]:
@@ -143,9 +164,8 @@ def measure(workers: int, pair: float, latency: float, seconds: float) -> tuple[
             marks.append((network.now(), network.busy))
             if len(marks) > FIRST and marks[-1][0] - marks[FIRST - 1][0] > seconds:
                 break
-    (begun, before), (end, after) = marks[FIRST - 1], marks[-1]
-    done = (len(marks) - FIRST) * pairs
-    return pairs, done * pair / workers / (end - begun), (after - before) / done
+    count = len(marks) - FIRST
+    return (marks[-1][0] - marks[FIRST - 1][0]) / count, (marks[-1][1] - marks[FIRST - 1][1]) / count
 
 
 def main() -> None:
@@ -159,8 +179,11 @@ def main() -> None:
     print("| workers | ms per pair | N | efficiency | learner: us per pair |\n|---|---|---|---|---|")
     for workers in map(int, arguments.workers.split(",")):
         pair = max(arguments.pair, workers / scaling.MOST)
-        pairs, efficiency, cpu = measure(workers, pair, arguments.latency, arguments.seconds)
-        print(f"| {workers} | {pair * 1000:g} | {pairs} | {efficiency:.2f} | {cpu * 1e6:.0f} |", flush=True)
+        pairs = max(scaling.PAIRS, scaling.PAIRS * workers // 64)
+        halves = partial(operator.mul, pair / 2)
+        wall, cpu = measure(workers, pairs, arguments.latency, arguments.seconds, halves)
+        efficiency = pairs * pair / workers / wall
+        print(f"| {workers} | {pair * 1000:g} | {pairs} | {efficiency:.2f} | {cpu / pairs * 1e6:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

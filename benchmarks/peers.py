@@ -1,4 +1,4 @@
-"""Compares the farm with a process pool, joblib, Ray, EvoTorch on Ray, and Dask; one table, and a file of its numbers.
+"""Compares the farm with a process pool, joblib, Ray, EvoTorch on Ray, and Dask: two tables, and their numbers.
 
     python benchmarks/peers.py [--turns 10] [--names pool,run] [--out docs/results/tables/peers.json] [--table]
 
@@ -6,10 +6,10 @@ Each backend is a process that stays; they work in turns of about a second, one 
 shared machine changes within seconds. All evaluate the same: generations of 15 and of 100 mirrored pairs of the finger
 gait, held still so that no rollout ends early, and of the arm of examples/; and generations of empty evaluations. The
 speed of a turn is that relative to the same physics steps by `mujoco.batch` with two threads in the same round of
-turns; processor time is that of a backend's processes together. The other tools get each worker's half of a generation
-in one call, which is fastest for them, and do not update or save anything. `farm run` updates, saves and, as users type
-it, records; it also simulates its mean policy, which counts as a rollout. Tools that are not installed are left out:
-`pip install ray distributed evotorch joblib` installs all.
+turns; processor time is that of a backend's processes together, of which one is no worker. The other tools get each
+worker's half of a generation in one call, which is fastest for them, and do not update or save anything. `farm run`
+updates, saves and, as users type it, records; it also simulates its mean policy, which counts as a rollout. Tools that
+are not installed are left out: `pip install ray distributed evotorch joblib` installs all.
 """
 
 import argparse
@@ -54,12 +54,12 @@ WORKERS: Final = 2
 
 
 def main() -> None:
-    """Measure what is asked for, and print the table of the file."""
+    """Measure what is asked for, and print the tables of the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--turns", type=int, default=10)
     parser.add_argument("--names", type=lambda text: text.split(","), default=list(BACKENDS))
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--table", type=Path, help="print the table of such a file, and measure nothing")
+    parser.add_argument("--table", type=Path, help="print the tables of such a file, and measure nothing")
     parser.add_argument("--only", choices=BACKENDS, help=argparse.SUPPRESS)
     parser.add_argument("--begun", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -76,28 +76,58 @@ def main() -> None:
 
 
 def table(found: dict[str, Any]) -> Iterator[str]:
-    """The lines of the table: medians of the turns, lowest to highest in parentheses."""
+    """The lines of both tables: medians of the turns, lowest to highest in parentheses."""
+    backends = found["backends"]
+    kinds = [(f"{kind}{pairs}", f"{kind}, {2 * pairs}") for kind, pairs in ROUNDS if kind != "zero"]
+    heads = [*(head for _, head in kinds), "core-ms at 30", "not its workers'", "30 empty [ms]", "200 [ms]",
+             "first [s]", "MB", "a killed worker"]  # fmt: skip
     yield f"{found['machine']}; {found['turns']} turns"
     yield ""
-    heads = [f"{kind}, {2 * pairs}" for kind, pairs in ROUNDS if kind != "zero"]
-    yield f"| | {' | '.join(heads)} | core-ms at 30 | 30 empty [ms] | 200 [ms] | first [s] | MB | a killed worker |"
-    yield f"|---|{'---|' * (len(heads) + 6)}"
-    for name, own in found["backends"].items():
-        speeds, rounds = [], own["rounds"]
-        for kind, pairs in ROUNDS:
-            key = f"{kind}{pairs}"
-            if kind != "zero":
-                pairs_of_turns = zip(found["backends"]["threads"]["rounds"][key], rounds[key], strict=True)
-                turns = [bare["wall"] / turn["wall"] for bare, turn in pairs_of_turns]
-                speeds.append(f"{statistics.median(turns):.2f} ({min(turns):.2f} to {max(turns):.2f})")
-        empty = (
-            [f"{1e3 * statistics.median(turn['wall'] for turn in rounds[f'zero{pairs}']):.2f}" for pairs in (15, 100)]
-            if "zero15" in rounds
-            else ["-", "-"]
-        )
-        cores = f"{1e3 * statistics.median(turn['cores'] for turn in rounds['gait15']):.0f}"
-        cells = [*speeds, cores, *empty, f"{own['first']:.1f}", f"{own['memory']:.0f}", own.get("killed", "-")]
+    yield f"| | {' | '.join(heads)} |"
+    yield "|---" * (len(heads) + 1) + "|"
+    for name, own in backends.items():
+        cells = [_spread(backends["threads"], own, key, _faster) for key, _ in kinds]
+        cells += [f"{_median(own, 'gait15', part):.1f}" for part in ("cores", "own")]
+        cells += [f"{_median(own, key, 'wall'):.2f}" if key in own["rounds"] else "-" for key in ("zero15", "zero100")]
+        cells += [f"{own['first']:.1f}", f"{own['memory']:.0f}", own.get("killed", "-")]
         yield f"| {BACKENDS[name][0]} | {' | '.join(cells)} |"
+    yield ""
+    yield f"| ratio, turn by turn | {' | '.join(head for _, head in kinds)} |"
+    yield "|---" * (len(kinds) + 1) + "|"
+    for words, first, second, ratio in RATIOS:
+        if first in backends and second in backends:
+            cells = [_spread(backends[first], backends[second], key, ratio, 3) for key, _ in kinds]
+            yield f"| {words} | {' | '.join(cells)} |"
+
+
+def _median(backend: dict[str, Any], key: str, part: str) -> float:
+    return 1e3 * statistics.median(turn[part] for turn in backend["rounds"][key])
+
+
+def _spread(first: dict[str, Any], second: dict[str, Any], key: str, ratio: "Ratio", digits: int = 2) -> str:
+    turns = [ratio(*both) for both in zip(first["rounds"][key], second["rounds"][key], strict=True)]
+    return f"{statistics.median(turns):.{digits}f} ({min(turns):.{digits}f} to {max(turns):.{digits}f})"
+
+
+Ratio = Callable[[dict[str, float], dict[str, float]], float]
+"""Of a turn of one backend and the turn of another in the same round."""
+
+
+def _faster(first: dict[str, float], second: dict[str, float]) -> float:
+    return first["wall"] / second["wall"]
+
+
+def _workers(turn: dict[str, float]) -> float:
+    return turn["cores"] - turn["own"]
+
+
+RATIOS: Final[tuple[tuple[str, str, str, Ratio], ...]] = (
+    ("speed of `farm.Farm` to bare pipes", "pipes", "pool", _faster),
+    ("speed of `farm run`, as typed, to Pool(2)", "multiprocessing", "recorded", _faster),
+    ("learner's processor time to its workers', not recording", "run", "run", lambda _, b: b["own"] / _workers(b)),
+    ("the same, recording", "recorded", "recorded", lambda _, b: b["own"] / _workers(b)),
+    ("workers' processor time, recording to not", "run", "recorded", lambda a, b: _workers(b) / _workers(a)),
+)
 
 
 def _measured(turns: int, names: list[str]) -> dict[str, Any]:
@@ -180,7 +210,7 @@ def _serve(name: str, begun: float) -> None:
                     generation("gait" if name in PHYSICS else "zero", 15)
                     first = time.time() - begun
                     generation("gait", 15)
-                    _say(first=first, memory=_family()[1])
+                    _say(first=first, memory=family()[1])
                 case ["open", kind, number]:
                     pairs = int(number)
                     for _ in range(3):
@@ -193,29 +223,29 @@ def _serve(name: str, begun: float) -> None:
 
 
 def _turn(call: Callable[[], object], *, more: bool, pairs: int) -> dict[str, float]:
-    """Wall time and processor time of a generation [s]."""
-    count, cores, begun = 0, _family()[0], time.perf_counter()
+    """Wall time of a generation, its processor time, and the part of that which this process took [s]."""
+    count, cores, own, begun = 0, family()[0], time.process_time(), time.perf_counter()
     while time.perf_counter() - begun < SECONDS:
         call()
         count += 1
-    wall, cores = time.perf_counter() - begun, _family()[0] - cores
-    of_pairs = 2 * pairs / (2 * pairs + more)  # that of a run has one rollout more
-    return {"wall": wall / count * of_pairs, "cores": cores / count * of_pairs}
+    wall, cores, own = time.perf_counter() - begun, family()[0] - cores, time.process_time() - own
+    each = 2 * pairs / (2 * pairs + more) / count  # a run's generation has one rollout more
+    return {"wall": wall * each, "cores": cores * each, "own": own * each}
 
 
 def _say(**values: object) -> None:
     print(json.dumps(values), flush=True)
 
 
-def _family() -> tuple[float, float]:
-    """Processor time [s] and proportional set size [MB] of this process and all its descendants."""
+def family(pid: int | None = None) -> tuple[float, float]:
+    """Processor time [s] and proportional set size [MB] of a process and all its descendants; by default this one."""
     parents, spent = {}, {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with suppress(OSError):
                 words = (entry / "stat").read_text().rpartition(")")[2].split()
                 parents[int(entry.name)], spent[int(entry.name)] = int(words[1]), int(words[11]) + int(words[12])
-    family, size = {os.getpid()}, 0
+    family, size = {pid or os.getpid()}, 0
     while len(family) > size:
         size = len(family)
         family |= {child for child, parent in parents.items() if parent in family}
@@ -317,6 +347,29 @@ def of_multiprocessing() -> Opened:
             return np.concatenate(pool.starmap(evaluate, [(kind, half) for half in _halves(rows)], 1))
 
         yield _pooled(call, lambda: victim)
+
+
+@contextmanager
+def of_pipes(*, pinned: bool) -> Opened:
+    """Two processes behind bare pipes, the least that a pool can be; pinned: each has its own core."""
+    context = multiprocessing.get_context("spawn")
+    with ExitStack() as stack:
+        ends = []
+        for _ in range(WORKERS):
+            end, other = context.Pipe()
+            process = context.Process(target=evaluations.serve, args=(other,), daemon=True)
+            process.start()
+            if pinned:
+                os.sched_setaffinity(process.pid or 0, {sorted(os.sched_getaffinity(0))[len(ends) % WORKERS]})
+            stack.callback(process.kill)
+            ends.append(end)
+
+        def call(kind: str, rows: FloatArray) -> FloatArray:
+            for end, half in zip(ends, _halves(rows), strict=True):
+                end.send((kind, half))
+            return np.concatenate([end.recv() for end in ends])
+
+        yield _pooled(call, None)
 
 
 @contextmanager
@@ -460,6 +513,8 @@ BACKENDS: Final[dict[str, tuple[str, str, Callable[[], Any]]]] = {
     "threads": ("physics alone, `mujoco.batch`, 2 threads", "mujoco", of_threads),
     "processes": ("physics alone, `mujoco.batch`, 2 processes", "mujoco", of_processes),
     "loop": ("closed loop, one process, 2 threads", "farm", of_loop),
+    "pipes": ("two processes behind bare pipes", "multiprocessing", partial(of_pipes, pinned=False)),
+    "pinned": ("the same, each on its own core", "multiprocessing", partial(of_pipes, pinned=True)),
     "multiprocessing": ("multiprocessing.Pool(2)", "multiprocessing", of_multiprocessing),
     "joblib": ("joblib with loky, 2 jobs", "joblib", of_joblib),
     "ray": ("Ray, 2 actors", "ray", of_ray),

@@ -1,11 +1,12 @@
 """Measures what recording costs the learner, and the size of recordings.
 
-    python benchmarks/recording.py [--blocks 10] [--repeats 3] [--long 500]
+    python benchmarks/recording.py [--blocks 4] [--repeats 3] [--long 500]
 
-In a run with 15 pairs per generation, the middle two of every four blocks of ten generations are recorded. So other
-load and learning (rollouts take longer as fewer end early) affect blocks with and without recording alike. The run is
-recorded into a file, and live: without a viewer, with a connected viewer, and with a viewer that no longer reads. The
-table compares the median time per generation, and the processor time of the learner's thread and of the recorder's.
+In a run with 15 pairs per generation, the middle two of every four blocks of 40 generations are recorded. So other
+load and learning (rollouts take longer as fewer end early) affect blocks with and without recording alike. A block
+ends when all of it is written. The run is recorded into a file, and live: without a viewer, with a connected viewer,
+and with a viewer that no longer reads. The table compares the median block's time per generation, and the processor
+time of the learner's thread and of the recorder's.
 """
 
 import argparse
@@ -29,8 +30,8 @@ from learner.recording.run import RunRecording, open_recording
 from learner.run.config import RunConfig, configure
 from learner.run.launch import Placement, Run, open_run
 
-BLOCK = 10
-"""Generations per block; the first of each block is left out, and the first four blocks of every run."""
+BLOCK = 40
+"""Generations per block; the first four blocks of every run are left out."""
 
 KINDS = {
     "into a file": "",
@@ -42,10 +43,10 @@ KINDS = {
 
 @dataclass
 class Times:
-    """Measured times; each list has one number per generation [ms]."""
+    """Measured times; each list has one number per block, which is that of one generation [ms]."""
 
     wall: list[float] = field(default_factory=list)
-    """Time from report to report."""
+    """Duration."""
     thread: list[float] = field(default_factory=list)
     """Processor time of the learner's thread."""
     process: list[float] = field(default_factory=list)
@@ -55,7 +56,7 @@ class Times:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--blocks", type=int, default=10, help="pairs of blocks per run, an even number")
+    parser.add_argument("--blocks", type=int, default=4, help="pairs of blocks per run, an even number")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--long", type=int, default=500, help="generations of the recording whose size is printed")
     arguments = parser.parse_args()
@@ -102,22 +103,21 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
 
 
 def _learn(run: Run, made: RunRecording, without: Times, with_: Times) -> None:
-    """Collect each generation's times, except the first of a block and those of the first four blocks."""
+    """Collect each block's times, except those of the first four."""
     before = _now()
     for report in run.learn():
-        number = report.progress.generation
-        block, within = divmod(number, BLOCK)
+        block, within = divmod(report.progress.generation, BLOCK)
         recorded = block % 4 in (1, 2)
-        if within == 0:
-            made.settled()
-        now = _now()
-        if block >= 4 and within:
-            times = with_ if recorded else without
-            for values, a, b in zip((times.wall, times.thread, times.process), before, now, strict=True):
-                values.append(1e3 * (b - a))
-        before = now
         if recorded:
             made.put(report)
+        if within == BLOCK - 1:
+            made.settled()
+            now = _now()
+            times = with_ if recorded else without
+            for values, a, b in zip((times.wall, times.thread, times.process), before, now, strict=True):
+                if block >= 4:
+                    values.append(1e3 * (b - a) / BLOCK)
+            before = now
 
 
 def _now() -> tuple[float, float, float]:
