@@ -1,53 +1,101 @@
 """Learns one policy for several objects, and tries it on each object and on ones that it was not trained on; one table.
 
     python benchmarks/objects.py [--seeds 0,1,2] [--generations 90] [--pose opposed] [--out runs/objects]
+    python benchmarks/objects.py --unseen [--seeds 20,21,22,23,24]
 
 For each set of objects that the gait is trained on: success on 200 perturbed starts with each of five objects, one
-number for each seed. Finished runs are not repeated; interrupted ones continue.
+number for each seed. With --unseen, every policy is trained on all five, each with different observations, and the last
+one with none; three more objects, which it never met, follow, and the mean over these, with the p value of a
+permutation test against the policy without observations. Finished runs are not repeated; interrupted ones continue.
 """
 
 import argparse
+import statistics
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from running import learn
+import numpy as np
+from running import learn, script
 
+from farm.arrays import FloatArray
 from learner.again.replay import load
 from learner.run.config import configure
 from learner.run.evaluation import evaluation_jobs
 
 OBJECTS: Final = ("bar", "thin-bar", "thick-bar", "cylinder", "bolt")
+UNSEEN: Final = ("hexagon", "stepped-bar", "club")
 TRAINED: Final = (("bar",), ("cylinder",), ("bar", "thick-bar", "cylinder"), OBJECTS)
+SEES: Final[dict[str, dict[str, Any]]] = {
+    "joints": {"state": "joints"},
+    "forces": {"state": "forces"},
+    "contact points": {"state": "cop"},
+    "tactile image": {"state": "tactile"},
+    "nothing": {"policy": f"{Path(__file__).parent / 'touch.py'}:Constant", "state": "joints"},
+}
 STARTS: Final = 200
 
 
 def main() -> None:
     """Learn, try, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--seeds", type=lambda text: list(map(int, text.split(","))))
     parser.add_argument("--generations", type=int, default=90)
     parser.add_argument("--pose", default="opposed")
     parser.add_argument("--out", type=Path, default=Path("runs/objects"))
+    parser.add_argument("--unseen", action="store_true", help="policies with different observations")
     given = parser.parse_args()
+    own = {"generations": given.generations, "pose": given.pose}
+    (unseen if given.unseen else sets)(given.seeds or list(range(20, 25) if given.unseen else range(3)), given.out, own)
+
+
+def sets(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
+    """The table of sets of objects."""
     print(f"| trained on | {' | '.join(OBJECTS)} |")
     print(f"|---|{'---|' * len(OBJECTS)}")
     for trained in TRAINED:
-        runs = []
-        for seed in map(int, given.seeds.split(",")):
-            run = given.out / f"{given.pose}-{given.generations}-{'-'.join(trained)}-s{seed}"
-            own = {"generations": given.generations, "pose": given.pose, "object": trained, "seed": seed}
-            learn(configure("finger-gait", **own), run, workers=2)
-            runs.append(run)
-        told = [", ".join(_success(run, thing) for run in runs) for thing in OBJECTS]
-        print(f"| {', '.join(trained)} | {' | '.join(told)} |", flush=True)
+        found = _tried(seeds, OBJECTS, out, {**settings, "object": trained}, "-".join(trained))
+        print(
+            f"| {', '.join(trained)} | {' | '.join(', '.join(f'{x:g}' for x in each) for each in found.T)} |",
+            flush=True,
+        )
 
 
-def _success(run: Path, thing: str) -> str:
-    """Success of a learnt policy with an object [%]."""
+def unseen(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
+    """The table of observations."""
+    from thesis.statistics import above
+
+    heads = [*OBJECTS, "their mean", *UNSEEN, "their mean", "p"]
+    print(f"| the policy sees | {' | '.join(heads)} |\n|---|{'---|' * len(heads)}")
+    found = {}
+    for name, sees in reversed(SEES.items()):
+        found[name] = _tried(seeds, (*OBJECTS, *UNSEEN), out, {**settings, "object": OBJECTS, **sees}, name)
+        parts = found[name][:, : len(OBJECTS)], found[name][:, len(OBJECTS) :]
+        cells = [cell for part in parts for cell in (*map(_cell, part.T), f"**{_cell(part.mean(axis=1))}**")]
+        means = [found[each][:, len(OBJECTS) :].mean(axis=1) for each in (name, "nothing")]
+        cells.append("" if name == "nothing" else f"{above(*means)[1]:.3f}")
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def _tried(seeds: Sequence[int], things: Sequence[str], out: Path, settings: dict[str, Any], name: str) -> FloatArray:
+    """Success with each object [%], (seeds, objects), of policies that are learnt with settings."""
+    rows = []
+    for seed in seeds:
+        run = out / f"{settings['pose']}-{settings['generations']}-{name.replace(' ', '-')}-s{seed}"
+        learn(configure("finger-gait", seed=seed, **settings), run, workers=2)
+        rows.append([_success(run, thing) for thing in things])
+    return np.array(rows)
+
+
+def _success(run: Path, thing: str) -> float:
     policy = load(run, object=thing)
     found = policy.runner.run(policy.mu, evaluation_jobs(STARTS, 1))
-    return f"{100.0 * found.flags[:STARTS, 0].mean():g}"
+    return 100.0 * float(found.flags[:STARTS, 0].mean())
+
+
+def _cell(values: FloatArray) -> str:
+    return f"{statistics.median(values):.3g} ({values.min():.3g} to {values.max():.3g})"
 
 
 if __name__ == "__main__":
-    main()
+    script(main)

@@ -1,16 +1,17 @@
 """What the scripts of this folder share: how they end, and runs that an interrupted script continues."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from farm.commands.signals import INTERRUPTED
-from farm.errors import ConfigError, FarmError
+from farm.commands.signals import INTERRUPTED, stop_flag
+from farm.errors import ConfigError, FarmError, RunError
 from farm.net.session import free_endpoint
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
 from learner.run.setup import fitted
+from learner.sweep.runs import Sharing, run
 
 
 def script(main: Callable[[], None]) -> None:
@@ -23,6 +24,35 @@ def script(main: Callable[[], None]) -> None:
     except FarmError as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(2 if isinstance(error, ConfigError) else 1)
+
+
+class Told:
+    """Prints how simultaneous runs end."""
+
+    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+        """Nothing."""
+
+    def said(self, run: str, line: str) -> None:
+        """Nothing."""
+
+    def ended(self, run: str, state: str, said: str) -> None:
+        """A line."""
+        sys.stderr.write(f"{run}: {state}; {said}\n")
+
+
+def learn_together(runs: Mapping[Path, RunConfig], sharing: Sharing) -> None:
+    """Learn runs that are not over as `farm sweep` does, several at a time on shared workers; the next call continues.
+
+    Raises:
+      KeyboardInterrupt: Ctrl-C or SIGTERM; what is learnt so far is saved.
+      RunError: a run failed.
+    """
+    with stop_flag("saving") as stop:
+        over = run(runs, sharing, Told(), stop.is_set)
+    if stop.is_set():
+        raise KeyboardInterrupt
+    if not over:
+        raise RunError("some runs failed; see their messages above")
 
 
 def learn(config: RunConfig, path: Path, workers: int) -> None:

@@ -5,6 +5,7 @@ import gc
 import importlib
 import json
 import logging
+import math
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, Final, NoReturn
 
 log = logging.getLogger(__name__)
@@ -21,6 +23,18 @@ _GRACE: Final = 1.5  # [s] for a worker to leave before it is killed
 _RESTARTS: Final = 20  # a worker that keeps dying is not restarted forever
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """Environment of a worker: the cores are divided among processes."""
+
+
+_QUOTA: Final = Path("/sys/fs/cgroup/cpu.max")
+
+
+def cores() -> int:
+    """Cores that this process may use: those of its affinity, and not more than its container's share (cgroup v2)."""
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with suppress(OSError, ValueError):  # no Linux, no limit ("max")
+        quota, period = map(int, _QUOTA.read_text("ascii").split())
+        own = min(own, max(1, math.ceil(quota / period)))
+    return own
 
 
 @contextmanager

@@ -106,15 +106,15 @@ def test_the_fragile_bar_needs_no_touch(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.slow
 def test_a_kalman_filter_feels_without_touch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(FOLDER)
-    import touch_map
+    import touch_controllers
 
     cell = {"joint_drift": 0.002, "joint_noise": 0.02, "joint_bias": 0.2}
     runner = problem(configure("fragile-bar", **cell)).runner()
     try:
-        closing = touch_map.play(runner, touch_map.FITS, None, 0.0, 0.02)
-        (kalman,) = touch_map.Kalman.fitted(closing, cell)
+        closing = touch_controllers.play(runner, touch_controllers.FITS, None, 0.0, 0.02)
+        (kalman,) = touch_controllers.Kalman.fitted(closing, cell)
         starts = [(2, 0, 78, i) for i in range(64)]
-        seeing, still = (touch_map.play(runner, starts, each, 0.02).success for each in (kalman, None))
+        seeing, still = (touch_controllers.play(runner, starts, each, 0.02).success for each in (kalman, None))
     finally:
         runner.close()
     assert seeing.mean() >= 0.75

@@ -1,6 +1,5 @@
 """`farm worker`: worker processes on this machine."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -8,7 +7,7 @@ from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError
-from farm.processes import LocalWorkers, forks
+from farm.processes import LocalWorkers, cores, forks
 from farm.settings import Settings, setting
 from workers.config import WorkerConfig
 
@@ -29,7 +28,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
-    processes = command.processes or _cores()
+    processes = command.processes or cores()
     may_fork = command.worker.backend == "cpu"  # devices want processes of their own
     with (
         forks(processes if may_fork else 0) as forked,
@@ -43,11 +42,6 @@ def main(words: Sequence[str]) -> int:
                     raise ConfigError("the workers could not start; see their messages above")
                 raise FarmError("no worker is left; see their messages above")
     return 0
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _flags(command: WorkerCommand) -> list[str]:

@@ -1,6 +1,5 @@
 """`farm dataset`: episodes of a learnt policy as a data set."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, RunError
 from farm.link import Link
 from farm.net.session import free_endpoint
+from farm.processes import cores
 from farm.seeds import SEEDS
 from farm.settings import setting
 from learner import parquet
@@ -62,7 +62,7 @@ class DatasetCommand(Link):
     @property
     def place(self) -> Placement:
         """Where the episodes are simulated."""
-        count = 0 if self.connect else self.workers or os.cpu_count() or 1
+        count = 0 if self.connect else self.workers or cores()
         return Placement(
             workers=count, listen=free_endpoint(), connect=self.connect, farm=self.farm, tls=self.bundle, record=False
         )

@@ -1,7 +1,6 @@
 """`farm verify`: repeats a run, and compares its numbers."""
 
 import json
-import os
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
@@ -23,6 +22,7 @@ from farm.errors import ConfigError, writing
 from farm.link import Link
 from farm.net.session import free_endpoint
 from farm.net.tls import Bundle
+from farm.processes import cores
 from farm.settings import setting
 from learner.again.verify import Differs, chosen, stored, verify_all, verify_some, workers
 from learner.run import checkpoint as checkpoints
@@ -63,7 +63,7 @@ class VerifyCommand(Link):
     @property
     def place(self) -> Placement | None:
         """Where the workers are; None for this process."""
-        count = self.workers if self.workers is not None else (os.cpu_count() or 1) if self.all else 0
+        count = self.workers if self.workers is not None else cores() if self.all else 0
         if not count and not self.connect:
             return None
         return Placement(

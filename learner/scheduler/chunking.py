@@ -11,6 +11,7 @@ from farm.settings import Settings, setting
 
 _SAMPLES = 64
 _APART = 1.5  # ratio of chunk sizes from which the overhead can be told
+_FURTHER = 2  # the line is believed up to so many times the largest chunk whose time is known; then the median counts
 _MESSAGES = 300.0  # chunks that a learner sends and receives per second: this takes a third of a core
 
 
@@ -41,11 +42,11 @@ class SchedulerConfig(Settings):
 
 
 class Chunking:
-    """The running medians of seconds per job and of seconds until an answer, over the last answers of all workers.
+    """The time of a chunk, and the running median of seconds until an answer, over the last answers of all workers.
 
-    Seconds per job are the workers' own, because a worker that other learners use too works on their chunks between two
-    of this one's. A chunk of n jobs takes about overhead + n x seconds: each control step of a batch has a part that
-    does not grow with the batch, and in small models it is most of the time.
+    A chunk of n jobs takes about overhead + n x slope: each control step of a batch has a part that does not grow with
+    the batch, and in small models it is most of the time. Seconds are the workers' own, because a worker that other
+    learners use too works on their chunks between two of this one's.
     """
 
     def __init__(self, config: SchedulerConfig) -> None:
@@ -54,7 +55,7 @@ class Chunking:
         self._waits: deque[float] = deque(maxlen=_SAMPLES)
         self._median: float | None = None  # computed when it is needed, as is the next one
         self._wait: float | None = 0.0
-        self._overhead = 0.0
+        self._overhead, self._slope, self._known = 0.0, 0.0, 0
         self._seconds = 0.0  # duration of the round's longest chunk
 
     def learn(self, jobs: int, wait: float, seconds: float = 0.0) -> None:
@@ -74,25 +75,29 @@ class Chunking:
         """Running median of the time per job [s], None before the first answer."""
         if self._median is None and self._samples:
             self._median = median(seconds / jobs for jobs, seconds in self._samples)
-            self._overhead = self._fitted()
+            self._fit(self._median)
         return self._median
 
-    def _fitted(self) -> float:
-        """The overhead of a chunk [s]: a line through the medians of the smaller and the larger third of the answers.
+    def _fit(self, each: float) -> None:
+        """Fit overhead and slope: a line through the medians of the smaller and the larger third of the answers.
 
-        (Tukey's resistant line, so that single late answers do not count.) As before, if their sizes hardly differ.
+        (Tukey's resistant line, so that single late answers do not count.) If their sizes hardly differ, the overhead
+        is as before.
         """
         ordered = sorted(self._samples)
+        self._known = _FURTHER * ordered[-1][0]
         third = len(ordered) // 3
-        if not third:
-            return self._overhead
         small, large = (
-            [median(values) for values in zip(*part, strict=True)] for part in (ordered[:third], ordered[-third:])
+            [median(values) for values in zip(*part, strict=True)]
+            for part in (ordered[: third or 1], ordered[-third or -1 :])
         )
-        if large[0] < _APART * small[0]:
-            return self._overhead
-        slope = (large[1] - small[1]) / (large[0] - small[0])
-        return max(0.0, small[1] - max(slope, 0.0) * small[0])
+        if third and large[0] >= _APART * small[0]:
+            self._slope = max(0.0, (large[1] - small[1]) / (large[0] - small[0]))
+            self._overhead = max(0.0, small[1] - self._slope * small[0])
+        else:
+            jobs = median(jobs for jobs, _ in self._samples)
+            self._overhead = min(self._overhead, each * jobs)
+            self._slope = each - self._overhead / jobs
 
     @property
     def patience(self) -> float:
@@ -118,13 +123,21 @@ class Chunking:
         """
         if self.median is None:
             return 1
-        seconds = max(self.median, 1e-9)  # with a median of 0 (a coarse clock) the share decides
         share, half = (-(-waiting // (parts * max(workers, 1))) for parts in (1, 2))
-        whole = -(-jobs // max(workers, 1)) * seconds
+        whole = self._duration(-(-jobs // max(workers, 1)))
         if whole <= self._config.short_seconds:
             return max(1, share)
-        shortest = max(self._config.least_seconds, self._config.least_overheads * self._overhead)
-        least = min(share, math.floor(shortest / seconds))
+        least = max(self._config.least_seconds, self._config.least_overheads * self._overhead)
         most = max(self._config.chunk_seconds, workers / _MESSAGES)
         self._seconds = min(most, 0.5 * whole)
-        return max(1, least, min(half, math.floor(most / seconds + 0.5)))
+        return max(1, min(share, math.floor(self._jobs(least))), min(half, math.floor(self._jobs(most) + 0.5)))
+
+    def _duration(self, jobs: int) -> float:
+        """Of a chunk [s]."""
+        each = max(self.median or 0.0, 1e-9)  # with a median of 0 (a coarse clock) the share decides
+        return self._overhead + jobs * self._slope if jobs <= self._known else jobs * each
+
+    def _jobs(self, seconds: float) -> float:
+        """The number of jobs that take so long in one chunk."""
+        line = (seconds - self._overhead) / max(self._slope, 1e-9)
+        return max(seconds / max(self.median or 0.0, 1e-9), min(line, self._known))

@@ -29,7 +29,7 @@ from farm.errors import ConfigError, RunError
 from farm.link import Link
 from farm.net import session
 from farm.net.session import free_endpoint
-from farm.processes import LocalWorkers, end
+from farm.processes import LocalWorkers, cores, end
 from farm.settings import setting
 from learner.run import config as configs
 from learner.run.config import RunConfig
@@ -80,7 +80,7 @@ class Sharing(Link):
     @property
     def processes(self) -> int:
         """Local worker processes."""
-        return self.workers if self.workers is not None else 0 if self.connect else os.cpu_count() or 1
+        return self.workers if self.workers is not None else 0 if self.connect else cores()
 
 
 @dataclass

@@ -26,8 +26,9 @@ assert sys.modules["resource"] is None
 from farm.net.session import free_endpoint, listen
 with listen(free_endpoint(), "f"):
     pass
-from workers import command, runner_process
-assert command._cores() == os.cpu_count()
+from farm import processes
+from workers import runner_process
+assert processes.cores() == os.cpu_count()
 sys.platform = "darwin"
 class NoPrctl:
     def __getattr__(self, name):

@@ -1,7 +1,9 @@
 """The model of the hand with an object: its files, and indices into its arrays."""
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +22,9 @@ CONTACT_WIDTH: Final = 7
 """Numbers per contact: found (1), force in the contact frame (3) [N], position in the world (3) [m]."""
 
 OBJECT: Final = "object"
+_TURNS: Final = {"euler": 0, "axisangle": 3}
+_OF_HINGES: Final = {"range": 0, "ref": 0, "springref": 0}
+"""MJCF's attributes with angles, of all elements and of hinges and balls: the index of the first angle in each."""
 
 
 def folder() -> Path:
@@ -75,10 +80,33 @@ def posed(sources: Mapping[str, str], pose: Pose, stiffness: float = 1.0) -> dic
         out["hand.xml"] = ET.tostring(hand, encoding="unicode")
     for file in (name for name in sources if name.startswith(OBJECT)):
         thing = _parsed(sources, file)
+        changed = _in_radians(thing)
         if pose.place is not None:
             _body(thing, OBJECT).set("pos", pose.place)
+        if changed or pose.place is not None:
             out[file] = ET.tostring(thing, encoding="unicode")
     return out
+
+
+def _in_radians(thing: ET.Element) -> bool:
+    """Convert an object's angles from degrees, MuJoCo's default, to the radians of the hand; whether there are any."""
+    compilers = thing.findall("compiler")
+    if any(compiler.get("angle") == "radian" for compiler in compilers):
+        return False
+    found = bool(compilers)
+    for element in thing.iter():
+        hinge = element.tag == "joint" and element.get("type", "hinge") in ("hinge", "ball")
+        for name, first in (_TURNS | _OF_HINGES if hinge else _TURNS).items():
+            numbers = element.get(name, "").split()
+            with suppress(ValueError):  # MuJoCo says what is wrong with it
+                angles = [repr(math.radians(float(number))) for number in numbers[first:]]
+                if angles:
+                    element.set(name, " ".join([*numbers[:first], *angles]))
+                    found = True
+    if found:
+        for compiler in compilers or [ET.SubElement(thing, "compiler")]:
+            compiler.set("angle", "radian")
+    return found
 
 
 def _body(root: ET.Element, name: str) -> ET.Element:

@@ -24,17 +24,30 @@ def test_chunks_do_not_shrink_into_the_overhead():
     times = [(n, 0.03 + 0.003 * n + (1.0 if i % 9 == 0 else 0.0)) for i, n in enumerate([1, 2, 3, 5, 8, 12, 20] * 6, 1)]
     seen = learnt(times)
     assert seen.chunk(40, 4, 2) == 2, "a worker's share"
-    assert seen.chunk(400, 30, 2) * seen.median == pytest.approx(0.09, rel=0.15)
+    assert seen.chunk(400, 40, 2) == pytest.approx(20, rel=0.4), "30 + 3 x 20 ms, more than half a share"
     free = learnt(times, least_overheads=0.0, least_seconds=1e-6)
     assert free.chunk(400, 4, 2) == 1, "down to half a share"
 
 
 def test_the_overhead_is_kept_while_all_chunks_are_alike():
     seen = learnt([(n, 0.03 + 0.003 * n) for n in [1, 20] * 32])
-    assert seen.chunk(400, 60, 2) < 20
+    assert seen.chunk(400, 60, 2) == 20
     for _ in range(64):
         seen.learn(20, 0.09)
-    assert seen.chunk(400, 60, 2) == 20, "90 ms are 20 jobs of 4.5 ms"
+    assert seen.chunk(400, 60, 2) == 20, "not half a share, which is 15"
+
+
+def test_a_task_that_is_mostly_overhead_is_not_cut_in_its_second_round():
+    """A two-link arm: 60 ms for one job, 62 ms for two. By their median time per job three chunks fit a share."""
+    seen = learnt([(n, 0.058 + 0.002 * n) for n in [1, 1, 2, 2, 3, 3, 6, 6]])
+    assert seen.chunk(30, 30, 2) == 12, "twice what is known"
+    seen.learn(12, 0.082)
+    assert seen.chunk(30, 30, 2) == 15, "a share"
+
+
+def test_a_line_through_small_chunks_is_not_believed_far_beyond_them():
+    seen = learnt([(n, 0.003) for n in [1, 2] * 8])
+    assert seen.chunk(10_000, 10_000, 2) == 89, "0.2 s by the median, 2.25 ms; by the line any number of jobs"
 
 
 def test_work_without_overhead_is_split_as_before():

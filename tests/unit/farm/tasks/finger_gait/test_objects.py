@@ -1,5 +1,6 @@
 """One policy for several objects: each rollout is the one with its object alone, and names that make no sense."""
 
+import mujoco
 import numpy as np
 import pytest
 from learning import learnt
@@ -8,6 +9,7 @@ from farm import settings
 from farm.errors import ConfigError
 from farm.policies.fourier import Direct, FeaturesConfig
 from farm.rollouts import Runner
+from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.env import FingerGaitEnv
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.probe import tried
@@ -80,6 +82,40 @@ def test_names_that_make_no_sense_are_one_line(names, words):
 def test_an_environment_has_one_object():
     with pytest.raises(ConfigError, match="object is bar, bolt; an environment has one"):
         FingerGaitEnv(object=("bar", "bolt"))
+
+
+LEVER = """<mujoco>{compiler}<worldbody><body name="object" pos="0.08 0.04 0.02"><freejoint name="object"/>
+  <geom name="handle" type="box" size="0.011 0.06 0.011" euler="0 {turn} 0" mass="0.05" contype="2" conaffinity="1"/>
+  <body name="lid"><joint name="lid" type="hinge" axis="0 1 0" range="{low} {high}"/>
+  <geom name="lid" type="capsule" size="0.002 0.01" axisangle="0 0 2 {turn}" mass="0.001"/></body>
+</body></worldbody></mujoco>"""
+
+
+def test_angles_of_an_object_are_degrees_unless_its_file_says_radians(tmp_path):
+    degrees = {"turn": 60, "low": -90, "high": 30}
+    radians = {name: np.radians(angle) for name, angle in degrees.items()}
+    found = []
+    for compiler, angles in (
+        ("", degrees), ('<compiler angle="degree"/>', degrees), ('<compiler angle="radian"/>', radians),
+    ):  # fmt: skip
+        path = tmp_path / f"{len(found)}.xml"
+        path.write_text(LEVER.format(compiler=compiler, **angles))
+        made = mujoco.MjModel.from_xml_string(model.mjcf(model.files([str(path)], "opposed")))
+        found.append([made.geom("handle").quat, made.geom("lid").quat, made.joint("lid").range])
+        hand = made.joint("index_1")
+        assert hand.range == pytest.approx([-0.196, 1.61])
+    for values in found:
+        assert values[0] == pytest.approx([np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6), 0.0])
+        assert values[1] == pytest.approx([np.cos(np.pi / 6), 0.0, 0.0, np.sin(np.pi / 6)])
+        assert values[2] == pytest.approx([-np.pi / 2, np.pi / 6])
+
+
+def test_the_axes_of_cylinder_and_bolt_lie_across_the_fingers():
+    for name, geom in (("cylinder", "cylinder"), ("bolt", "head")):
+        made = mujoco.MjModel.from_xml_string(model.mjcf(model.files([name], "opposed")))
+        axis = np.zeros(9)
+        mujoco.mju_quat2Mat(axis, made.geom(geom).quat)
+        assert np.abs(axis.reshape(3, 3)[:, 2]) == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
 
 
 def test_an_object_that_a_grip_does_not_hold_is_named():
