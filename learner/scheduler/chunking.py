@@ -25,8 +25,10 @@ class SchedulerConfig(Settings):
     """Towards the end of a round chunks shrink down to this [s], or to `least_overheads`."""
     least_overheads: float = setting(3.0, least=0.0)
     """Chunks do not shrink below this many times the part of their time that does not depend on their size."""
-    short_seconds: float = setting(0.06, least=0.0)
+    short_seconds: float = setting(0.1, least=0.0)
     """If a worker's whole share of a round takes at most this [s], it is sent in one message."""
+    short_overheads: float = setting(10.0, least=0.0)
+    """The same if it takes at most this many times the part of a chunk's time that does not depend on its size."""
     straggler_factor: float = setting(4.0, least=1.0)
     """A job unanswered for this many times the running median also goes to another worker."""
     straggler_seconds: float = setting(1.0, above=0.0)
@@ -125,7 +127,7 @@ class Chunking:
             return 1
         share, half = (-(-waiting // (parts * max(workers, 1))) for parts in (1, 2))
         whole = self._duration(-(-jobs // max(workers, 1)))
-        if whole <= self._config.short_seconds:
+        if whole <= max(self._config.short_seconds, self._config.short_overheads * self._overhead):
             return max(1, share)
         least = max(self._config.least_seconds, self._config.least_overheads * self._overhead)
         most = max(self._config.chunk_seconds, workers / _MESSAGES)
