@@ -69,7 +69,7 @@ def main() -> None:
     if not arguments.table:
         found = _measured(arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}])
         if arguments.out:
-            arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+            arguments.out.write_text(json.dumps(found, separators=(",", ":")) + "\n")
     else:
         found = json.loads(arguments.table.read_text())
     print("\n".join(table(found)))
@@ -98,6 +98,16 @@ def table(found: dict[str, Any]) -> Iterator[str]:
         if first in backends and second in backends:
             cells = [_spread(backends[first], backends[second], key, ratio, 3) for key, _ in kinds]
             yield f"| {words} | {' | '.join(cells)} |"
+
+
+def first_page(found: dict[str, Any]) -> Iterator[str]:
+    """The rows of README's table."""
+    backends = found["backends"]
+    for name, own in backends.items():
+        if name not in (*PHYSICS, "loop", "pipes", "pinned"):
+            speeds = [_spread(backends["threads"], own, key, _faster).split()[0] for key in ("gait15", "gait100")]
+            numbers = [f"{_median(own, 'zero15', 'wall'):.2g}", f"{own['first']:.1f}", f"{own['memory']:.0f}"]
+            yield f"| {' | '.join([BACKENDS[name][0], *speeds, *numbers, own.get('killed', '-')])} |"
 
 
 def _median(backend: dict[str, Any], key: str, part: str) -> float:
@@ -230,7 +240,7 @@ def _turn(call: Callable[[], object], *, more: bool, pairs: int) -> dict[str, fl
         count += 1
     wall, cores, own = time.perf_counter() - begun, family()[0] - cores, time.process_time() - own
     each = 2 * pairs / (2 * pairs + more) / count  # a run's generation has one rollout more
-    return {"wall": wall * each, "cores": cores * each, "own": own * each}
+    return {name: round(each * value, 7) for name, value in (("wall", wall), ("cores", cores), ("own", own))}
 
 
 def _say(**values: object) -> None:
@@ -263,6 +273,7 @@ def _killed(kill: "Kill") -> None:
         _say()
         return
     work, victim = kill
+    work()  # a first call may start workers
     before = time.perf_counter()
     alone = work()
     undisturbed = time.perf_counter() - before

@@ -139,7 +139,7 @@ def best(found: Mapping[str, Any], cell: Cell) -> int:
 def _unread_best(found: Mapping[str, Any], extra: Mapping[str, float]) -> int:
     """The best learnt policy that reads nothing."""
     seeds = [found[name] for name in found if name.startswith(f"nothing read, learnt, {_name(extra)}, ")]
-    return max(seeds) if extra else int(found[_LEARNT])
+    return max(seeds, default=0) if extra else int(found[_LEARNT])
 
 
 def tables(found: Mapping[str, Any]) -> str:
@@ -155,22 +155,24 @@ def tables(found: Mapping[str, Any]) -> str:
             learnt = f" ({100 * np.median(seeds) / n:.0f})" if seeds else ""
             row.append(f"{100 * best(found, cell) / n:.0f}{learnt}, {100 * least(good, best(found, cell)):+.0f}")
         lines.append(f"| {drift:g} | {' | '.join(row)} |")
-    heads = ["stiffness", "blind", *SKINS, "good touch adds at least", "nothing read", "nothing read, learnt"]
+    heads = ["stiffness", "blind", *SKINS, "good touch adds at least", "best fixed angle"]
     lines += ["", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for factor in sorted({1.0, *STIFFNESSES}):
         own = {} if factor == 1.0 else {"stiffness": factor}
         hands = [found[f"{skin} by hand, {_name(own)}"]["success"] for skin in SKINS]
         blind = best(found, {"joint_drift": 0.0, "joint_noise": 0.01, **own})
-        unread = [found[f"nothing read, {_name(own)}"], _unread_best(found, own)]
         cells = [*(_percent(count) for count in (blind, *hands)), f"{100 * least(hands[1], blind):+.0f}"]
-        lines.append(f"| {factor:g} | {' | '.join([*cells, *map(_percent, unread)])} |")
+        lines.append(f"| {factor:g} | {' | '.join([*cells, _percent(found[f'nothing read, {_name(own)}'])])} |")
     lines += ["", "| learnt with | success by seed [%] |", "|---|---|"]
     rows = {skin: f"{skin} learnt" for skin in SKINS}
+    rows |= {f"nothing read, stiffness {extra['stiffness']:g}": f"nothing read, learnt, {_name(extra)}"
+             for extra in STIFFER}  # fmt: skip
     rows |= {f"memory, without touch, drift {cell['joint_drift']:g}": f"blind learnt, {_name(cell)}, with memory"
              for cell in REMEMBERED}  # fmt: skip
     for head, name in rows.items():
-        shares = (found[f"{name}, seed {seed}"] / n for seed in SEEDS)
-        lines.append(f"| {head} | {', '.join(f'{100 * share:.3g}' for share in shares)} |")
+        shares = [found[f"{name}, seed {seed}"] / n for seed in SEEDS if f"{name}, seed {seed}" in found]
+        if shares:
+            lines.append(f"| {head} | {', '.join(f'{100 * share:.3g}' for share in shares)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -50,6 +50,16 @@ def test_the_page_of_own_tasks_shows_the_recorded_table() -> None:
     assert done.stdout in (results / "own-tasks.md").read_text("utf-8")
 
 
+def test_the_pages_show_the_recorded_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import peers
+
+    found = json.loads((FOLDER.parent / "docs/results/tables/peers.json").read_text("utf-8"))
+    assert "\n".join(peers.first_page(found)) in (FOLDER.parent / "README.md").read_text("utf-8")
+    _, _, *tables = peers.table(found)
+    assert "\n".join(tables) in (FOLDER / "README.md").read_text("utf-8")
+
+
 def test_the_map_of_touch_shows_the_recorded_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(FOLDER)
     import touch_map
