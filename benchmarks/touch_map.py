@@ -50,7 +50,7 @@ REMEMBERED: Final[tuple[dict[str, float], ...]] = tuple(
     {"joint_drift": drift, "joint_noise": 0.01} for drift in (0.0, 0.005, 0.01)
 )
 """Cells in which networks with a memory are learnt as well."""
-MEMORY: Final[dict[str, Any]] = {"state": "joints"}
+MEMORY: Final[dict[str, Any]] = {"state": "joints", "action": "offset", "units": 4, "initial_sigma": 0.05}
 SEEDS: Final = (20, 21, 22, 23, 24)
 _LEARNT: Final = "nothing read, learnt"
 
