@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import importlib
 import json
 import logging
 import math
@@ -16,6 +15,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn
+
+from farm import plugins
 
 log = logging.getLogger(__name__)
 
@@ -126,7 +127,7 @@ def _become_worker() -> NoReturn:
         while not line.endswith(b"\n") and (byte := os.read(0, 1)):
             line += byte
         if line:
-            status = importlib.import_module("workers.__main__").main(json.loads(line))
+            status = plugins.load("workers.__main__").main(json.loads(line))
     except BaseException:
         traceback.print_exc()
         status = 1
