@@ -420,7 +420,6 @@ _QUESTIONS: Final = [
             "joints+contacts, D 1500": "contacts-D1500-fitted",
             "joints+tactile, D 5400": "joints-tactile-D5400-fitted",
         },
-        trials=_MANY,
         find=claims.states,
     ),
     Experiment(
@@ -430,7 +429,6 @@ _QUESTIONS: Final = [
         claim="With N 50 returns rise at generation 30 to 40, drop, and recover. With N 15 they rise at generation 90, "
         "more smoothly and nearly as high (4.2.4).",
         curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
-        trials=_MANY,
         find=claims.pairs_per_generation,
     ),
     Experiment(
@@ -441,7 +439,6 @@ _QUESTIONS: Final = [
         "histories, which are two rollouts each.",
         curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
         figure=Curves(over="rollouts"),
-        trials=_MANY,
         find=claims.rollouts_count,
     ),
     Experiment(
