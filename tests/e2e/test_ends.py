@@ -123,7 +123,11 @@ def test_a_folder_whose_name_is_no_name(farm: Farm) -> None:
 def test_workers_that_cannot_work(farm: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = farm.folder / "broken"
     broken.mkdir()
-    (broken / "sitecustomize.py").write_text("import os, sys\nif 'workers' in sys.orig_argv:\n    os._exit(1)\n")
+    (broken / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "if 'workers' in sys.orig_argv:\n    os._exit(1)\n"
+        "os.register_at_fork(after_in_child=lambda: os._exit(1))\n"
+    )
     monkeypatch.setenv("PYTHONPATH", str(broken))
     said = farm.call("run", "--name", "r", "--generations", "1", *SMALL, status=1)
     assert "farm: no local worker keeps running; see their messages above" in said

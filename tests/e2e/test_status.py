@@ -73,7 +73,7 @@ def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Far
     code = (
         "import sys; from farm import plugins; plugins.code_digest = lambda module: 'x';"
         "from workers.__main__ import main;"
-        f"sys.argv = ['worker', '--connect', '{endpoint}']; sys.exit(main())"
+        f"sys.exit(main(['--connect', '{endpoint}']))"
     )
     stranger = farm.start_python("-c", code)
     assert stranger.stdout
