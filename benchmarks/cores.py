@@ -5,10 +5,10 @@
 First table: a chunk of R rollouts takes a process a + (b + c) R seconds, where a + b R is Python's part and c R that of
 the physics, measured here on one core. With T threads the physics takes the time of its longest thread, c ceil(R / T),
 and the rest is as long as before; that threads also wait for each other at each step is left out. Learner and scheduler
-are the farm's own, network and workers are emulated as in `large.py`, all on one host. The numbers are
-shares of what so many cores could simulate: 1 is physics alone on each. Second table: `farm worker --processes N` here,
-forked from one process or started one by one: memory, and time until all N are on the farm. `peers.py --names
-pinned,pipes,loop` compares processes with and without cores of their own, and threads, on two real cores.
+are the farm's own, network and workers are emulated as in `large.py`, all on one host. The numbers are shares of what
+so many cores could simulate: 1 is physics alone on each. Second table: `farm worker --processes N` here, forked from
+one process or started one by one: memory, and time until all N are on the farm. `peers.py --names pinned,pipes,loop`
+compares processes with and without cores of their own, and threads, on two real cores.
 """
 
 import argparse

@@ -31,7 +31,7 @@ SEES: Final[dict[str, dict[str, Any]]] = {
     "forces": {"state": "forces"},
     "contact points": {"state": "cop"},
     "tactile image": {"state": "tactile"},
-    "nothing": {"policy": f"{Path(__file__).parent / 'touch.py'}:Constant", "state": "joints"},
+    "nothing": {"policy": "constant", "state": "joints", "initial_sigma": 0.2},
 }
 STARTS: Final = 200
 
@@ -55,10 +55,8 @@ def sets(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
     print(f"|---|{'---|' * len(OBJECTS)}")
     for trained in TRAINED:
         found = _tried(seeds, OBJECTS, out, {**settings, "object": trained}, "-".join(trained))
-        print(
-            f"| {', '.join(trained)} | {' | '.join(', '.join(f'{x:g}' for x in each) for each in found.T)} |",
-            flush=True,
-        )
+        cells = [", ".join(f"{share:g}" for share in each) for each in found.T]
+        print(f"| {', '.join(trained)} | {' | '.join(cells)} |", flush=True)
 
 
 def unseen(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:

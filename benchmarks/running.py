@@ -7,6 +7,7 @@ from pathlib import Path
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
 from farm.net.session import free_endpoint
+from learner.commands.sweep import Runs
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
@@ -26,29 +27,15 @@ def script(main: Callable[[], None]) -> None:
         sys.exit(2 if isinstance(error, ConfigError) else 1)
 
 
-class Told:
-    """Prints how simultaneous runs end."""
-
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
-        """Nothing."""
-
-    def said(self, run: str, line: str) -> None:
-        """Nothing."""
-
-    def ended(self, run: str, state: str, said: str) -> None:
-        """A line."""
-        sys.stderr.write(f"{run}: {state}; {said}\n")
-
-
-def learn_together(runs: Mapping[Path, RunConfig], sharing: Sharing) -> None:
+def learn_together(runs: Mapping[Path, RunConfig], where: Path, sharing: Sharing) -> None:
     """Learn runs that are not over as `farm sweep` does, several at a time on shared workers; the next call continues.
 
     Raises:
       KeyboardInterrupt: Ctrl-C or SIGTERM; what is learnt so far is saved.
       RunError: a run failed.
     """
-    with stop_flag("saving") as stop:
-        over = run(runs, sharing, Told(), stop.is_set)
+    with stop_flag("saving") as stop, Runs(runs, where) as shown:
+        over = run(runs, sharing, shown, stop.is_set)
     if stop.is_set():
         raise KeyboardInterrupt
     if not over:

@@ -52,6 +52,7 @@ REMEMBERED: Final[tuple[dict[str, float], ...]] = tuple(
 """Cells in which networks with a memory are learnt as well."""
 MEMORY: Final[dict[str, Any]] = {"state": "joints", "action": "offset", "units": 4, "initial_sigma": 0.05}
 SEEDS: Final = (20, 21, 22, 23, 24)
+RUNS: Final = Path("runs/touch-map")
 _LEARNT: Final = "nothing read, learnt"
 
 
@@ -62,7 +63,7 @@ Learnt = tuple[Path, RunConfig]
 def learnt(name: str, cell: Cell, seed: int, **settings: Any) -> Learnt:  # noqa: ANN401
     """A run that learns in a cell."""
     folder = "-".join([name, *(f"{key}-{value:g}" for key, value in sorted(cell.items())), f"s{seed}"])
-    return Path("runs/touch-map", folder), farm.configure("fragile-bar", seed=seed, **settings, **cell)
+    return RUNS / folder, farm.configure("fragile-bar", seed=seed, **settings, **cell)
 
 
 def tried(folder: Path, config: RunConfig) -> int:
@@ -252,7 +253,7 @@ def main() -> None:
     path = arguments.out / "map.json"
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     todo = {name: run for name, run in runs(fine=arguments.fine) if name not in found}
-    learn_together(dict(todo.values()), Sharing(connect=tuple(arguments.connect), tls=arguments.tls))
+    learn_together(dict(todo.values()), RUNS, Sharing(connect=tuple(arguments.connect), tls=arguments.tls))
     for name, compute in (*((name, partial(tried, *run)) for name, run in todo.items()), *programs()):
         if name not in found:
             found[name] = compute()
