@@ -1,8 +1,10 @@
 """Rollouts and wall time until a given return, beside EvoTorch and sb3-contrib on the same two cores; one table.
 
-    python benchmarks/learning_speed.py [--seeds 0,1,2,3,4] [--tasks gait,Hopper,Arm] [--methods defaults,evotorch]
+    python benchmarks/learning_speed.py [--seeds 5] [--tasks gait,Hopper,Arm] [--methods defaults,evotorch]
+        [--out docs/results/tables/learning-speed.jsonl] [--table]
 
-Needs evotorch and sb3-contrib: pip install evotorch sb3-contrib.
+Needs evotorch and sb3-contrib: pip install evotorch sb3-contrib. Cells that are in the file are not measured again, so
+an interrupted program continues.
 
     defaults    `farm run --task TASK --no-record` with two workers
     linear-ars  the same with --policy linear --algorithm ars --normalise
@@ -18,11 +20,13 @@ over a policy that does nothing.
 """
 
 import argparse
+import itertools
+import json
 import multiprocessing
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from multiprocessing.pool import Pool
 from pathlib import Path
@@ -36,7 +40,6 @@ from farm.arrays import FloatArray
 from farm.moments import normaliser
 from farm.net.work import Jobs
 from farm.rollouts import Runner
-from learner.again.replay import loaded
 from learner.run.evaluation import evaluation_jobs
 from learner.run.folder import RunFolder
 from learner.run.setup import problem
@@ -49,11 +52,15 @@ TASKS: Final = {
     "Arm": (f"{HERE.parent / 'examples/tasks/arm.py'}:Arm", 6000, 35.0),
 }
 """Task, rollouts at most, and the return to be reached."""
+LINEAR: Final[dict[str, Any]] = {"policy": "linear", "algorithm": "ars", "normalise": True}
+UNBIASED: Final[dict[str, Any]] = {"policy": "linear", "bias": False}
 STARTS: Final = 20
 IN_A_ROW: Final = 3
 
-Means = list[tuple[int, float, FloatArray, FloatArray]]
+Mean = tuple[int, float, FloatArray, FloatArray]
 """Rollouts so far, seconds so far, mean (P,), and normaliser (2, d)."""
+Search = Callable[[Pool, str, int, int], Iterator[Mean]]
+"""Learns a task with a seed and so many rollouts at most; it has learnt before it gives the first mean."""
 
 
 class Shared(Rollouts):
@@ -61,7 +68,7 @@ class Shared(Rollouts):
 
     def __init__(self, pool: Pool, task: str, seed: int, **policy: Any) -> None:  # noqa: ANN401
         super().__init__(task, seed, **policy)
-        self._pool, self.means = pool, Means()
+        self._pool, self.means = pool, list[Mean]()
         self._config = {"task": task, "seed": seed, **(policy or {"policy": "linear"})}
         pool.starmap(ready, [(self._config,)] * 2, 1)
         self._begun = time.perf_counter()
@@ -100,85 +107,115 @@ def _half(config: dict[str, Any], jobs: Jobs, seen: FloatArray) -> tuple[FloatAr
     return given.returns, given.moments
 
 
-def _scored(runner: Runner, means: Means, wanted: float) -> tuple[int, float] | None:
+def _reached(runner: Runner, means: Iterable[Mean], wanted: float) -> tuple[int, float] | None:
     """Rollouts and seconds after which the means have the return; None if they never do."""
-    good = 0
-    for at, (_, _, mean, seen) in enumerate(means):
+    good = list[tuple[int, float]]()
+    for rollouts, seconds, mean, seen in means:
         given = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([seen, seen]))
-        good = good + 1 if given.returns[:STARTS].mean() >= wanted else 0
-        if good == IN_A_ROW:
-            return means[at - IN_A_ROW + 1][:2]
+        reached = given.returns[:STARTS].mean() >= wanted
+        good = [*good, (rollouts, seconds)] if reached else []
+        if len(good) == IN_A_ROW:
+            return good[0]
     return None
 
 
-def of_peer(search: Callable[..., FloatArray], **policy: Any) -> Callable[..., tuple[Runner, Means]]:  # noqa: ANN401
+def of_peer(search: Callable[..., FloatArray], **policy: Any) -> Search:  # noqa: ANN401
     """Another library's search."""
 
-    def learnt(pool: Pool, task: str, seed: int, rollouts: int) -> tuple[Runner, Means]:
-        own = policy or {"policy": farm.configure(task).policy}
-        trial = Shared(pool, task, seed, **own)
+    def learnt(pool: Pool, task: str, seed: int, rollouts: int) -> Iterator[Mean]:
+        trial = Shared(pool, task, seed, **(policy or {"policy": farm.configure(task).policy}))
         search(trial, seed, rollouts)
-        return trial.runner, trial.means
+        yield from trial.means
 
     return learnt
 
 
-def of_farm(**settings: Any) -> Callable[..., tuple[Runner, Means]]:  # noqa: ANN401
+def of_farm(**settings: Any) -> Search:  # noqa: ANN401
     """`farm run`."""
 
-    def learnt(_: Pool, task: str, seed: int, rollouts: int) -> tuple[Runner, Means]:
+    def learnt(_: Pool, task: str, seed: int, rollouts: int) -> Iterator[Mean]:
         config = farm.configure(task, seed=seed, **settings)
         config = replace(config, generations=entry_of("own", config).generations(rollouts))
         with tempfile.TemporaryDirectory() as folder:
-            path, means = Path(folder) / "run", Means()
-            for _report in farm.learn(config, path, workers=2):
+            for _report in farm.learn(config, Path(folder) / "run", workers=2):
                 pass
-            stored = RunFolder.open(path)
-            runner = problem(config).runner()
+            stored = RunFolder.open(Path(folder) / "run")
             for line in stored.progress():
-                policy = loaded(stored, line.generation)
-                seen = getattr(policy.problem.policy, "constants", {})
-                names = [name for name in ("observation_mean", "observation_deviation") if name in seen]
-                own = np.stack([seen[name] for name in names]) if names else np.empty((2, 0))
-                means.append((line.rollouts, line.seconds, policy.mu, own))
-        return runner, means
+                yield line.rollouts, line.seconds, *stored.parameters.mean(line.generation)
 
     return learnt
 
 
-METHODS: Final[dict[str, Callable[..., tuple[Runner, Means]]]] = {
-    "defaults": of_farm(),
-    "linear-ars": of_farm(policy="linear", algorithm="ars", normalise=True),
-    "evotorch": of_peer(by_evotorch),
-    "ars": of_peer(by_ars, policy="linear", bias=False),
+METHODS: Final[dict[str, tuple[Search, dict[str, Any]]]] = {
+    "defaults": (of_farm(), {}),
+    "linear-ars": (of_farm(**LINEAR), LINEAR),
+    "evotorch": (of_peer(by_evotorch), {}),
+    "ars": (of_peer(by_ars, **UNBIASED), UNBIASED),
 }
+"""Each with the settings of its policy."""
+
+
+def measured(pool: Pool, name: str, method: str, seed: int) -> tuple[int, float] | None:
+    """Rollouts and seconds until a task's return; None if it is not reached."""
+    task, rollouts, wanted = TASKS[name]
+    search, settings = METHODS[method]
+    runner = problem(farm.configure(task, seed=seed, **settings)).runner()
+    try:
+        return _reached(runner, search(pool, task, seed, rollouts), wanted)
+    finally:
+        runner.close()
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Medians and ranges; how many seeds reached the return, if not all."""
+    methods = [name for name in METHODS if any(row["method"] == name for row in rows)]
+    yield f"| task, return | | {' | '.join(methods)} |"
+    yield "|---" * (2 + len(methods)) + "|"
+    for task in dict.fromkeys(row["task"] for row in rows):
+        for what in ("rollouts", "seconds"):
+            cells = [_cell([row[what] for row in rows if (row["task"], row["method"]) == (task, name)])
+                     for name in methods]  # fmt: skip
+            yield f"| {task}, {TASKS[task][2]:g} | {what} | {' | '.join(cells)} |"
+
+
+def _cell(values: Sequence[float | None]) -> str:
+    there = [value for value in values if value is not None]
+    if not there:
+        return f"none of {len(values)}" if values else "-"
+    some = "" if len(there) == len(values) else f", {len(there)} of {len(values)} seeds"
+    middle, low, high = (_number(value) for value in (statistics.median(there), min(there), max(there)))
+    return f"{middle} ({low} to {high}){some}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def main() -> None:
-    """Learn, and print the table: medians and ranges; how many seeds reached the return, if not all."""
+    """Measure the cells that are missing, and print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("--tasks", type=lambda text: text.split(","), default=list(TASKS))
     words.add_argument("--methods", type=lambda text: text.split(","), default=list(METHODS))
-    words.add_argument("--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(5)))
+    words.add_argument("--seeds", type=int, default=5)
+    words.add_argument("--out", type=Path, default=Path("learning-speed.jsonl"))
+    words.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
     given = words.parse_args()
-    print(f"| task, return | | {' | '.join(given.methods)} |")
-    print(f"|---|---|{'---|' * len(given.methods)}")
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        for name in given.tasks:
-            task, rollouts, wanted = TASKS[name]
-            found = [[_scored(*METHODS[method](pool, task, seed, rollouts), wanted) for seed in given.seeds]
-                     for method in given.methods]  # fmt: skip
-            for row, what in enumerate(("rollouts", "seconds")):
-                cells = [_cell([each[row] for each in cell if each], len(given.seeds)) for cell in found]
-                print(f"| {name}, {wanted:g} | {what} | {' | '.join(cells)} |", flush=True)
-
-
-def _cell(values: Sequence[float], seeds: int) -> str:
-    if not values:
-        return "never"
-    low, high = min(values), max(values)
-    some = "" if len(values) == seeds else f", {len(values)} of {seeds} seeds"
-    return f"{statistics.median(values):.3g} ({low:.3g} to {high:.3g}){some}"
+    rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
+    if not given.table:
+        there = {(row["task"], row["method"], row["seed"]) for row in rows}
+        cells = itertools.product(range(given.seeds), given.tasks, given.methods)
+        with multiprocessing.get_context("spawn").Pool(2) as pool:
+            for seed, task, method in cells:
+                if (task, method, seed) not in there:
+                    found = measured(pool, task, method, seed)
+                    rollouts, seconds = (found[0], round(found[1], 2)) if found else (None, None)
+                    rows.append(
+                        {"task": task, "method": method, "seed": seed} | {"rollouts": rollouts, "seconds": seconds}
+                    )
+                    print(rows[-1], flush=True)
+                    with given.out.open("a") as file:
+                        file.write(json.dumps(rows[-1]) + "\n")
+    print("\n".join(table(sorted(rows, key=lambda row: list(TASKS).index(row["task"])))))
 
 
 if __name__ == "__main__":

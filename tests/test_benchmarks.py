@@ -42,12 +42,16 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
     assert all(line.count("|") >= 3 for line in lines)
 
 
-def test_the_page_of_own_tasks_shows_the_recorded_table() -> None:
-    results = FOLDER.parent / "docs/results"
-    words = ["--out", results / "tables/own-tasks.jsonl", "--table"]
-    done = subprocess.run([sys.executable, FOLDER / "own_tasks.py", *words], capture_output=True, text=True, check=True)
-    assert done.stdout.count("\n") == 8
-    assert done.stdout in (results / "own-tasks.md").read_text("utf-8")
+@pytest.mark.parametrize(
+    ("name", "page", "lines"),
+    [("own_tasks", "docs/results/own-tasks.md", 8), ("learning_speed", "benchmarks/README.md", 8)],
+)
+def test_a_page_shows_the_recorded_table(name: str, page: str, lines: int) -> None:
+    file = FOLDER.parent / f"docs/results/tables/{name.replace('_', '-')}.jsonl"
+    words = ["--out", file, "--table"]
+    done = subprocess.run([sys.executable, FOLDER / f"{name}.py", *words], capture_output=True, text=True, check=True)
+    assert done.stdout.count("\n") == lines
+    assert done.stdout in (FOLDER.parent / page).read_text("utf-8")
 
 
 def test_the_pages_show_the_recorded_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
