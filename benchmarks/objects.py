@@ -31,7 +31,7 @@ SEES: Final[dict[str, dict[str, Any]]] = {
     "forces": {"state": "forces"},
     "contact points": {"state": "cop"},
     "tactile image": {"state": "tactile"},
-    "nothing": {"policy": "constant", "state": "joints", "initial_sigma": 0.2},
+    "nothing": {"policy": "constant", "state": "joints", "initial_mu": 0.0, "initial_sigma": 0.1},
 }
 STARTS: Final = 200
 
