@@ -105,10 +105,12 @@ class Constant(Policy):
 
 WIDE: dict[str, Any] = {"width": 1.77, "weight_scale": 0.25, "initial_sigma": 1.0, "action": "offset"}
 """Settings of the weighted kernel as for the finger gait."""
+EXACT: dict[str, float] = {"force_noise": 0.0, "force_hysteresis": 0.0, "force_dropout": 0.0}
+"""Touch without errors."""
 ROWS: dict[str, dict[str, Any]] = {
-    "forces": {},
-    "cop": {"state": "cop"},
-    "tactile": {"state": "tactile", "width": 1.0},
+    "forces": EXACT,
+    "cop": {"state": "cop", **EXACT},
+    "tactile": {"state": "tactile", "width": 1.0, **EXACT},
     "constant": {"policy": f"{HERE}:Constant", "initial_sigma": 0.3, "action": "offset", "state": "joints"},
     "time": {"task": f"{HERE}:Blind", "sight": "time"},
     "joints": {"state": "joints"},

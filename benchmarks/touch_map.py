@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 from running import learn_together
-from touch import STARTS
+from touch import EXACT, STARTS
 from touch_controllers import Cell, Kalman, Touch, Zeroed, by_hand, open_loop
 
 import farm
@@ -38,7 +38,7 @@ NOISES: Final = (0.0, 0.01, 0.02, 0.04, 0.08)
 STIFFNESSES: Final = (0.5, 2.0, 4.0)
 """Factors of the servos' stiffness, with a noise of 0.01 rad and no drift."""
 SKINS: Final[dict[str, dict[str, float]]] = {
-    "exact touch": {},
+    "exact touch": EXACT,
     "good touch": {"force_noise": 0.05, "force_hysteresis": 0.1, "force_dropout": 0.01},
     "poor touch": {"force_noise": 0.2, "force_delay": 1, "force_hysteresis": 0.3, "force_dropout": 0.1},
 }
@@ -96,6 +96,9 @@ def runs(*, fine: bool) -> Iterator[tuple[str, Learnt]]:
         for extra in STIFFER:
             own = learnt("constant", extra, seed, **CONSTANT)
             yield f"nothing read, learnt, {_name(extra)}, seed {seed}", own
+            errors = SKINS["good touch"] | extra
+            own = learnt("forces", errors, seed, state="forces", width=0.4)
+            yield f"good touch learnt, {_name(extra)}, seed {seed}", own
         for cell in REMEMBERED:
             own = learnt("rnn", cell, seed, policy="rnn", **MEMORY)
             yield f"blind learnt, {_name(cell)}, with memory, seed {seed}", own
@@ -138,7 +141,7 @@ def best(found: Mapping[str, Any], cell: Cell) -> int:
 
 
 def _unread_best(found: Mapping[str, Any], extra: Mapping[str, float]) -> int:
-    """The best learnt policy that reads nothing."""
+    """The best learnt policy that reads nothing, lucky seeds included."""
     seeds = [found[name] for name in found if name.startswith(f"nothing read, learnt, {_name(extra)}, ")]
     return max(seeds, default=0) if extra else int(found[_LEARNT])
 
@@ -156,16 +159,22 @@ def tables(found: Mapping[str, Any]) -> str:
             learnt = f" ({100 * np.median(seeds) / n:.0f})" if seeds else ""
             row.append(f"{100 * best(found, cell) / n:.0f}{learnt}, {100 * least(good, best(found, cell)):+.0f}")
         lines.append(f"| {drift:g} | {' | '.join(row)} |")
-    heads = ["stiffness", "blind", *SKINS, "good touch adds at least", "best fixed angle"]
+    heads = ["stiffness", "blind", *SKINS, "good touch, learnt", "good touch adds at least", "best fixed angle"]
     lines += ["", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for factor in sorted({1.0, *STIFFNESSES}):
         own = {} if factor == 1.0 else {"stiffness": factor}
         hands = [found[f"{skin} by hand, {_name(own)}"]["success"] for skin in SKINS]
         blind = best(found, {"joint_drift": 0.0, "joint_noise": 0.01, **own})
-        cells = [*(_percent(count) for count in (blind, *hands)), f"{100 * least(hands[1], blind):+.0f}"]
+        learnt = _median(found, f"good touch learnt, {_name(own)}" if own else "good touch learnt")
+        cells = [
+            *(_percent(count) for count in (blind, *hands, learnt)),
+            f"{100 * least(max(hands[1], learnt), blind):+.0f}",
+        ]
         lines.append(f"| {factor:g} | {' | '.join([*cells, _percent(found[f'nothing read, {_name(own)}'])])} |")
     lines += ["", "| learnt with | success by seed [%] |", "|---|---|"]
     rows = {skin: f"{skin} learnt" for skin in SKINS}
+    rows |= {f"good touch, stiffness {extra['stiffness']:g}": f"good touch learnt, {_name(extra)}"
+             for extra in STIFFER}  # fmt: skip
     rows |= {f"nothing read, stiffness {extra['stiffness']:g}": f"nothing read, learnt, {_name(extra)}"
              for extra in STIFFER}  # fmt: skip
     rows |= {f"memory, without touch, drift {cell['joint_drift']:g}": f"blind learnt, {_name(cell)}, with memory"
@@ -175,6 +184,12 @@ def tables(found: Mapping[str, Any]) -> str:
         if shares:
             lines.append(f"| {head} | {', '.join(f'{100 * share:.3g}' for share in shares)} |")
     return "\n".join(lines) + "\n"
+
+
+def _median(found: Mapping[str, Any], name: str) -> int:
+    """Of the seeds that have been learnt."""
+    seeds = [found[f"{name}, seed {seed}"] for seed in SEEDS if f"{name}, seed {seed}" in found]
+    return int(np.median(seeds)) if seeds else 0
 
 
 def _percent(count: int) -> str:

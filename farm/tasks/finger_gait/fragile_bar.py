@@ -57,7 +57,7 @@ _ACTION: Final = 0.2  # penalty per squared change of the targets [1 / rad^2]
 
 @dataclass(frozen=True, kw_only=True)
 class FragileBarConfig(SensingConfig):
-    """The fragile bar's settings."""
+    """The fragile bar's settings; docs/results/touch.md says what their values follow from."""
 
     gamma: float = setting(1.0, above=0.0, most=1.0)
     """Discount factor of the return, per control step."""
@@ -66,6 +66,12 @@ class FragileBarConfig(SensingConfig):
     zeroed."""
     joint_bias: float = setting(0.05, least=0.0, most=1.0)
     """Joint readings are wrong by U(-joint_bias, joint_bias), drawn for each joint and rollout [rad]."""
+    force_noise: float = setting(0.05, least=0.0, most=100.0)
+    """Standard deviation of the total force that a touching fingertip reads, drawn in each control step [N]."""
+    force_hysteresis: float = setting(0.1, least=0.0, below=1.0)
+    """A taxel's reading stays as it is while it is wrong by less than this share of the force."""
+    force_dropout: float = setting(0.01, least=0.0, most=1.0)
+    """Probability that a fingertip repeats its last reading, for each control step."""
     action: Literal["offset", "absolute", "increment"] = "increment"
     """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
     friction: float = setting(1.0, above=0.0)

@@ -16,12 +16,13 @@ from learner.run.setup import problem
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 SEEDS: list[Seed] = [(5, 0, 0, i) for i in range(6)]
+EXACT = {"force_noise": 0.0, "force_hysteresis": 0.0, "force_dropout": 0.0}
 CLOSING = np.array([0.0, 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, 0.0])
 
 
 def observed(task: str = "fragile-bar", action: np.ndarray = CLOSING, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
     """Observations (T, B, d) of rollouts that repeat an action, and the fingers' true forces (T, B, 3)."""
-    runner: Runner = problem(configure(task, **settings)).runner()
+    runner: Runner = problem(configure(task, **(EXACT | settings))).runner()
     try:
         batch, seen, force = Batch(runner.task, runner.sim, SEEDS), [], []
         while not batch.over:
