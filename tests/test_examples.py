@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from learning import learnt
 
+from farm.seeds import trial
+from farm.tasks.loop import Batch, again
 from learner.again.replay import load
 from learner.run.config import configure
+from learner.run.setup import problem
 
 LEARN = Path(__file__).parents[1] / "examples" / "learn.py"
 
@@ -45,6 +48,41 @@ def test_random_actions_play_episodes(tmp_path: Path) -> None:
     said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
     assert [line.split(":")[0] for line in said.splitlines()] == ["episode 0", "episode 1"]
     assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())
+
+
+def test_a_cycle_makes_its_grips_in_turn() -> None:
+    task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
+    runner = problem(configure(task, steps=51)).runner()
+    found = runner.rollouts(np.zeros((2, runner.size)), [None, trial(1, 0)])
+    assert found.measures[:, 0].tolist() == [4.0, 4.0]
+    pressing = found.frames["force"].sum(axis=-1) >= 0.1
+    last = np.flatnonzero(np.diff(found.frames["changes"][0]))  # of each grip's control steps
+    assert np.diff(last).tolist() == [3] * 15, "a grip is felt for three steps, then the next one is made"
+    four = [[True, True, True], [False, True, True], [True, True, True], [True, False, True]]
+    assert pressing[0, last].tolist() == four * 4
+    assert found.returns[0] == pytest.approx(16.0, abs=2.0), "1 for each change, less for a bar that has moved"
+    open_hand = np.zeros((8, 7))
+    open_hand[3:6, 0] = -0.3  # [rad], of the middle finger's joints while it should press
+    still = runner.rollouts(open_hand.reshape(1, -1), [None])
+    assert (still.returns[0], still.measures[0, 0]) == (0.0, 0.0), "nothing for a hand that holds still"
+
+
+def test_a_cycle_remembers_where_a_finger_was_touched() -> None:
+    runner = problem(configure(f"{LEARN.parent / 'tasks/cycle.py'}:Cycle", steps=24)).runner()
+
+    def play() -> tuple[np.ndarray, np.ndarray]:
+        batch, seen = Batch(runner.task, runner.sim, [None]), []
+        while not batch.over:
+            seen.append(batch.observe()[0, 4:])
+            batch.step(np.zeros((1, 8)))
+        return np.array(seen), batch.frames["force"][0].sum(axis=-1) > 0
+
+    seen, touches = again(play)
+    before, now, touched = seen[:-1], seen[1:], touches[:-1]
+    assert (now[~touched] == before[~touched]).all()
+    assert (now[touched] != before[touched]).all()
+    assert 3 < (~touched).sum() < 24
+    assert np.abs(seen).max() < 5.0, "within the fingertip's half sphere"
 
 
 @pytest.mark.slow

@@ -55,6 +55,9 @@ TURNED: Final = np.deg2rad(6.0)
 TURNED_COSINE: Final = float(elementary.cos(np.array(0.5 * TURNED)))
 """Cosine of half of that."""
 
+MOST_MOTION: Final = 20.0
+"""Largest `motion`: a lost object is punished by other terms."""
+
 CLOSING: Final = 100
 """Physics steps in which a grip is closed around the frozen object."""
 
@@ -358,6 +361,13 @@ def distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArra
     difference = pose[..., :3] - start[..., :3]
     shift = np.sqrt((difference * difference).sum(axis=-1))
     return shift, np.abs((pose[..., 3:] * start[..., 3:]).sum(axis=-1))
+
+
+def motion(pose: FloatArray, start: FloatArray) -> FloatArray:
+    """How far poses (..., 7) are from others: the squares of shift / MOVED and turn / TURNED, MOST_MOTION at most."""
+    shift, cosine = distance(pose, start)
+    # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
+    return np.asarray(np.minimum((shift / MOVED) ** 2 + (1.0 - cosine) / (1.0 - TURNED_COSINE), MOST_MOTION))
 
 
 def _joint_colours() -> tuple[tuple[int, int, int], ...]:

@@ -7,7 +7,7 @@ TIMESTEP the controller sets joint targets; a demonstration of the goal grip def
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -20,15 +20,16 @@ from farm.tasks.base import Record, Score
 from farm.tasks.finger_gait import rewards, touch
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, POSES, UPPER
 from farm.tasks.finger_gait.holding import (
+    MOST_MOTION,
     MOVED,
     SUCCESS_STEPS,
     TARGET_LIMIT,
     TURNED_COSINE,
     HandTask,
     contact_sensors,
-    distance,
     dropped,
     force_of,
+    motion,
     pressing,
     stayed,
     touching,
@@ -36,8 +37,6 @@ from farm.tasks.finger_gait.holding import (
 from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
 from farm.tasks.finger_gait.sensing import DEFLECTED, ZERO, SensingConfig
-
-_MOST_MOTION: Final = 20.0  # of the squares of a step: a lost object is punished by other terms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,10 +218,7 @@ class FingerGait(HandTask):
     def _motion(self, record: Record) -> FloatArray:
         """Penalty for moving the object, (B, T)."""
         pose = slice(len(JOINTS), None)
-        shift, cosine = distance(record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose])
-        # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
-        moved = (shift / MOVED) ** 2 + (1.0 - cosine) / (1.0 - TURNED_COSINE)
-        return np.asarray(-self.config.motion * np.minimum(moved, _MOST_MOTION))
+        return -self.config.motion * motion(record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose])
 
     def _success(self, record: Record) -> BoolArray:
         """Whether only the goal grip's fingers press at the last steps, and the object stayed in place."""
@@ -258,7 +254,7 @@ class FingerGait(HandTask):
             "motion": config.motion,
             "moved": MOVED,
             "turned_cosine": TURNED_COSINE,
-            "most_motion": _MOST_MOTION,
+            "most_motion": MOST_MOTION,
             "goal_joints": goal.joints,
             "goal_images": goal.images,
             "goal_points": goal.points,

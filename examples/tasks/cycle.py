@@ -1,0 +1,121 @@
+"""An Allegro hand changes its grip of a bar again and again, and corrects by touch how the bar creeps."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+import farm
+from farm.tasks.finger_gait import touch
+from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS
+from farm.tasks.finger_gait.holding import (
+    MOST_MOTION,
+    HandTask,
+    contact_sensors,
+    dropped,
+    force_of,
+    motion,
+    pressing,
+    stayed,
+)
+from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
+
+TURNS = ("index+middle+thumb", "middle+thumb", "index+middle+thumb", "index+thumb")
+PRESS = np.array([[finger in GRIPS[grip] for finger in FINGERS] for grip in TURNS])
+POSE = slice(len(JOINTS), None)  # of the object, in qpos
+FELT = 3  # control steps for which a grip must be felt before the next one is made
+SCALE = 5.0  # a deflection of 0.2 rad counts as 1, and so does a contact at 0.2 fingertip radii from the pad's middle
+
+
+class Cycle(HandTask):
+    """Grip a bar with three fingers, middle finger and thumb, three fingers, index finger and thumb, and again.
+
+    Each grip's joint targets are known, and the next grip is made when touch has shown the last one. An action is
+    added to the targets: it has to keep the bar where it hung, or it creeps a little with every change.
+    """
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config(SensingConfig):
+        """The cycle's settings."""
+
+        object: str = "crowned-bar"
+        """Object to be held: the name of a file in assets/objects."""
+        state: Literal["phase", "joints", "touch"] = "touch"
+        """What is seen beside the grip that is being made (phase): each joint's deflection from its target | where each
+        fingertip was last touched."""
+        friction: float = farm.setting(1.0, above=0.0)
+        """Factor of every friction coefficient."""
+
+    pose, start_grip, action = "between", "index+thumb", "absolute"
+    steps = 240  # of 0.1 s: twenty cycles
+    terms = ("reward",)
+    measures = (farm.Measure(name="cycles", low=0.0, high=farm.tasks.base.STEPS_LIMIT),)
+    presets = {
+        "default": {"policy": "linear", "bias": False, "algorithm": "snes", "pairs": 25, "initial_sigma": 0.015,
+                    "generations": 100},
+    }  # fmt: skip
+
+    @property
+    def object(self):
+        return self.config.object
+
+    @property
+    def parts(self):
+        seen = {"phase": (), "joints": (len(JOINTS),), "touch": (len(FINGERS),)}
+        return (len(TURNS), *seen[self.config.state])
+
+    @property
+    def observations(self):
+        return ()
+
+    def setup(self, sim):
+        (grasping,) = self._find_start(sim)
+        self.commands = np.stack([grasping.command(GRIPS[grip]) for grip in TURNS])
+
+    def _drawn(self, rng):
+        return Perturbation.draw(rng, self.steps, self.config, displacement=0.003)
+
+    def prepare(self, sim, rngs):
+        super().prepare(sim, rngs)
+        sim.own["changes"], sim.own["felt"] = np.zeros((2, len(sim)), dtype=int)
+        sim.own["touched"] = np.zeros((len(sim), len(FINGERS)))
+
+    def observe(self, sim):
+        phase = np.eye(len(TURNS))[sim.own["changes"] % len(TURNS)]
+        if self.config.state == "joints":
+            return np.concatenate([phase, SCALE * (self.joints(sim) - sim.own["target"])], axis=1)
+        if self.config.state == "touch":
+            sim.own["touched"] = self.touched(sim)
+            return np.concatenate([phase, SCALE * sim.own["touched"]], axis=1)
+        return phase
+
+    def touched(self, sim):
+        """Where fingertips are touched, or were last: from the pad's middle, in the finger's plane (B, 3) [radii]."""
+        points = touch.contact_points(self.images(sim))
+        across = 0.75**0.5 * points[..., 0] - 0.5 * points[..., 2]  # the pad's middle is touch.TILT, 30 degrees
+        return np.where(points.any(axis=-1), across, sim.own["touched"])
+
+    def act(self, sim, action):
+        return super().act(sim, self.commands[sim.own["changes"] % len(TURNS)] + action)
+
+    def measure(self, sim):
+        return super().measure(sim) | {"changes": sim.own.get("changes", np.zeros(len(sim), dtype=int))}
+
+    def reward(self, sim, action):
+        force = force_of(contact_sensors(sim))
+        there = (pressing(force) == PRESS[sim.own["changes"] % len(TURNS)]).all(axis=1)
+        felt = np.where(there, sim.own["felt"] + 1, 0)
+        changed = felt == FELT
+        sim.own["felt"], sim.own["changes"] = np.where(changed, 0, felt), sim.own["changes"] + changed
+        kept = 1.0 - motion(sim.qpos[:, POSE], self.model.qpos0[POSE]) / MOST_MOTION
+        return changed * kept  # nothing for a hand that holds still
+
+    def ended(self, sim):
+        return dropped(sim) | ~stayed(sim.qpos[:, POSE], sim.own["released"])
+
+    def success(self, sim):
+        return ~self.ended(sim)
+
+    def outcomes(self, record):
+        rows = np.arange(len(record.steps))
+        return {"cycles": record.frames["changes"][rows, record.steps - 1] // len(TURNS)}
