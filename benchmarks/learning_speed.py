@@ -1,7 +1,7 @@
 """Rollouts and wall time until a given return, beside EvoTorch and sb3-contrib on the same two cores; one table.
 
     python benchmarks/learning_speed.py [--seeds 5] [--tasks gait,Hopper,Arm] [--methods defaults,evotorch]
-        [--out docs/results/tables/learning-speed.jsonl] [--table]
+        [--out FILE.jsonl] [--table]
 
 Needs evotorch and sb3-contrib: pip install evotorch sb3-contrib. Cells that are in the file are not measured again, so
 an interrupted program continues.
@@ -46,6 +46,7 @@ from learner.run.setup import problem
 from learner.sweep.race import entry_of
 
 HERE: Final = Path(__file__).parent
+TABLE: Final = HERE.parent / "docs/results/tables/learning-speed.jsonl"
 TASKS: Final = {
     "gait": ("finger-gait", 900, -1.2),
     "Hopper": (TESTED["Hopper"], 6000, 400.0),
@@ -107,13 +108,12 @@ def _half(config: dict[str, Any], jobs: Jobs, seen: FloatArray) -> tuple[FloatAr
     return given.returns, given.moments
 
 
-def _reached(runner: Runner, means: Iterable[Mean], wanted: float) -> tuple[int, float] | None:
+def reached(runner: Runner, means: Iterable[Mean], wanted: float) -> tuple[int, float] | None:
     """Rollouts and seconds after which the means have the return; None if they never do."""
     good = list[tuple[int, float]]()
     for rollouts, seconds, mean, seen in means:
         given = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([seen, seen]))
-        reached = given.returns[:STARTS].mean() >= wanted
-        good = [*good, (rollouts, seconds)] if reached else []
+        good = [*good, (rollouts, seconds)] if given.returns[:STARTS].mean() >= wanted else []
         if len(good) == IN_A_ROW:
             return good[0]
     return None
@@ -161,7 +161,7 @@ def measured(pool: Pool, name: str, method: str, seed: int) -> tuple[int, float]
     search, settings = METHODS[method]
     runner = problem(farm.configure(task, seed=seed, **settings)).runner()
     try:
-        return _reached(runner, search(pool, task, seed, rollouts), wanted)
+        return reached(runner, search(pool, task, seed, rollouts), wanted)
     finally:
         runner.close()
 
@@ -196,8 +196,8 @@ def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("--tasks", type=lambda text: text.split(","), default=list(TASKS))
     words.add_argument("--methods", type=lambda text: text.split(","), default=list(METHODS))
-    words.add_argument("--seeds", type=int, default=5)
-    words.add_argument("--out", type=Path, default=Path("learning-speed.jsonl"))
+    words.add_argument("--seeds", type=int, default=5, help="number of seeds, 0 and on")
+    words.add_argument("--out", type=Path, default=TABLE)
     words.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
     given = words.parse_args()
     rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []

@@ -6,7 +6,9 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from farm.net.session import free_endpoint
@@ -52,6 +54,25 @@ def test_a_page_shows_the_recorded_table(name: str, page: str, lines: int) -> No
     done = subprocess.run([sys.executable, FOLDER / f"{name}.py", *words], capture_output=True, text=True, check=True)
     assert done.stdout.count("\n") == lines
     assert done.stdout in (FOLDER.parent / page).read_text("utf-8")
+
+
+def test_a_return_is_reached_by_three_means_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import learning_speed
+
+    class Known:
+        def run(self, mean: np.ndarray, _: object, normaliser: np.ndarray) -> SimpleNamespace:
+            assert normaliser.shape == (2, 2, 0)
+            return SimpleNamespace(returns=np.repeat(mean, learning_speed.STARTS + 1))
+
+    def reached(returns: list[float]) -> tuple[int, float] | None:
+        means = [(10 * (i + 1), float(i), np.array([each]), np.empty((2, 0))) for i, each in enumerate(returns)]
+        found: tuple[int, float] | None = learning_speed.reached(Known(), iter(means), 1.0)
+        return found
+
+    assert reached([0.0, 1.0, 2.0, 0.9, 1.0, 1.0, 3.0, 0.0]) == (50, 4.0)
+    assert reached([1.0, 1.0, 0.0, 1.0, 1.0]) is None
+    assert reached([]) is None
 
 
 def test_the_pages_show_the_recorded_comparison(monkeypatch: pytest.MonkeyPatch) -> None:

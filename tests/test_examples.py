@@ -60,11 +60,32 @@ def test_a_cycle_makes_its_grips_in_turn() -> None:
     assert np.diff(last).tolist() == [3] * 15, "a grip is felt for three steps, then the next one is made"
     four = [[True, True, True], [False, True, True], [True, True, True], [True, False, True]]
     assert pressing[0, last].tolist() == four * 4
+    assert found.success.all()
     assert found.returns[0] == pytest.approx(16.0, abs=2.0), "1 for each change, less for a bar that has moved"
+    assert found.returns[1] < found.returns[0], "this one was displaced from its nominal place"
     open_hand = np.zeros((8, 7))
     open_hand[3:6, 0] = -0.3  # [rad], of the middle finger's joints while it should press
     still = runner.rollouts(open_hand.reshape(1, -1), [None])
     assert (still.returns[0], still.measures[0, 0]) == (0.0, 0.0), "nothing for a hand that holds still"
+    assert not still.success[0]
+
+
+@pytest.mark.parametrize(("state", "size"), [("phase", 4), ("joints", 12)])
+def test_a_cycle_without_touch_sees_its_phase(state: str, size: int) -> None:
+    runner = problem(configure(f"{LEARN.parent / 'tasks/cycle.py'}:Cycle", state=state, joint_noise=0.0)).runner()
+
+    def seen() -> np.ndarray:
+        batch = Batch(runner.task, runner.sim, [None])
+        batch.step(np.zeros((1, 8)))
+        return batch.observe()[0]
+
+    x = again(seen)
+    assert x.shape == (size,)
+    assert x[:4].tolist() == [1.0, 0.0, 0.0, 0.0]
+    if size > 4:
+        lag = runner.sim.qpos[0, :8] - runner.sim.ctrl[0]
+        np.testing.assert_allclose(x[4:], 5.0 * lag)
+        assert lag[:2].sum() < -0.01, "the index finger presses, so it lags behind its targets"
 
 
 def test_a_cycle_remembers_where_a_finger_was_touched() -> None:

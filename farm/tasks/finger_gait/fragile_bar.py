@@ -2,8 +2,9 @@
 
 Index finger and thumb grip a bar as in the finger gait, and the middle finger is added. But the bar under the middle
 finger is up to 10 mm higher or lower than it appears, and breaks at 3 N: the force tells when to stop closing.
-Friction, mass and the bar's position vary more than in the finger gait, and the joint readings have a constant error
-that is drawn for each rollout, which hides the servos' deflection from a policy that does not zero its encoders.
+Friction, mass and the bar's position vary more than in the finger gait. Forces are read with errors. The joint readings
+have a constant error that is drawn for each rollout, which hides the servos' deflection from a policy that does not
+zero its encoders.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,7 +58,7 @@ _ACTION: Final = 0.2  # penalty per squared change of the targets [1 / rad^2]
 
 @dataclass(frozen=True, kw_only=True)
 class FragileBarConfig(SensingConfig):
-    """The fragile bar's settings; docs/results/touch.md says what their values follow from."""
+    """The fragile bar's settings; docs/results/touch.md compares them with others'."""
 
     gamma: float = setting(1.0, above=0.0, most=1.0)
     """Discount factor of the return, per control step."""

@@ -56,7 +56,7 @@ TURNED_COSINE: Final = float(elementary.cos(np.array(0.5 * TURNED)))
 """Cosine of half of that."""
 
 MOST_MOTION: Final = 20.0
-"""Largest `motion`: a lost object is punished by other terms."""
+"""Largest `motion`; tasks treat a lost object apart."""
 
 CLOSING: Final = 100
 """Physics steps in which a grip is closed around the frozen object."""
@@ -364,7 +364,7 @@ def distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def motion(pose: FloatArray, start: FloatArray) -> FloatArray:
-    """How far poses (..., 7) are from others: the squares of shift / MOVED and turn / TURNED, MOST_MOTION at most."""
+    """(shift / MOVED)^2 + (turn / TURNED)^2 between poses (..., 7) in m and wxyz, MOST_MOTION at most, (...)."""
     shift, cosine = distance(pose, start)
     # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
     return np.asarray(np.minimum((shift / MOVED) ** 2 + (1.0 - cosine) / (1.0 - TURNED_COSINE), MOST_MOTION))

@@ -45,6 +45,13 @@ def test_readings_have_no_errors_but_noise_and_bias_unless_asked():
     assert np.nanstd(noisy - joints) == pytest.approx(0.03, rel=0.1)
 
 
+def test_the_fragile_bars_forces_are_read_with_errors():
+    own = FragileBarConfig()
+    assert (own.force_noise, own.force_hysteresis, own.force_dropout, own.force_delay) == (0.05, 0.1, 0.01, 0)
+    assert own.numb
+    assert not SensingConfig().numb
+
+
 def test_a_bias_is_constant_and_a_drift_grows_as_a_random_walk():
     errors = SensingConfig(joint_noise=0.0, joint_bias=0.1)
     noise = np.stack([Perturbation.draw(np.random.default_rng(i), 25, errors).noise for i in range(200)])
