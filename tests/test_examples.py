@@ -63,47 +63,54 @@ def test_a_cycle_makes_its_grips_in_turn() -> None:
     assert found.success.all()
     assert found.returns[0] == pytest.approx(16.0, abs=2.0), "1 for each change, less for a bar that has moved"
     assert found.returns[1] < found.returns[0], "this one was displaced from its nominal place"
-    open_hand = np.zeros((8, 7))
+    open_hand = np.zeros((8, 8))
     open_hand[3:6, 0] = -0.3  # [rad], of the middle finger's joints while it should press
     still = runner.rollouts(open_hand.reshape(1, -1), [None])
     assert (still.returns[0], still.measures[0, 0]) == (0.0, 0.0), "nothing for a hand that holds still"
     assert not still.success[0]
 
 
-@pytest.mark.parametrize(("state", "size"), [("phase", 4), ("joints", 12)])
-def test_a_cycle_without_touch_sees_its_phase(state: str, size: int) -> None:
-    runner = problem(configure(f"{LEARN.parent / 'tasks/cycle.py'}:Cycle", state=state, joint_noise=0.0)).runner()
+@pytest.mark.parametrize(("state", "count"), [("phase", 0), ("joints", 8), ("touch", 1)])
+def test_a_cycle_sees_its_phase_and_something_in_each(state: str, count: int) -> None:
+    task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
+    runner = problem(configure(task, state=state, steps=24, joint_noise=0.0)).runner()
 
-    def seen() -> np.ndarray:
-        batch = Batch(runner.task, runner.sim, [None])
-        batch.step(np.zeros((1, 8)))
-        return batch.observe()[0]
+    def play() -> tuple[np.ndarray, ...]:
+        batch, seen, lag = Batch(runner.task, runner.sim, [None]), [], []
+        while not batch.over:
+            seen.append(batch.observe()[0])
+            lag.append(runner.sim.qpos[0, :8] - runner.sim.own["target"][0])
+            batch.step(np.zeros((1, 8)))
+        return np.array(seen), np.array(lag), batch.frames["changes"][0]
 
-    x = again(seen)
-    assert x.shape == (size,)
-    assert x[:4].tolist() == [1.0, 0.0, 0.0, 0.0]
-    if size > 4:
-        lag = runner.sim.qpos[0, :8] - runner.sim.ctrl[0]
-        np.testing.assert_allclose(x[4:], 5.0 * lag)
-        assert lag[:2].sum() < -0.01, "the index finger presses, so it lags behind its targets"
+    seen, lag, changes = again(play)
+    phase, own = seen[:, :4].astype(bool), seen[:, 4:].reshape(24, 4, count)
+    assert (phase.sum(axis=1) == 1).all()
+    assert (phase.argmax(axis=1) == changes % 4).all()
+    assert (own[~phase] == 0.0).all()
+    if state == "joints":
+        np.testing.assert_allclose(own[phase], 5.0 * lag)
+    if state == "touch":
+        assert np.abs(own[phase]).max() < 5.0, "within the fingertips' half spheres"
+        assert len(np.unique(own[phase])) == 24
 
 
 def test_a_cycle_remembers_where_a_finger_was_touched() -> None:
     runner = problem(configure(f"{LEARN.parent / 'tasks/cycle.py'}:Cycle", steps=24)).runner()
 
     def play() -> tuple[np.ndarray, np.ndarray]:
-        batch, seen = Batch(runner.task, runner.sim, [None]), []
+        batch, felt = Batch(runner.task, runner.sim, [None]), []
         while not batch.over:
-            seen.append(batch.observe()[0, 4:])
+            batch.observe()
+            felt.append(runner.sim.own["touched"][0].copy())
             batch.step(np.zeros((1, 8)))
-        return np.array(seen), batch.frames["force"][0].sum(axis=-1) > 0
+        return np.array(felt), batch.frames["force"][0].sum(axis=-1) > 0
 
-    seen, touches = again(play)
-    before, now, touched = seen[:-1], seen[1:], touches[:-1]
+    felt, touches = again(play)
+    before, now, touched = felt[:-1], felt[1:], touches[:-1]
     assert (now[~touched] == before[~touched]).all()
     assert (now[touched] != before[touched]).all()
     assert 3 < (~touched).sum() < 24
-    assert np.abs(seen).max() < 5.0, "within the fingertip's half sphere"
 
 
 @pytest.mark.slow

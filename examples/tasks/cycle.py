@@ -43,8 +43,8 @@ class Cycle(HandTask):
         object: str = "crowned-bar"
         """Object to be held: the name of a file in assets/objects."""
         state: Literal["phase", "joints", "touch"] = "touch"
-        """What is seen beside the grip that is being made (phase): each joint's deflection from its target | where each
-        fingertip was last touched."""
+        """What is seen beside the grip that is being made (phase): each joint's deflection from its target | where the
+        fingertips were last touched, as their mean."""
         friction: float = farm.setting(1.0, above=0.0)
         """Factor of every friction coefficient."""
 
@@ -53,8 +53,8 @@ class Cycle(HandTask):
     terms = ("reward",)
     measures = (farm.Measure(name="cycles", low=0.0, high=farm.tasks.base.STEPS_LIMIT),)
     presets = {
-        "default": {"policy": "linear", "bias": False, "algorithm": "snes", "pairs": 25, "initial_sigma": 0.015,
-                    "generations": 100},
+        "default": {"policy": "linear", "bias": False, "algorithm": "snes", "pairs": 10, "initial_sigma": 0.015,
+                    "generations": 60},
     }  # fmt: skip
 
     @property
@@ -63,8 +63,8 @@ class Cycle(HandTask):
 
     @property
     def parts(self):
-        seen = {"phase": (), "joints": (len(JOINTS),), "touch": (len(FINGERS),)}
-        return (len(CYCLE), *seen[self.config.state])
+        seen = {"phase": 0, "joints": len(JOINTS), "touch": 1}[self.config.state]
+        return (len(CYCLE), *[seen] * len(CYCLE)) if seen else (len(CYCLE),)
 
     @property
     def observations(self):
@@ -84,18 +84,19 @@ class Cycle(HandTask):
 
     def observe(self, sim):
         phase = np.eye(len(CYCLE))[sim.own["changes"] % len(CYCLE)]
-        if self.config.state == "joints":
-            return np.concatenate([phase, SCALE * (self.joints(sim) - sim.own["target"])], axis=1)
-        if self.config.state == "touch":
-            sim.own["touched"] = self.touched(sim)
-            return np.concatenate([phase, SCALE * sim.own["touched"]], axis=1)
-        return phase
+        seen = SCALE * self.seen(sim)  # what helps in one phase harms in another, so each has weights of its own
+        return np.concatenate([phase, *(seen * phase[:, [i]] for i in range(len(CYCLE)))], axis=1)
 
-    def touched(self, sim):
-        """Where fingertips are touched, or were last: from the pad's middle, in the finger's plane (B, 3) [radii]."""
+    def seen(self, sim):
+        """What a state sees beside the phase, (B, n)."""
+        if self.config.state == "phase":
+            return np.empty((len(sim), 0))
+        if self.config.state == "joints":
+            return self.joints(sim) - sim.own["target"]
         points = touch.contact_points(self.images(sim))
-        along = ALONG[0] * points[..., 0] + ALONG[1] * points[..., 2]
-        return np.where(points.any(axis=-1), along, sim.own["touched"])
+        along = ALONG[0] * points[..., 0] + ALONG[1] * points[..., 2]  # from the pad's middle, in the finger's plane
+        sim.own["touched"] = np.where(points.any(axis=-1), along, sim.own["touched"])
+        return sim.own["touched"].mean(axis=1, keepdims=True)
 
     def act(self, sim, action):
         return super().act(sim, self.commands[sim.own["changes"] % len(CYCLE)] + action)

@@ -99,7 +99,6 @@ def test_a_process_with_threads_does_not_fork() -> None:
     assert ran("""
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 with forks(2) as waiting, LocalWorkers(1, NOBODY, waiting) as pool:
-    words = lambda: open(f"/proc/{pool.pids[0]}/cmdline", "rb").read()
-    until(words)  # it is empty for a moment while the new program is loaded
-    print(waiting, b"workers" in words())
+    words = until(lambda: open(f"/proc/{pool.pids[0]}/cmdline", "rb").read())  # empty while the program is loaded
+    print(waiting, b"workers" in words)
 """) == "[] True\n"  # fmt: skip
