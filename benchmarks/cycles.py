@@ -5,9 +5,9 @@
 
 The task is `examples/tasks/cycle.py`. The first row is a script, the targets of the grips as they are. The others learn
 what is added to these targets in each phase: the same for every cycle (phase), and a linear function of the joints'
-deflections (joints) or of where the fingertips were last touched (touch), with the task's own settings for all three. Each final
-policy is tried on 50 starts that were not used for training, for 1000 control steps (100 s), that is 83 cycles at most.
-Settings were chosen on seeds 1 to 3. Finished runs are not repeated; interrupted ones continue.
+deflections (joints) or of where the fingertips were last touched (touch), with the task's own settings for all three.
+Each final policy is tried on 50 starts that were not used for training, for 1000 control steps (100 s), that is 83
+cycles at most. Finished runs are not repeated; interrupted ones continue.
 """
 
 import argparse
