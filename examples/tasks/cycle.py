@@ -41,7 +41,7 @@ class Cycle(HandTask):
         """The cycle's settings."""
 
         object: str = "crowned-bar"
-        """Object to be held: the name of a file in assets/objects."""
+        """Object to be held: the name of a file in assets/objects, or a file NAME.xml."""
         state: Literal["phase", "joints", "touch"] = "touch"
         """What is seen beside the grip that is being made (phase): each joint's deflection from its target | where the
         fingertips were last touched, as their mean."""
@@ -88,7 +88,7 @@ class Cycle(HandTask):
         return np.concatenate([phase, *(seen * phase[:, [i]] for i in range(len(CYCLE)))], axis=1)
 
     def seen(self, sim):
-        """What a state sees beside the phase, (B, n)."""
+        """What a state sees beside the phase, (B, n): deflections [rad], or a place on the pad [fingertip radii]."""
         if self.config.state == "phase":
             return np.empty((len(sim), 0))
         if self.config.state == "joints":
