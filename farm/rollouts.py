@@ -119,9 +119,6 @@ class Runner:
             moments=_placed(done, lambda part: _moments(part, wanted)) if wanted else np.empty((0, 0)),
         )
 
-    def _shares(self, rollouts: loop.Rollouts) -> FloatArray:
-        return shares(self.task, rollouts.terms, rollouts.clamped)
-
     def _traces(self, done: "list[_Part]", chosen: IntArray, *, steps: bool) -> AnyArray:
         """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
         values = np.zeros((len(chosen), *(whole(self.spec) if steps else self.spec.trace)), dtype="<f4")

@@ -1,7 +1,8 @@
 """The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU.
 
 Only this module imports it. The device computes in single precision, so results differ from those of the backend
-`cpu`. Tasks read arrays in the host's memory, which are updated after each control step, not each physics step.
+`cpu`; on a GPU they also depend on the batch, since sums in a fixed order (its option `deterministic`) are ten times
+slower. Tasks read arrays in the host's memory, which are updated after each control step, not each physics step.
 """
 
 import copy
@@ -23,6 +24,9 @@ _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATI
 """Overflows of contacts or constraints; a solver that reaches its last iteration is not an overflow."""
 _MEANINGLESS: Final = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
 """Flags that Warp refuses and that change nothing there: it never resets by itself and has no midphase."""
+_ROOM: Final = 2
+"""Buffers for contacts and constraints, in MuJoCo Warp's sizes, with which a model begins. Its sizes are those of the
+model's initial state: of a thousand grips of the hand one has more, and kernels are compiled anew for each size."""
 _MOST_ROOM: Final = 64
 _DERIVED: Final = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
@@ -62,7 +66,7 @@ class WarpEngine:
         self._host: dict[str, AnyArray] = {}  # (size, ...)
         self._expanded: dict[str, AnyArray] = {}  # (size, ...)
         self._example = mujoco.MjData(model)
-        self._worlds, self._room, self._graph = 0, 1, None
+        self._worlds, self._room, self._graph = 0, _ROOM, None
         self._device: Any = None
         self._data: Any = None
         self._put(1)
@@ -168,7 +172,7 @@ class WarpEngine:
             self._device = mujoco_warp.put_model(self._plain, batch_sizes=there)
         except (NotImplementedError, ValueError) as error:
             raise FarmError(f"MuJoCo Warp cannot simulate this model: {error}") from None
-        self._device.opt.deterministic, self._device.opt.warn_overflow = True, False
+        self._device.opt.warn_overflow = False
         self._device.opt.contact_sensor_maxmatch *= self._room
         self._graph = None
 

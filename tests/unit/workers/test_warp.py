@@ -148,7 +148,7 @@ def test_too_little_room_is_noticed_and_doubled(
     monkeypatch.setattr(warp, "_defaults", lambda _: (1, 2))
     small = Runner(cpu.task, cpu.policy, lambda model: warp.WarpEngine(model, 4), exact=False)
     got = small.rollouts(theta, [None, None])
-    assert small.sim.engine._room > 1  # type: ignore[attr-defined]
+    assert small.sim.engine._room > warp._ROOM  # type: ignore[attr-defined]
     np.testing.assert_allclose(got.returns, gpu.rollouts(theta, [None, None]).returns, rtol=0.02)
     monkeypatch.setattr(warp, "_MOST_ROOM", 2)
     small = Runner(cpu.task, cpu.policy, lambda model: warp.WarpEngine(model, 4), exact=False)
