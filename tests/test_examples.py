@@ -227,6 +227,7 @@ print(farm.load("run").rollout().trajectory.value)
 """
 
 
+@pytest.mark.slow
 def test_a_script_beside_folders_of_ones_own_named_like_ours(tmp_path: Path) -> None:
     for name in ("learner", "workers", "assets"):
         (tmp_path / name).mkdir()

@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -81,7 +82,17 @@ ERRORS = {"ConfigError", "CheckpointError", "RunError", "TaskError"}
 """Their example is that of FarmError."""
 
 
-@pytest.mark.parametrize("name", [each for each in farm.__all__ if each not in APART | ERRORS])
+SLOW = {"Farm"}
+"""Its example is a script of its own workers, as those of tests/loop/test_pool.py."""
+
+
+def shown() -> list[Any]:
+    """Public names whose examples run, as parameters."""
+    names = [each for each in farm.__all__ if each not in APART | ERRORS]
+    return [pytest.param(each, marks=pytest.mark.slow if each in SLOW else ()) for each in names]
+
+
+@pytest.mark.parametrize("name", shown())
 def test_the_example_of_a_public_name_runs(name: str, place: Path) -> None:
     program = example(name)
     assert f"farm.{name}" in program or name in {"Backend", "Algorithm", "Record", "FarmError"}

@@ -231,6 +231,7 @@ def test_a_gif(done: Farm, tmp_path: Path) -> None:
     assert 0.01 < orange.mean() < 0.2  # the bar is there, and no more than a part of the picture
 
 
+@pytest.mark.slow
 def test_nothing_to_draw_with(done: Farm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)

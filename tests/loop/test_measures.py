@@ -217,6 +217,7 @@ def test_they_are_in_the_line_of_a_generation_the_recording_and_the_evaluation(
     assert figures["nominal"]["measures"] == summary["mean_policy_measures"]
 
 
+@pytest.mark.slow
 def test_a_sweeps_table_has_them(
     cart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -268,13 +268,14 @@ print(*pool.worker_pids, flush=True)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "status", "said"),
     [
         ("", 0, ""),
-        pytest.param("del pool, pairs", 0, "", marks=pytest.mark.slow),
-        pytest.param("sys.exit(3)", 3, "", marks=pytest.mark.slow),
-        pytest.param("raise ValueError('of the script')", 1, "ValueError: of the script", marks=pytest.mark.slow),
+        ("del pool, pairs", 0, ""),
+        ("sys.exit(3)", 3, ""),
+        ("raise ValueError('of the script')", 1, "ValueError: of the script"),
     ],
 )
 def test_a_script_that_closes_nothing_ends_and_its_workers_too(end: str, status: int, said: str) -> None:

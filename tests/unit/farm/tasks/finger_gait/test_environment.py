@@ -155,6 +155,7 @@ def _run(code: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_a_program_that_imports_gymnasium_alone_makes_checks_and_renders_it():
     if _run("from mujoco.egl import GLContext; GLContext(8, 8)").returncode:
         pytest.skip("no EGL: nothing renders without a screen here")
