@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from learning import learnt
 
+from farm.errors import ConfigError
 from farm.seeds import trial
 from farm.tasks.loop import Batch, again
 from learner.again.replay import load
@@ -70,10 +71,12 @@ def test_a_cycle_makes_its_grips_in_turn() -> None:
     assert not still.success[0]
 
 
-@pytest.mark.parametrize(("state", "count"), [("phase", 0), ("joints", 8), ("touch", 1)])
+@pytest.mark.parametrize(("state", "count"), [("phase", 0), ("joints", 8), ("estimate", 1), ("touch", 1)])
 def test_a_cycle_sees_its_phase_and_something_in_each(state: str, count: int) -> None:
     task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
-    runner = problem(configure(task, state=state, steps=24, joint_noise=0.0)).runner()
+    weights = np.random.default_rng(0).standard_normal((4, 9)) if state == "estimate" else np.empty(0)
+    given = {"state": state, "weights": tuple(weights.ravel().tolist())}
+    runner = problem(configure(task, **given, steps=24, joint_noise=0.0)).runner()
 
     def play() -> tuple[np.ndarray, ...]:
         batch, seen, lag = Batch(runner.task, runner.sim, [None]), [], []
@@ -90,9 +93,19 @@ def test_a_cycle_sees_its_phase_and_something_in_each(state: str, count: int) ->
     assert (own[~phase] == 0.0).all()
     if state == "joints":
         np.testing.assert_allclose(own[phase], 5.0 * lag)
+    if state == "estimate":
+        now = (weights[phase.argmax(axis=1)] * np.column_stack([lag, np.ones(24)])).sum(axis=1)
+        averaged = [sum(0.05 * 0.95 ** (t - s) * now[s] for s in range(t + 1)) for t in range(24)]
+        np.testing.assert_allclose(own[phase][:, 0], 5.0 * np.array(averaged))
     if state == "touch":
         assert np.abs(own[phase]).max() < 5.0, "within the fingertips' half spheres"
         assert len(np.unique(own[phase])) == 24
+
+
+def test_a_cycle_needs_the_weights_of_its_estimate() -> None:
+    task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
+    with pytest.raises(ConfigError, match=r"weights has 2 numbers; state estimate needs 36"):
+        problem(configure(task, state="estimate", weights=(1.0, 2.0))).runner()
 
 
 def test_a_cycle_remembers_where_a_finger_was_touched() -> None:

@@ -25,6 +25,7 @@ PRESS = np.array([[finger in GRIPS[grip] for finger in FINGERS] for grip in CYCL
 POSE = slice(len(JOINTS), None)  # of the object, in qpos
 FELT = 3  # control steps for which a grip must be felt before the next one is made
 ALONG = 0.75**0.5, -0.5  # the pad in a fingertip's x and z: cosine and minus the sine of touch.TILT, 30 degrees
+FRESH = 0.05  # share of the newest reading in the estimate, which averages over some 20 control steps
 SCALE = 5.0  # a deflection of 0.2 rad counts as 1, and so does a contact at 0.2 fingertip radii from the pad's middle
 
 
@@ -42,9 +43,11 @@ class Cycle(HandTask):
 
         object: str = "crowned-bar"
         """Object to be held: the name of a file in assets/objects, or a file NAME.xml."""
-        state: Literal["phase", "joints", "touch"] = "touch"
-        """What is seen beside the grip that is being made (phase): each joint's deflection from its target | where the
-        fingertips were last touched, as their mean."""
+        state: Literal["phase", "joints", "estimate", "touch"] = "touch"
+        """What is seen beside the grip that is being made (phase): each joint's deflection from its target | an
+        estimate of the bar's place from these | where the fingertips were last touched, as their mean."""
+        weights: tuple[float, ...] = ()
+        """Of the state estimate, for each grip one for each joint's deflection, and a constant [fingertip radii]."""
         friction: float = farm.setting(1.0, above=0.0)
         """Factor of every friction coefficient."""
 
@@ -63,7 +66,7 @@ class Cycle(HandTask):
 
     @property
     def parts(self):
-        seen = {"phase": 0, "joints": len(JOINTS), "touch": 1}[self.config.state]
+        seen = {"phase": 0, "joints": len(JOINTS), "estimate": 1, "touch": 1}[self.config.state]
         return (len(CYCLE), *[seen] * len(CYCLE)) if seen else (len(CYCLE),)
 
     @property
@@ -71,6 +74,11 @@ class Cycle(HandTask):
         return ()
 
     def setup(self, sim):
+        wanted = len(CYCLE) * (len(JOINTS) + 1) if self.config.state == "estimate" else 0
+        if len(self.config.weights) != wanted:
+            raise farm.ConfigError(
+                f"weights has {len(self.config.weights)} numbers; state {self.config.state} needs {wanted}"
+            )
         (grasping,) = self._find_start(sim)
         self.commands = np.stack([grasping.command(GRIPS[grip]) for grip in CYCLE])
 
@@ -80,7 +88,7 @@ class Cycle(HandTask):
     def prepare(self, sim, rngs):
         super().prepare(sim, rngs)
         sim.own["changes"], sim.own["felt"] = np.zeros((2, len(sim)), dtype=int)
-        sim.own["touched"] = np.zeros((len(sim), len(FINGERS)))
+        sim.own["touched"], sim.own["estimate"] = np.zeros((len(sim), len(FINGERS))), np.zeros(len(sim))
 
     def observe(self, sim):
         phase = np.eye(len(CYCLE))[sim.own["changes"] % len(CYCLE)]
@@ -92,11 +100,20 @@ class Cycle(HandTask):
         if self.config.state == "phase":
             return np.empty((len(sim), 0))
         if self.config.state == "joints":
-            return self.joints(sim) - sim.own["target"]
+            return self.deflections(sim)
+        if self.config.state == "estimate":
+            weights = np.reshape(self.config.weights, (len(CYCLE), len(JOINTS) + 1))[sim.own["changes"] % len(CYCLE)]
+            now = (weights[:, :-1] * self.deflections(sim)).sum(axis=1) + weights[:, -1]
+            sim.own["estimate"] += FRESH * (now - sim.own["estimate"])
+            return sim.own["estimate"][:, None].copy()
         points = touch.contact_points(self.images(sim))
         along = ALONG[0] * points[..., 0] + ALONG[1] * points[..., 2]  # from the pad's middle, in the finger's plane
         sim.own["touched"] = np.where(points.any(axis=-1), along, sim.own["touched"])
         return sim.own["touched"].mean(axis=1, keepdims=True)
+
+    def deflections(self, sim):
+        """What the joints' readings are behind their targets, (B, 8) [rad]."""
+        return self.joints(sim) - sim.own["target"]
 
     def act(self, sim, action):
         return super().act(sim, self.commands[sim.own["changes"] % len(CYCLE)] + action)
