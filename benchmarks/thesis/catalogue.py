@@ -47,6 +47,8 @@ def _default(**settings: Any) -> RunConfig:  # noqa: ANN401
 
 
 _WIDE: Final = ("contacts-D1500", "joints-tactile-D5400")
+_THIRTY: Final = ("joints-D1500", "contacts-D1500-30", "joints-tactile-D5400-30", "contacts-D1500-N50")
+"""With a fitted start, of 30 trials each."""
 _ACCURATE: Final = ("joints-D1600", "contacts-D3400", "tactile-D10800", "joints-tactile-D12600")
 _EARLY: Final[Mapping[str, str]] = {
     "joints": "early-joints", "joints+contacts": "early-contacts", "tactile": "early-tactile",
@@ -68,8 +70,10 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "joints-D8000-returns-x128": _projected("joints", 8000, return_scale=12.8),
     "joints-D8000-returns-x100": _projected("joints", 8000, return_scale=10.0),
     "contacts-D1500": _projected("joints+contacts", 1500),
+    "contacts-D1500-30": _projected("joints+contacts", 1500),
     "contacts-D1500-N50": _projected("joints+contacts", 1500, pairs=50),
     "joints-tactile-D5400": _projected("joints+tactile", 5400),
+    "joints-tactile-D5400-30": _projected("joints+tactile", 5400),
     "direct-contacts-N50": _direct("joints+contacts", 100, pairs=50),
     "direct-contacts-N50-clipped": _direct("joints+contacts", 100, pairs=50, clip=True),
     "direct-contacts-N50-limited": _direct("joints+contacts", 100, pairs=50, reward="limited"),
@@ -122,7 +126,7 @@ FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     for suffix, names, parts in (
         (
             "fitted",
-            ("joints-D1500", *_WIDE, *_ACCURATE, "contacts-D1500-N50", *_EARLY.values(), *_BETWEEN),
+            (*_THIRTY, *_WIDE, *_ACCURATE, *_EARLY.values(), *_BETWEEN),
             ("bandwidth", "initial_sigma"),
         ),
         ("width", _WIDE, ("bandwidth",)),
@@ -417,10 +421,11 @@ _QUESTIONS: Final = [
         "image learning is slowest (4.2.3).",
         curves={
             "joints, D 1500": "joints-D1500-fitted",
-            "joints+contacts, D 1500": "contacts-D1500-fitted",
-            "joints+tactile, D 5400": "joints-tactile-D5400-fitted",
+            "joints+contacts, D 1500": "contacts-D1500-30-fitted",
+            "joints+tactile, D 5400": "joints-tactile-D5400-30-fitted",
         },
         find=claims.states,
+        trials=_MANY,
     ),
     Experiment(
         name="fig-4.5-fitted",
@@ -428,8 +433,9 @@ _QUESTIONS: Final = [
         question="Few pairs and many updates, or many pairs and few updates, if the start fits the size of the state?",
         claim="With N 50 returns rise at generation 30 to 40, drop, and recover. With N 15 they rise at generation 90, "
         "more smoothly and nearly as high (4.2.4).",
-        curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
+        curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-30-fitted"},
         find=claims.pairs_per_generation,
+        trials=_MANY,
     ),
     Experiment(
         name="fig-4.6-fitted",
@@ -437,9 +443,10 @@ _QUESTIONS: Final = [
         question="Which N learns more from the same number of rollouts, if the start fits the size of the state?",
         claim="What matters is the number of rollouts; with a small N learning is faster (4.2.4). The thesis counts "
         "histories, which are two rollouts each.",
-        curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-fitted"},
+        curves={"N 50": "contacts-D1500-N50-fitted", "N 15": "contacts-D1500-30-fitted"},
         figure=Curves(over="rollouts"),
         find=claims.rollouts_count,
+        trials=_MANY,
     ),
     Experiment(
         name="equal-accuracy-fitted",

@@ -1,5 +1,6 @@
 """The figures of experiments; only this module of benchmarks/thesis imports matplotlib."""
 
+import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,7 +55,13 @@ def draw(experiment: Experiment, data: Data, folder: Path) -> tuple[Path, Path]:
         canvas.suptitle(experiment.title, x=0.01, ha="left", fontsize=11, fontweight="bold")
         canvas.savefig(paths[0], dpi=110, metadata={"Software": None})
         canvas.savefig(paths[1], metadata={"Date": None, "Creator": None})
+    paths[1].write_text(re.sub(r"[1-9]\d*\.\d{3,}", _short, paths[1].read_text("utf-8")), "utf-8")
     return paths
+
+
+def _short(number: re.Match[str]) -> str:
+    """A coordinate [pt] without the digits that nobody sees, which are a third of a file."""
+    return f"{float(number[0]):.2f}"
 
 
 def _canvas(panels: int, caption: str) -> tuple[Canvas, list[Axes]]:
