@@ -1,16 +1,16 @@
 """Learns a whole cycle of grips, and counts the cycles until the bar is lost; one table.
 
-    python benchmarks/cycles.py [--seeds 20,21,22,23,24] [--states touch,estimate,joints,phase]
+    python benchmarks/cycles.py [--seeds 20,21,22,23,24] [--states touch estimate joints phase]
         [--object crowned-bar] [--runs runs/cycles] [--out FILE.jsonl] [--table]
 
 The task is `examples/tasks/cycle.py`. The first row is a script, the targets of the grips as they are. The others learn
 what is added to these targets in each phase: the same for every cycle (phase), and a linear function of the joints'
 deflections (joints), of an estimate of the bar's place from these (estimate), or of where the fingertips were last
-touched (touch), with the task's own settings for all four. The estimate is the strongest opponent of touch: its
-weights are fitted to the true place in rollouts of the script with small random additions, by least squares, and it
-averages over some 20 control steps. Each final policy is tried on 50 starts that were not used for training, for 1000
-control steps (100 s), that is 83 cycles at most. Rows that are in the file are not measured again, finished runs are
-not repeated, and interrupted ones continue.
+touched (touch), with the task's own settings for all. The estimate is the strongest opponent of touch: its weights are
+fitted to the true place in rollouts of the script with small random additions, by least squares, and it averages over
+some 20 control steps; once more with readings without noise (estimate-exact). Each final policy is tried on 50 starts
+that were not used for training, for 1000 control steps (100 s), that is 83 cycles at most. Rows that are in the file
+are not measured again, finished runs are not repeated, and interrupted ones continue.
 """
 
 import argparse
@@ -39,14 +39,22 @@ STEPS: Final = 1000
 WANTED: Final = 25
 FITTED: Final = 256  # rollouts to which the estimate is fitted
 ADDED: Final = 0.01  # to the script's targets in these, standard deviation [rad]
-STATES: Final = ("script", "touch", "estimate", "joints", "phase")
+SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
+    "script": {"state": "phase"},
+    "touch": {"state": "touch"},
+    "estimate": {"state": "estimate"},
+    "estimate-exact": {"state": "estimate", "joint_noise": 0.0},
+    "joints": {"state": "joints"},
+    "phase": {"state": "phase"},
+}
+"""Settings of the task by what is seen."""
 
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(20, 25)))
-    parser.add_argument("--states", type=lambda text: text.split(","), default=list(STATES[1:]))
+    parser.add_argument("--states", nargs="+", choices=list(SEEN)[1:], default=list(SEEN)[1:])
     parser.add_argument("--object", default="crowned-bar")
     parser.add_argument("--runs", type=Path, default=Path("runs/cycles"))
     parser.add_argument("--out", type=Path, default=TABLE)
@@ -70,7 +78,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """The rows by object, state and seed."""
     yield f"| bar | what is seen | seed | cycles, least / median / most | starts with at least {WANTED} | never lost |"
     yield "|---|---|---|---|---|---|"
-    for row in sorted(rows, key=lambda row: (row["object"], STATES.index(row["state"]), row["seed"])):
+    for row in sorted(rows, key=lambda row: (row["object"], list(SEEN).index(row["state"]), row["seed"])):
         seen, seed = (row["state"], row["seed"]) if row["seed"] is not None else ("nothing: a script", "-")
         cycles = f"{row['least']:g} / {row['median']:g} / {row['most']:g}"
         yield f"| {row['object']} | {seen} | {seed} | {cycles} | {row['reached']:.0%} | {row['kept']:.0%} |"
@@ -78,16 +86,16 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def _script(name: str) -> LoadedPolicy:
     """The grips' targets as they are."""
-    found = problem(configure(TASK, state="phase", object=name, steps=STEPS))
+    found = problem(configure(TASK, **SEEN["script"], object=name, steps=STEPS))
     return LoadedPolicy(found, 0, np.zeros(found.policy.size))
 
 
 def _learnt(name: str, state: str, seed: int, runs: Path) -> LoadedPolicy:
     """The final policy of a run, which is learnt if it is not there."""
-    run, more = runs / f"{name}-{state}-s{seed}", {}
-    if state == "estimate":
-        more["weights"] = estimate(name)
-    learn(configure(TASK, seed=seed, state=state, object=name, **more), run, workers=2)
+    settings, run = {"object": name, **SEEN[state]}, runs / f"{name}-{state}-s{seed}"
+    if settings["state"] == "estimate":
+        settings["weights"] = estimate(settings)
+    learn(configure(TASK, seed=seed, **settings), run, workers=2)
     return load(run, steps=STEPS)
 
 
@@ -102,21 +110,26 @@ def _tried(policy: LoadedPolicy) -> dict[str, float]:
     }  # fmt: skip
 
 
-def estimate(name: str) -> tuple[float, ...]:
+def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
     """Weights of the state `estimate`: for each grip, of the joints' deflections and a constant.
 
     Fitted to the bar's place along the fingers' way [fingertip radii], with the readings' noise, on starts that neither
     learning nor the table uses.
     """
-    found = problem(configure(TASK, state="phase", object=name))
+    found = problem(configure(TASK, **{**settings, **SEEN["script"]}))
     task: Any = found.task
-    seen: list[FloatArray] = []  # of each step (n, 10): the grip, deflections, the place
-    observe = task.observe
+    grips, observe = task.parts[0], task.observe
+    averaged, places = [], []  # of each step (n, 36), averaged as the estimate will be, and (n,)
 
     def noted(sim: Sim) -> FloatArray:
-        grip = sim.own["changes"] % task.parts[0]
-        place = (sim.qpos[:, len(JOINTS)] - task.model.qpos0[len(JOINTS)]) / TIP_RADIUS
-        seen.append(np.column_stack([grip, task.deflections(sim), place]))
+        now = np.zeros((len(sim), grips, len(JOINTS) + 1))
+        now[np.arange(len(sim)), sim.own["changes"] % grips] = np.column_stack(
+            [task.deflections(sim), np.ones(len(sim))]
+        )
+        before = sim.own.get("averaged", np.zeros((len(sim), now[0].size)))
+        sim.own["averaged"] = before + task.fresh * (now.reshape(before.shape) - before)
+        averaged.append(sim.own["averaged"])
+        places.append((sim.qpos[:, len(JOINTS)] - task.model.qpos0[len(JOINTS)]) / TIP_RADIUS)
         observed: FloatArray = observe(sim)
         return observed
 
@@ -124,11 +137,8 @@ def estimate(name: str) -> tuple[float, ...]:
     policy = LoadedPolicy(found, 0, np.zeros(found.policy.size))
     added = ADDED * np.random.default_rng(0).standard_normal((FITTED, found.policy.size))
     policy.runner.rollouts(added, [streams.trial(3, i) for i in range(FITTED)])
-    readings, weights = np.concatenate(seen), []
-    for grip in range(task.parts[0]):
-        mine = readings[readings[:, 0] == grip, 1:]
-        weights.append(np.linalg.lstsq(np.column_stack([mine[:, :-1], np.ones(len(mine))]), mine[:, -1])[0])
-    return tuple(np.concatenate(weights).round(2).tolist())  # the same on any machine
+    weights = np.linalg.lstsq(np.concatenate(averaged), np.concatenate(places))[0]
+    return tuple(weights.round(2).tolist())  # hides how LAPACK rounds
 
 
 if __name__ == "__main__":

@@ -50,10 +50,10 @@ def learn(config: RunConfig, path: Path, workers: int) -> None:
       RunError: the run failed.
     """
     folder = RunFolder(path)
-    if (folder.read_summary() or {}).get("state") == "finished":
-        return
     if path.exists() and folder.read_config() != fitted(config):
         raise ConfigError(f"{path} is a run with different settings: remove it, or work in a different folder")
+    if (folder.read_summary() or {}).get("state") == "finished":
+        return
     place = Placement(workers=workers, listen=free_endpoint(), record=False)
     with open_run(config, path, place, resume=path.exists()) as run:
         for _ in run.learn():

@@ -55,13 +55,13 @@ def draw(experiment: Experiment, data: Data, folder: Path) -> tuple[Path, Path]:
         canvas.suptitle(experiment.title, x=0.01, ha="left", fontsize=11, fontweight="bold")
         canvas.savefig(paths[0], dpi=110, metadata={"Software": None})
         canvas.savefig(paths[1], metadata={"Date": None, "Creator": None})
-    paths[1].write_text(re.sub(r"[1-9]\d*\.\d{3,}", _short, paths[1].read_text("utf-8")), "utf-8")
+    paths[1].write_text(shortened(paths[1].read_text("utf-8")), "utf-8")
     return paths
 
 
-def _short(number: re.Match[str]) -> str:
-    """A coordinate [pt] without the digits that nobody sees, which are a third of a file."""
-    return f"{float(number[0]):.2f}"
+def shortened(svg: str) -> str:
+    """An SVG's coordinates [pt] without the digits that nobody sees, a third of the file; its texts stay."""
+    return re.sub(r"<[^>]*>", lambda tag: re.sub(r"[1-9]\d*\.\d{3,}", lambda of: f"{float(of[0]):.2f}", tag[0]), svg)
 
 
 def _canvas(panels: int, caption: str) -> tuple[Canvas, list[Axes]]:

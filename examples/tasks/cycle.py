@@ -25,7 +25,6 @@ PRESS = np.array([[finger in GRIPS[grip] for finger in FINGERS] for grip in CYCL
 POSE = slice(len(JOINTS), None)  # of the object, in qpos
 FELT = 3  # control steps for which a grip must be felt before the next one is made
 ALONG = 0.75**0.5, -0.5  # the pad in a fingertip's x and z: cosine and minus the sine of touch.TILT, 30 degrees
-FRESH = 0.05  # share of the newest reading in the estimate, which averages over some 20 control steps
 SCALE = 5.0  # a deflection of 0.2 rad counts as 1, and so does a contact at 0.2 fingertip radii from the pad's middle
 
 
@@ -53,6 +52,7 @@ class Cycle(HandTask):
 
     pose, start_grip, action, ending = "between", "index+thumb", "absolute", "lost"
     steps = 240  # of 0.1 s: twenty cycles
+    fresh = 0.05  # share of the newest reading in the estimate, which averages over some 20 control steps
     terms = ("reward",)
     measures = (farm.Measure(name="cycles", low=0.0, high=farm.tasks.base.STEPS_LIMIT),)
     presets = {
@@ -104,7 +104,7 @@ class Cycle(HandTask):
         if self.config.state == "estimate":
             weights = np.reshape(self.config.weights, (len(CYCLE), len(JOINTS) + 1))[sim.own["changes"] % len(CYCLE)]
             now = (weights[:, :-1] * self.deflections(sim)).sum(axis=1) + weights[:, -1]
-            sim.own["estimate"] += FRESH * (now - sim.own["estimate"])
+            sim.own["estimate"] += self.fresh * (now - sim.own["estimate"])
             return sim.own["estimate"][:, None].copy()
         points = touch.contact_points(self.images(sim))
         along = ALONG[0] * points[..., 0] + ALONG[1] * points[..., 2]  # from the pad's middle, in the finger's plane

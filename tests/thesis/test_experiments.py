@@ -63,11 +63,12 @@ def test_every_experiment_shows_set_ups_that_exist_and_every_set_up_is_shown():
 
 def test_set_ups_are_different_and_their_names_can_be_runs():
     assert all(keys.checked("run", f"{name}-s0") for name in (*SETUPS, *FITTED))
-    once = [json.dumps(to_dict(config)) for name, config in SETUPS.items() if not name.endswith("-30")]
+    again = {name for name in SETUPS if name.endswith("-30")} | {"object-bar"}  # a set-up that was learnt once more
+    once = [json.dumps(to_dict(config)) for name, config in SETUPS.items() if name not in again]
     assert len(set(once)) == len(once), "two names for one set-up"
 
 
-@pytest.mark.parametrize("name", ["joints-D300-30", "default-cylinder", "direct-joints-N5", "cosine-joints-D100"])
+@pytest.mark.parametrize("name", ["joints-D300-30", "object-cylinder", "direct-joints-N5", "cosine-joints-D100"])
 def test_set_ups_can_be_begun(name):
     assert problem(config(name)).policy.size > 0
 
@@ -410,6 +411,17 @@ def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
         return
     again = paths[1].read_bytes()
     assert draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)[1].read_bytes() == again
+
+
+def test_a_figure_keeps_the_numbers_that_are_read() -> None:
+    pytest.importorskip("matplotlib")
+    from benchmarks.thesis.figures import shortened
+
+    svg = '<path d="M 12.345678 -0.123456 L 7.5 8" transform="scale(0.015625)"/><text x="100.987654">1.12345</text>'
+    assert (
+        shortened(svg)
+        == '<path d="M 12.35 -0.123456 L 7.5 8" transform="scale(0.015625)"/><text x="100.99">1.12345</text>'
+    )
 
 
 def measurements(experiment: Experiment, count: int) -> dict[str, np.ndarray]:

@@ -1,8 +1,8 @@
 """The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU.
 
-Only this module imports it. The device computes in single precision, so results differ from those of the backend
-`cpu`; on a GPU they also depend on the batch, since sums in a fixed order (its option `deterministic`) are ten times
-slower. Tasks read arrays in the host's memory, which are updated after each control step, not each physics step.
+Only this module imports it. The device computes in single precision, so results differ from those of the backend `cpu`; on a GPU they also depend on
+the batch, since its option `deterministic` makes it 8 to 20 times slower. Tasks read arrays in the host's memory, which
+are updated after each control step, not each physics step.
 """
 
 import copy
@@ -25,8 +25,9 @@ _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATI
 _MEANINGLESS: Final = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
 """Flags that Warp refuses and that change nothing there: it never resets by itself and has no midphase."""
 _ROOM: Final = 2
-"""Buffers for contacts and constraints, in MuJoCo Warp's sizes, with which a model begins. Its sizes are those of the
-model's initial state: of a thousand grips of the hand one has more, and kernels are compiled anew for each size."""
+"""Buffers for contacts and constraints with which a model begins, as a factor of MuJoCo Warp's own sizes. These are a
+guess from the model (64 constraints for the hand; one in a hundred rollouts has more), and kernels are compiled anew
+for each size."""
 _MOST_ROOM: Final = 64
 _DERIVED: Final = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
