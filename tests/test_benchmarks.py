@@ -46,7 +46,11 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "page", "lines"),
-    [("own_tasks", "docs/results/own-tasks.md", 8), ("learning_speed", "benchmarks/README.md", 8)],
+    [
+        ("own_tasks", "docs/results/own-tasks.md", 8),
+        ("learning_speed", "benchmarks/README.md", 8),
+        ("cycles", "docs/results/chain-of-gaits.md", 27),
+    ],
 )
 def test_a_page_shows_the_recorded_table(name: str, page: str, lines: int) -> None:
     file = FOLDER.parent / f"docs/results/tables/{name.replace('_', '-')}.jsonl"
