@@ -1,8 +1,8 @@
 """The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU.
 
 Only this module imports it. The device computes in single precision, so results differ from those of the backend `cpu`.
-On a GPU they also depend on the batch, since its option `deterministic` makes it 8 to 20 times slower. Tasks read arrays
-in the host's memory, which are updated after each control step, not each physics step.
+On a GPU they also depend on the batch, since its option `deterministic` makes it 8 to 20 times slower. Tasks read
+arrays in the host's memory, which are updated after each control step, not each physics step.
 """
 
 import copy
