@@ -7,11 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from farm.net.session import free_endpoint
+from farm.seeds import trial
+from farm.sim.sim import Sim
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
@@ -58,6 +61,28 @@ def test_a_page_shows_the_recorded_table(name: str, page: str, lines: int) -> No
     done = subprocess.run([sys.executable, FOLDER / f"{name}.py", *words], capture_output=True, text=True, check=True)
     assert done.stdout.count("\n") == lines
     assert done.stdout in (FOLDER.parent / page).read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_the_cycles_estimate_tells_where_the_bar_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import cycles
+
+    given: dict[str, Any] = {"object": "crowned-bar", "state": "estimate"}
+    runner = problem(configure(cycles.TASK, weights=cycles.estimate(given), **given)).runner()
+    observe, estimates, places = runner.task.observe, [], []
+
+    def noted(sim: Sim) -> np.ndarray:
+        observed: np.ndarray = observe(sim)
+        estimates.append(sim.own["estimate"].copy())
+        places.append(sim.qpos[:, 8] / 0.012)
+        return observed
+
+    monkeypatch.setattr(runner.task, "observe", noted)
+    runner.rollouts(np.zeros((50, runner.size)), [trial(1, i) for i in range(50)])
+    place = np.concatenate(places) - runner.task.model.qpos0[8] / 0.012  # [fingertip radii]
+    wrong = place - np.concatenate(estimates)
+    assert np.mean(wrong**2) < 0.5 * np.mean(place**2), "more than half is known, from other starts"
 
 
 def test_a_return_is_reached_by_three_means_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
