@@ -34,18 +34,18 @@ try:
 except RunError as error:
     sys.exit(str(error))
 assert (model.geom_rgba == [[0, 0, 0, 1]]).all(), "the physics' model is changed"
-np.save(sys.stdout.buffer, np.array(drawn))
+np.save("drawn.npy", np.array(drawn))
 """
 
 
 def drawn_by(code, tmp_path):
     """Pictures (F, height, width, 3) that a program draws in a process of its own."""
     environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=False, timeout=60)
-    if b"cannot draw here" in done.stderr:
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    if "cannot draw here" in done.stderr:
         pytest.skip("no OSMesa and no EGL")
-    (tmp_path / "drawn.npy").write_bytes(done.stdout)
-    assert done.returncode == 0, done.stderr.decode()
+    assert done.returncode == 0, done.stderr
     return np.load(tmp_path / "drawn.npy").astype(int)
 
 
@@ -126,7 +126,7 @@ mocap = np.tile([0.0, 0.0, -0.6, 1, 0, 0, 0], (3, 1, 1))
 mocap[2, 0, 0] = 0.6
 try:
     drawn = pictures(model, qpos, (480, 480), camera=camera, mocap=mocap, channels=channels, values=values)
-    np.save(sys.stdout.buffer, np.array(list(drawn)))
+    np.save("drawn.npy", np.array(list(drawn)))
 except RunError as error:
     sys.exit(str(error))
 """
