@@ -18,11 +18,12 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks.thesis.catalogue import EXPERIMENTS, minutes
+from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import Data, Experiment, Finding, judge, spread, verdict
 from benchmarks.thesis.figures import draw
 from benchmarks.thesis.folder import ExperimentFolder
 from benchmarks.thesis.measure import measure
+from benchmarks.thesis.setups import minutes
 
 HERE = Path(__file__).parent
 

@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.thesis import catalogue
+from benchmarks.thesis import setups
 from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import judge, verdict
 from benchmarks.thesis.folder import ExperimentFolder, find
@@ -170,8 +170,8 @@ def _cost(names: tuple[str, ...]) -> tuple[str, str, str]:
     """Runs, rollouts and minutes of experiments."""
     folder = ExperimentFolder(path=Path(), experiments=names, trials=None, generations=None)
     counts = {setup: folder.count(setup) for setup in folder.setups}
-    rollouts = sum(count * catalogue.rollouts(setup) for setup, count in counts.items())
-    minutes = sum(count * catalogue.minutes((setup,)) for setup, count in counts.items())
+    rollouts = sum(count * setups.rollouts(setup) for setup, count in counts.items())
+    minutes = sum(count * setups.minutes((setup,)) for setup, count in counts.items())
     return str(sum(counts.values())), str(rollouts), f"{minutes:.0f}"
 
 

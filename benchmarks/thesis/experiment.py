@@ -106,7 +106,7 @@ class Experiment:
     claim: str = ""
     """What Plage 2016 reports, with the section; empty for our own questions."""
     curves: Mapping[str, str] = field(default_factory=dict)
-    """Label in the legend -> name of the set-up (catalogue.SETUPS)."""
+    """Label in the legend -> name of the set-up (setups.SETUPS)."""
     figure: Figure = field(default_factory=Curves)
     find: Callable[[Data], list[Finding]] | None = None
     """Tests the claim on the recorded data."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.thesis import catalogue, series
+from benchmarks.thesis import series, setups
 from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import Data, Experiment, trial
 from farm.errors import ConfigError
@@ -111,7 +111,7 @@ class ExperimentFolder:
 
     def config(self, setup: str, number: int) -> RunConfig:
         """Configuration of a trial."""
-        return trial(catalogue.config(setup), number, self.generations)
+        return trial(setups.config(setup), number, self.generations)
 
     def run(self, setup: str, number: int) -> RunFolder:
         """The folder of a trial, which may not exist."""

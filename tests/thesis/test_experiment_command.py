@@ -12,9 +12,9 @@ from processes import Farm, children
 from recordings import generations
 
 from benchmarks.thesis.__main__ import main
-from benchmarks.thesis.catalogue import SETUPS
 from benchmarks.thesis.experiment import trial
 from benchmarks.thesis.folder import ExperimentFolder
+from benchmarks.thesis.setups import SETUPS
 from farm.errors import ConfigError
 from farm.net.session import free_endpoint
 from learner.run import config as configs

@@ -11,7 +11,7 @@ import pytest
 from made import stats
 
 from benchmarks.thesis import claims, series, shapes, statistics
-from benchmarks.thesis.catalogue import EXPERIMENTS, FITTED, SETUPS, config, setup
+from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.claims import features_for
 from benchmarks.thesis.experiment import (
     UNDECIDED,
@@ -30,6 +30,7 @@ from benchmarks.thesis.experiment import (
 )
 from benchmarks.thesis.folder import ExperimentFolder, find
 from benchmarks.thesis.series import COLUMNS, Series
+from benchmarks.thesis.setups import FITTED, SETUPS, config, setup
 from farm.errors import ConfigError
 from farm.net import keys
 from farm.tasks.standard import nominal
