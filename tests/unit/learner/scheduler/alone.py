@@ -1,18 +1,25 @@
 """A small task in a file, and runs of it without a network."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from farm.net.telemetry import Report
 from farm.net.work import NOT_NORMALISED, Jobs, Results
+from learner.run import checkpoint as checkpoints
 from learner.run import setup
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+from learner.run.learner import Learner
 from learner.scheduler.round import RoundResults
 
 POLE = """
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 import numpy as np
 import farm
 
@@ -94,3 +101,27 @@ class Alone:
 
     def report(self, progress: object) -> None:
         pass
+
+
+def begun(config: RunConfig, path: Path) -> tuple[Learner, Alone]:
+    found, at = setup.start(config, path.name)
+    return Learner(found, RunFolder.create(path, config), at), Alone(found)
+
+
+def learnt(config: RunConfig, path: Path) -> list[Report]:
+    learner, alone = begun(config, path)
+    return list(learner.learn(alone))  # type: ignore[arg-type]
+
+
+def taken_up(path: Path, *, mixed: bool = False, **changed: Any) -> tuple[Learner, Alone]:
+    folder = RunFolder.open(path)
+    config = replace(folder.read_config(), **changed)
+    found, at = setup.resumed(folder, config, mixed=mixed)
+    folder.rewind(at)
+    folder.write_config(config)
+    return Learner(found, folder, at), Alone(found, 1)
+
+
+def state(path: Path) -> tuple[bytes, bytes]:
+    at = checkpoints.load(path / "checkpoint")
+    return at.state["mu"].tobytes(), at.state["sigma"].tobytes()
