@@ -1,6 +1,6 @@
 """Learns a whole cycle of grips, and counts the cycles until the bar is lost; one table.
 
-    python benchmarks/cycles.py [--seeds 20,21,22,23,24] [--states touch estimate joints phase]
+    python benchmarks/cycles.py [--seeds 20,21,22,23,24] [--states touch estimate ...]
         [--object crowned-bar] [--runs runs/cycles] [--out FILE.jsonl] [--table]
 
 The task is `examples/tasks/cycle.py`. The first row is a script, the targets of the grips as they are. The others learn
@@ -14,14 +14,13 @@ are not measured again, finished runs are not repeated, and interrupted ones con
 """
 
 import argparse
-import json
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import learn, script
+from running import keep, kept, learn, script
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
@@ -60,7 +59,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=TABLE)
     parser.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
     given = parser.parse_args()
-    rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
+    rows = kept(given.out)
     if not given.table:
         there = {(row["object"], row["state"], row["seed"]) for row in rows}
         wanted = [("script", None), *((state, seed) for seed in given.seeds for state in given.states)]
@@ -68,9 +67,7 @@ def main() -> None:
             if (given.object, state, seed) not in there:
                 policy = _script(given.object) if seed is None else _learnt(given.object, state, seed, given.runs)
                 rows.append({"object": given.object, "state": state, "seed": seed} | _tried(policy))
-                print(rows[-1], flush=True)
-                with given.out.open("a") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
+                keep(given.out, rows[-1])
     print("\n".join(table(rows)))
 
 
@@ -111,7 +108,7 @@ def _tried(policy: LoadedPolicy) -> dict[str, float]:
 
 
 def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
-    """Weights of the state `estimate`: for each grip, of the joints' deflections and a constant.
+    """Weights (36,) of the state `estimate`: for each of the four grips, of eight deflections [rad] and a constant.
 
     Fitted to the bar's place along the fingers' way [fingertip radii], with the readings' noise, on starts that neither
     learning nor the table uses.

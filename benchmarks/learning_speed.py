@@ -21,7 +21,6 @@ over a policy that does nothing.
 
 import argparse
 import itertools
-import json
 import multiprocessing
 import statistics
 import tempfile
@@ -34,6 +33,7 @@ from typing import Any, Final
 
 import numpy as np
 from own_tasks import TESTED, Rollouts, by_ars, by_evotorch
+from running import keep, kept, script
 
 import farm
 from farm.arrays import FloatArray
@@ -200,7 +200,7 @@ def main() -> None:
     words.add_argument("--out", type=Path, default=TABLE)
     words.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
     given = words.parse_args()
-    rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
+    rows = kept(given.out)
     if not given.table:
         there = {(row["task"], row["method"], row["seed"]) for row in rows}
         cells = itertools.product(range(given.seeds), given.tasks, given.methods)
@@ -212,13 +212,9 @@ def main() -> None:
                     rows.append(
                         {"task": task, "method": method, "seed": seed} | {"rollouts": rollouts, "seconds": seconds}
                     )
-                    print(rows[-1], flush=True)
-                    with given.out.open("a") as file:
-                        file.write(json.dumps(rows[-1]) + "\n")
+                    keep(given.out, rows[-1])
     print("\n".join(table(sorted(rows, key=lambda row: list(TASKS).index(row["task"])))))
 
 
 if __name__ == "__main__":
-    from running import script
-
     script(main)

@@ -22,7 +22,6 @@ as docs/choosing.md says.
 """
 
 import argparse
-import json
 import math
 import statistics
 import sys
@@ -34,6 +33,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from running import keep, kept, script
 
 import farm
 from farm import seeds as streams
@@ -248,7 +248,7 @@ def main() -> None:
     words.add_argument("--out", type=Path, default=Path("own-tasks.jsonl"))
     words.add_argument("--table", action="store_true", help="print the file's table and compute nothing")
     given = words.parse_args()
-    rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
+    rows = kept(given.out)
     if not given.table:
         there = {(row["task"], row["method"], row["seed"], row["rollouts"]) for row in rows}
         cells = [
@@ -267,10 +267,9 @@ def main() -> None:
             for done in as_completed(waiting):
                 row = dict(zip(("task", "method", "seed", "rollouts"), waiting[done], strict=True))
                 rows.append(row | {"score": round(done.result(), 4)})
-                with given.out.open("a") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
+                keep(given.out, rows[-1])
     print("\n".join(table(row for row in rows if row["rollouts"] == given.rollouts and row["seed"] < given.seeds)))
 
 
 if __name__ == "__main__":
-    main()
+    script(main)

@@ -1,8 +1,10 @@
 """What the scripts of this folder share: how they end, and runs that an interrupted script continues."""
 
+import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
@@ -25,6 +27,18 @@ def script(main: Callable[[], None]) -> None:
     except FarmError as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(2 if isinstance(error, ConfigError) else 1)
+
+
+def kept(file: Path) -> list[dict[str, Any]]:
+    """Rows that a script has measured before, one of JSON per line; none without the file."""
+    return [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
+
+
+def keep(file: Path, row: Mapping[str, Any]) -> None:
+    """Add a row to the file and show it, so that an interrupted script continues after it."""
+    print(dict(row), flush=True)
+    with file.open("a", encoding="utf-8") as out:
+        out.write(json.dumps(row) + "\n")
 
 
 def learn_together(runs: Mapping[Path, RunConfig], where: Path, sharing: Sharing) -> None:

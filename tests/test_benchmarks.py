@@ -15,6 +15,7 @@ import pytest
 from farm.net.session import free_endpoint
 from farm.seeds import trial
 from farm.sim.sim import Sim
+from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
@@ -75,12 +76,12 @@ def test_the_cycles_estimate_tells_where_the_bar_is(monkeypatch: pytest.MonkeyPa
     def noted(sim: Sim) -> np.ndarray:
         observed: np.ndarray = observe(sim)
         estimates.append(sim.own["estimate"].copy())
-        places.append(sim.qpos[:, 8] / 0.012)
+        places.append((sim.qpos[:, len(JOINTS)] - runner.task.model.qpos0[len(JOINTS)]) / TIP_RADIUS)
         return observed
 
     monkeypatch.setattr(runner.task, "observe", noted)
     runner.rollouts(np.zeros((50, runner.size)), [trial(1, i) for i in range(50)])
-    place = np.concatenate(places) - runner.task.model.qpos0[8] / 0.012  # [fingertip radii]
+    place = np.concatenate(places)  # [fingertip radii]
     wrong = place - np.concatenate(estimates)
     assert np.mean(wrong**2) < 0.5 * np.mean(place**2), "more than half is known, from other starts"
 

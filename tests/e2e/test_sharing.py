@@ -30,7 +30,7 @@ def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:
     farm.start("worker", "--connect", endpoint, "--processes", "2")
     farm.wait_for(lambda: max(len(farm.progress(name)) for name in RUNS) >= GENERATIONS - 1, 120)
     done = sorted(len(farm.progress(name)) for name in RUNS)
-    assert 2 * done[0] > done[1], f"generations done: {done}"
+    assert done[0] > GENERATIONS / 2, f"generations done: {done}"
     for name, learner in learners.items():
         assert learner.wait(120) == 0
         farm.call("run", "--name", f"{name}-alone", *RUNS[name], *length)
