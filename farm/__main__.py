@@ -22,21 +22,21 @@ _PIPE: Final = 141
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; exit status 0, 1 for a failure, 2 for a mistake in its use."""
-    own = arguments is None  # a process of its own
+    standalone = arguments is None  # a process of its own
     try:
-        if own:
+        if standalone:
             _signals(signal.SIG_DFL)  # during imports there is nothing to save or to stop yet
             _streams()
-        status = _run(list(sys.argv[1:] if arguments is None else arguments), own=own)
+        status = _run(list(sys.argv[1:] if arguments is None else arguments), standalone=standalone)
         sys.stdout.flush()
     except (KeyboardInterrupt, SystemExit, Exception) as error:
         status = _ended(error)
-    if own:
+    if standalone:
         _signals(signal.SIG_DFL)
     return status
 
 
-def _run(words: Sequence[str], *, own: bool) -> int:
+def _run(words: Sequence[str], *, standalone: bool) -> int:
     name = words[0] if words else "--help"
     if name in ("-h", "--help", "help"):
         sys.stdout.write(_overview())
@@ -49,7 +49,7 @@ def _run(words: Sequence[str], *, own: bool) -> int:
     from farm import plugins
 
     command = plugins.find("commands", name).target
-    if own:
+    if standalone:
         _signals(signal.default_int_handler)  # unless a command decides otherwise, SIGTERM acts like Ctrl-C
     return int(command(words[1:]))
 
@@ -81,11 +81,11 @@ def _ended(error: BaseException) -> int:
     if isinstance(error, BrokenPipeError) or isinstance(unwritten, BrokenPipeError):
         return _PIPE  # the reader has ended, such as head
     if isinstance(error, KeyboardInterrupt | Interrupted):
-        said, status = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n", 130
+        text, status = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n", 130
     elif isinstance(error, FarmError):
-        said, status = f"farm: {printable(str(error))}\n", 2 if isinstance(error, ConfigError) else 1
+        text, status = f"farm: {printable(str(error))}\n", 2 if isinstance(error, ConfigError) else 1
     elif unwritten and isinstance(error, OSError):
-        said, status = f"farm: cannot write to standard output: {unwritten.strerror}\n", 1
+        text, status = f"farm: cannot write to standard output: {unwritten.strerror}\n", 1
     else:
         plugins = sys.modules.get("farm.plugins")  # not imported here: there may be no file left to open
         frames = (
@@ -95,9 +95,9 @@ def _ended(error: BaseException) -> int:
             raise error
         reason = _system(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         traced = printable("".join(frames), kept="\n")
-        said, status = f"{traced}farm: {printable(reason)}\n", 1
+        text, status = f"{traced}farm: {printable(reason)}\n", 1
     with suppress(OSError):
-        sys.stderr.write(said)
+        sys.stderr.write(text)
     return status
 
 

@@ -64,22 +64,22 @@ class Canary(Task):
 @cache
 def digest() -> str:
     """SHA-256 of the rollouts' results; takes less than a tenth of a second, once per process."""
-    hashed = hashlib.sha256()
+    sha256 = hashlib.sha256()
     task = Canary(TaskConfig())
     spec, runner = specification(task), None
     for name in plugins.BUILT_IN["policies"]:
         kind: Any = plugins.find("policies", name).target
         config = kind.Config(**_SETTINGS.get(name, {}))
-        drawn = {key: _numbers(values.shape) for key, values in kind.draw(config, spec, seeds.features(0)).items()}
+        constants = {key: _numbers(values.shape) for key, values in kind.draw(config, spec, seeds.features(0)).items()}
         if kind.standardised:
-            drawn |= {"origin": _numbers((spec.observation,)), "spread": 1.5 + _numbers((spec.observation,))}
-        policy: Policy = kind(config, spec, drawn)
+            constants |= {"origin": _numbers((spec.observation,)), "spread": 1.5 + _numbers((spec.observation,))}
+        policy: Policy = kind(config, spec, constants)
         runner = runner or Runner(task, policy)
         runner.policy = policy
         rollouts = runner.rollouts(0.3 * _numbers((2, policy.size)), [None, seeds.trial(0, 0)])
         for values in (rollouts.returns, rollouts.actions, rollouts.frames["qpos"]):
-            hashed.update(np.ascontiguousarray(values).tobytes())
-    return hashed.hexdigest()
+            sha256.update(np.ascontiguousarray(values).tobytes())
+    return sha256.hexdigest()
 
 
 def _numbers(shape: tuple[int, ...]) -> FloatArray:

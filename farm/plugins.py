@@ -139,11 +139,11 @@ class Plugin:
 
 def names(kind: str) -> dict[str, str]:
     """Names of the plug-ins of a kind, and the origin of each; files are not listed."""
-    found = dict.fromkeys(BUILT_IN[kind], "built in")
+    origins = dict.fromkeys(BUILT_IN[kind], "built in")
     for point in _points(kind):
-        if point.name not in found:
-            found[point.name] = _release(point)
-    return found
+        if point.name not in origins:
+            origins[point.name] = _release(point)
+    return origins
 
 
 def find(kind: str, name: str) -> Plugin:
@@ -156,35 +156,35 @@ def find(kind: str, name: str) -> Plugin:
     if path.endswith(".py"):
         where = Path(path).resolve()
         return _of_source(kind, where, _read(where, f"{_one(kind)} {where}"), inside)
-    own, _, variant = name.partition(":")
-    if own in BUILT_IN[kind]:
-        module, _, attribute = BUILT_IN[kind][own].partition(":")
+    base, _, variant = name.partition(":")
+    if base in BUILT_IN[kind]:
+        module, _, attribute = BUILT_IN[kind][base].partition(":")
         try:
-            found = Plugin(kind, name, getattr(load(module), attribute), variant)
+            plugin = Plugin(kind, name, getattr(load(module), attribute), variant)
         except ImportError as error:
             package = (error.name or "").partition(".")[0].replace("_", "-")  # only optional packages can be missing
-            raise ConfigError(f"{_one(kind)} {own!r} needs {package}: pip install {package}") from error
+            raise ConfigError(f"{_one(kind)} {base!r} needs {package}: pip install {package}") from error
     else:
-        found = _from_package(kind, own, variant)
-    takes = getattr(found.target, "takes", "")
+        plugin = _from_package(kind, base, variant)
+    takes = getattr(plugin.target, "takes", "")
     if bool(takes) != bool(variant):
-        raise ConfigError(f"{_one(kind)} {name[:80]!r}: expected {own}{f':{takes}' if takes else ''}")
-    return found
+        raise ConfigError(f"{_one(kind)} {name[:80]!r}: expected {base}{f':{takes}' if takes else ''}")
+    return plugin
 
 
-def _from_package(kind: str, own: str, variant: str) -> Plugin:
+def _from_package(kind: str, name: str, variant: str) -> Plugin:
     for point in _points(kind):
-        if point.name == own:
+        if point.name == name:
             try:
                 target = point.load()
             except Exception as error:  # whatever an import may raise
                 raise ConfigError(
-                    f"{_one(kind)} {own!r} of {_release(point)} cannot be imported: {type(error).__name__}: {error}"
+                    f"{_one(kind)} {name!r} of {_release(point)} cannot be imported: {type(error).__name__}: {error}"
                 ) from error
-            return Plugin(kind, f"{own}:{variant}" if variant else own, target, variant, _release(point))
-    known = ", ".join(names(kind))
-    files = "" if kind == "commands" else f", or FILE.py:CLASS{_beside(own)}"
-    raise ConfigError(f"unknown {_one(kind)} {own[:80]!r}; known are {known}{files}")
+            return Plugin(kind, f"{name}:{variant}" if variant else name, target, variant, _release(point))
+    listing = ", ".join(names(kind))
+    files = "" if kind == "commands" else f", or FILE.py:CLASS{_beside(name)}"
+    raise ConfigError(f"unknown {_one(kind)} {name[:80]!r}; known are {listing}{files}")
 
 
 def _beside(name: str) -> str:
@@ -203,14 +203,14 @@ def _beside(name: str) -> str:
 def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
     """A class's source; anything but a file of sensible name and size is refused before it is opened."""
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
             raise kind(f"{what}: it is not a file")
         if not FILE_NAME.fullmatch(path.name):
             raise kind(f"{what}: its name may have letters, digits, '_', '.', '-' and spaces only; rename it")
-        if found.st_size > SOURCE_LIMIT:
+        if status.st_size > SOURCE_LIMIT:
             raise kind(
-                f"{what} has {found.st_size} bytes; a class's file travels to workers and has at most {SOURCE_LIMIT}: "
+                f"{what} has {status.st_size} bytes; a class's file travels to workers and has at most {SOURCE_LIMIT}: "
                 "put data into a package"
             )
         return path.read_bytes()
@@ -224,9 +224,9 @@ def no_exit(call: Callable[P, T]) -> Callable[P, T]:
     """Let a sys.exit in a plug-in's code be an error of this function: it must not end a program of the farm."""
 
     @wraps(call)
-    def guarded(*values: P.args, **named: P.kwargs) -> T:
+    def guarded(*values: P.args, **keywords: P.kwargs) -> T:
         try:
-            return call(*values, **named)
+            return call(*values, **keywords)
         except SystemExit as error:
             last = author_frames(error)[-1:]
             where = "".join(f" in {Path(each.filename).name}, line {each.lineno}" for each in last)
@@ -240,8 +240,8 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
     target = getattr(module, inside, None)
     if not isinstance(target, type):
         classes = [(name, value) for name, value in vars(module).items() if isinstance(value, type)]
-        known = [name for name, value in classes if value.__module__ == module.__name__]
-        raise ConfigError(f"{path} has no class {inside!r}; it has {', '.join(known) or 'none'}")
+        here = [name for name, value in classes if value.__module__ == module.__name__]
+        raise ConfigError(f"{path} has no class {inside!r}; it has {', '.join(here) or 'none'}")
     return Plugin(kind, f"{path}:{inside}", target, file=path, source=source)
 
 
@@ -292,8 +292,8 @@ def author_traceback(error: BaseException) -> tuple[str, ...]:
         return ()
     plain = traceback.format_list([(*each,) for each in frames])  # without carets, which differ between releases
     text = "".join([*plain, *traceback.format_exception_only(error)])
-    shown = ("".join(letter if letter.isprintable() else "?" for letter in line) for line in text.splitlines())
-    return tuple(line[:_WIDTH] for line in shown)[-_LINES:]
+    lines = ("".join(letter if letter.isprintable() else "?" for letter in line) for line in text.splitlines())
+    return tuple(line[:_WIDTH] for line in lines)[-_LINES:]
 
 
 def named_file(wire: str) -> str:
@@ -324,26 +324,26 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
 @cache
 def code_digest(module: str) -> str:
     """SHA-256 of a module's source and of all modules that it imports from its own top-level package."""
-    said = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for name, source in sorted(_sources(module).items()):
-        said.update(name.encode() + b"\0" + source + b"\0")
-    return said.hexdigest()
+        sha256.update(name.encode() + b"\0" + source + b"\0")
+    return sha256.hexdigest()
 
 
 def _sources(module: str) -> dict[str, bytes]:
     """Sources of a module and of all modules that it imports, directly or not, from its own package."""
-    found: dict[str, bytes] = {}
+    sources: dict[str, bytes] = {}
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name in found:
+        if name in sources:
             continue
         spec = importlib.util.find_spec(name)
         if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
             continue
-        found[name] = Path(spec.origin).read_bytes()
-        waiting += _imports(found[name], spec.parent, module.partition(".")[0])
-    return found
+        sources[name] = Path(spec.origin).read_bytes()
+        waiting += _imports(sources[name], spec.parent, module.partition(".")[0])
+    return sources
 
 
 @cache  # task, policy and simulation share most of their modules
@@ -383,14 +383,14 @@ def load(module: str) -> Any:  # noqa: ANN401  a module
     """
     package = module.partition(".")[0]
     init = Path(__file__).parent.parent / package / "__init__.py"
-    known = sys.modules.get(package)
-    if known is None and package != "farm" and init.exists():
+    package_module = sys.modules.get(package)
+    if package_module is None and package != "farm" and init.exists():
         spec = importlib.util.spec_from_file_location(package, init, submodule_search_locations=[str(init.parent)])
         assert spec is not None
         assert spec.loader is not None
         sys.modules[package] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(sys.modules[package])
-    elif init.exists() and Path(str(getattr(known, "__file__", None) or "")) != init:
+    elif init.exists() and Path(str(getattr(package_module, "__file__", None) or "")) != init:
         raise ConfigError(f"a module named {package!r} that is not rolloutfarm's is loaded: import farm before it")
     return importlib.import_module(module)
 

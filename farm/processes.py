@@ -31,11 +31,11 @@ _QUOTA: Final = Path("/sys/fs/cgroup/cpu.max")
 
 def cores() -> int:
     """Cores that this process may use: those of its affinity, and not more than its container's share (cgroup v2)."""
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with suppress(OSError, ValueError):  # no Linux, no limit ("max")
         quota, period = map(int, _QUOTA.read_text("ascii").split())
-        own = min(own, max(1, math.ceil(quota / period)))
-    return own
+        count = min(count, max(1, math.ceil(quota / period)))
+    return count
 
 
 @contextmanager
@@ -45,11 +45,11 @@ def forks(count: int) -> "Iterator[list[Forked]]":
     What this process has imported they share. But threads (Zenoh's, Rerun's, CUDA's, those of linear algebra) would be
     gone in a fork, and what they have locked would stay locked.
     """
-    made = _forks(count)
+    processes = _forks(count)
     try:
-        yield made
+        yield processes
     finally:
-        end(made, _GRACE)
+        end(processes, _GRACE)
 
 
 def _forks(count: int) -> "list[Forked]":
@@ -67,19 +67,19 @@ class Forked:
 
     def __init__(self) -> None:
         """Start it, in a session of its own; its standard input closes when this process ends."""
-        read, write = os.pipe()
+        source, sink = os.pipe()
         both = (signal.SIGINT, signal.SIGTERM)  # the child must not handle them as this process does
         before = signal.pthread_sigmask(signal.SIG_BLOCK, both)
         self.pid = os.fork()
         if not self.pid:
-            os.dup2(read, 0)
+            os.dup2(source, 0)
             for number in both:
                 signal.signal(number, signal.SIG_DFL)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             _become_worker()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        os.close(read)
-        self.stdin = os.fdopen(write, "wb", 0)
+        os.close(source)
+        self.stdin = os.fdopen(sink, "wb", 0)
         self._status: int | None = None
 
     def begin(self, arguments: Sequence[str]) -> None:

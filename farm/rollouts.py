@@ -79,54 +79,54 @@ class Runner:
         Raises:
           UnservedError: the normaliser does not match the observations.
         """
-        theta, seeds, wanted = jobs.theta(mu), jobs.seeds(), normaliser.shape[-1]
-        around, own = self._normalised(normaliser)
-        elsewhere = jobs.physics & ~jobs.around & bool(wanted)  # a rollout of an earlier generation
+        theta, seeds, size = jobs.theta(mu), jobs.seeds(), normaliser.shape[-1]
+        around, earlier = self._normalised(normaliser)
+        elsewhere = jobs.physics & ~jobs.around & bool(size)  # a rollout of an earlier generation
         judged = (jobs.seen | ~jobs.explores) & ~jobs.physics & (self._judge is not self.sim)
-        seen: dict[int, Trajectory] = {}
+        trajectories: dict[int, Trajectory] = {}
         done: list[_Part] = []
-        for chosen, policy, sim, every in (
+        for mask, policy, sim, every in (
             (~jobs.physics & ~judged, around, self.sim, 0),
             (judged, around, self._judge, 0),
             (jobs.physics & ~elsewhere, around, self._judge, 1),
-            (elsewhere, own, self._judge, 1),
+            (elsewhere, earlier, self._judge, 1),
         ):
-            rows = np.flatnonzero(np.repeat(chosen, jobs.rollouts))
+            rows = np.flatnonzero(np.repeat(mask, jobs.rollouts))
             if not len(rows):
                 continue
-            some = (theta, seeds) if chosen.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
-            moments = bool(wanted) and not every
+            batch = (theta, seeds) if mask.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
+            moments = bool(size) and not every
             rollouts = loop.run(
-                self.task, policy, sim, *some, every, moments=moments, observed=traces == "steps" and not every
+                self.task, policy, sim, *batch, every, moments=moments, observed=traces == "steps" and not every
             )  # fmt: skip
-            for job in np.flatnonzero(jobs.seen & chosen).tolist():
+            for job in np.flatnonzero(jobs.seen & mask).tolist():
                 first = int(jobs.rollouts[:job].sum())
-                seen[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
+                trajectories[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
             done.append((rows, rollouts))
         returns = _placed(done, lambda part: part.returns)
         wanted_traces = traces if self.spec.traced or traces == "steps" else "none"
-        chosen = traced(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        selection = traced(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
             returns=returns,
             flags=_placed(done, lambda part: part.flags),
             steps=_placed(done, lambda part: part.steps),
-            traces=self._traces(done, chosen, steps=traces == "steps"),
-            trajectories=tuple(seen[job] for job in sorted(seen)),
+            traces=self._traces(done, selection, steps=traces == "steps"),
+            trajectories=tuple(trajectories[job] for job in sorted(trajectories)),
             measures=_placed(done, lambda part: part.measures) if self.spec.measures else np.empty((0, 0)),
             terms=_placed(done, lambda part: shares(self.task, part.terms, part.clamped))
             if terms
             else np.empty((0, 0)),
-            moments=_placed(done, lambda part: _moments(part, wanted)) if wanted else np.empty((0, 0)),
+            moments=_placed(done, lambda part: _moments(part, size)) if size else np.empty((0, 0)),
         )
 
-    def _traces(self, done: "list[_Part]", chosen: IntArray, *, steps: bool) -> AnyArray:
+    def _traces(self, done: "list[_Part]", selection: IntArray, *, steps: bool) -> AnyArray:
         """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
-        values = np.zeros((len(chosen), *(whole(self.spec) if steps else self.spec.trace)), dtype="<f4")
+        values = np.zeros((len(selection), *(whole(self.spec) if steps else self.spec.trace)), dtype="<f4")
         traces = stepped if steps else loop.traces
-        for rows, rollouts in done if len(chosen) else ():
-            mine = np.isin(chosen, rows)
-            if mine.any():
-                values[mine] = traces(self.task, self.spec, rollouts, np.searchsorted(rows, chosen[mine]))
+        for rows, rollouts in done if len(selection) else ():
+            mask = np.isin(selection, rows)
+            if mask.any():
+                values[mask] = traces(self.task, self.spec, rollouts, np.searchsorted(rows, selection[mask]))
         return values
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy]:
@@ -135,8 +135,8 @@ class Runner:
             raise UnservedError(f"a normaliser of {normaliser.shape[-1]} numbers, not {self.spec.observation}")
         if not normaliser.size:
             return self.policy, self.policy
-        around, own = (Normalised(self.policy, each) for each in normaliser)
-        return around, own
+        around, earlier = (Normalised(self.policy, each) for each in normaliser)
+        return around, earlier
 
     @plugins.no_exit
     def rollouts(self, theta: FloatArray, seeds: Sequence[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
@@ -159,11 +159,11 @@ _Part: TypeAlias = tuple[IntArray, loop.Rollouts]
 
 def _placed(parts: list[_Part], values: Callable[[loop.Rollouts], AnyArray]) -> AnyArray:
     """Values of all rollouts (S, ...), from those of each part."""
-    found = [values(rollouts) for _, rollouts in parts]
+    pieces = [values(rollouts) for _, rollouts in parts]
     if len(parts) == 1:  # the usual case: its rows are all rows
-        return found[0]
-    out = np.empty((sum(map(len, found)), *found[0].shape[1:]), found[0].dtype)
-    for (rows, _), each in zip(parts, found, strict=True):
+        return pieces[0]
+    out = np.empty((sum(map(len, pieces)), *pieces[0].shape[1:]), pieces[0].dtype)
+    for (rows, _), each in zip(parts, pieces, strict=True):
         out[rows] = each
     return out
 
@@ -265,17 +265,17 @@ def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple
     """The class named in a specification, if its code is the same as the learner's."""
     base = {"tasks": Task, "policies": Policy}[kind]
     from_file = plugins.named_file(name) != ""
-    found = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
-    if not (isinstance(found.target, type) and issubclass(found.target, base)):
+    plugin = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
+    if not (isinstance(plugin.target, type) and issubclass(plugin.target, base)):
         raise UnservedError(f"{name} is not a {base.__name__}")
     if from_file:
-        return found
-    if found.release != release:
-        own, there = found.release or "rolloutfarm", release or "rolloutfarm"
-        raise UnservedError(f"the run uses {name} of {there}, but here {name} belongs to {own}")
-    if found.digest() != digest:
+        return plugin
+    if plugin.release != release:
+        here, learners = (each or "rolloutfarm" for each in (plugin.release, release))
+        raise UnservedError(f"the run uses {name} of {learners}, but here {name} belongs to {here}")
+    if plugin.digest() != digest:
         raise UnservedError(f"its code of {name!r} differs from the learner's: {_SAME}")
-    return found
+    return plugin
 
 
 def backend(name: str) -> Backend:

@@ -119,7 +119,7 @@ def _check_kind(name: str, value: object, hint: Any, kinds: tuple[Any, ...]) -> 
     if kinds and type(value) not in kinds:
         names = ("nothing" if kind is type(None) else kind.__name__ for kind in kinds)
         raise ConfigError(f"{_flag(name)} is {value!r}; expected {' or '.join(names)}")
-    choices = [known for part in (hint, *get_args(hint)) if get_origin(part) is Literal for known in get_args(part)]
+    choices = [choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)]
     if choices and value is not None and value not in choices:
         raise ConfigError(f"unknown {_flag(name)} {value!r}; known are {', '.join(map(str, choices))}")
     if type(value) is float and not math.isfinite(value):
@@ -167,14 +167,14 @@ def from_dict(kind: type[C], values: object, where: str) -> C:
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where} is {str(values)[:80]!r}; expected a table of settings")
-    known = {each.name: each for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    unknown = [str(name)[:80] for name in values if name not in known]
+    names = {each.name: each for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = [str(name)[:80] for name in values if name not in names]
     if unknown:
-        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known are {', '.join(known) or 'none'}")
+        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known are {', '.join(names) or 'none'}")
     hints = _hints(kind)  # type: ignore[arg-type]
-    made = {name: _natural(value, hints[name]) for name, value in values.items()}
+    arguments = {name: _natural(value, hints[name]) for name, value in values.items()}
     try:
-        return kind(**made)
+        return kind(**arguments)
     except (ConfigError, TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: {error}") from None
 
@@ -197,47 +197,47 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
     import tyro  # only commands need it
 
     distinct(default, program)
-    said = io.StringIO()
-    shown = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")  # tyro reads its encoding
+    errors = io.StringIO()
+    page = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")  # tyro reads its encoding
     extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, arguments)}
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(shown):
+        with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(page):
             style = (tyro.conf.OmitArgPrefixes, tyro.conf.UseAppendAction)
             return tyro.cli(kind, prog=program, args=arguments, config=style, **extra)
     except SystemExit as end:
         if end.code:
-            raise ConfigError(_one_line(said.getvalue(), program)) from None
-        sys.stderr.write(said.getvalue())
-        shown.seek(0)
-        sys.stdout.write(_without_none(shown.read()))
+            raise ConfigError(_one_line(errors.getvalue(), program)) from None
+        sys.stderr.write(errors.getvalue())
+        page.seek(0)
+        sys.stdout.write(_without_none(page.read()))
         raise
 
 
 def _without_none(text: str) -> str:
     """Tyro's help text without "None" as a default or choice; its columns stay aligned."""
-    emptied = re.sub(_NO_DEFAULT, lambda found: re.sub(r"[^\s│]", " ", found[0]), text).splitlines(keepends=True)
-    kept = [
+    emptied = re.sub(_NO_DEFAULT, lambda match: re.sub(r"[^\s│]", " ", match[0]), text).splitlines(keepends=True)
+    lines = [
         line for old, line in zip(text.splitlines(), emptied, strict=True) if line.strip("│ \n") or old == line[:-1]
     ]
 
-    def given(line: str) -> str:
-        def without(found: re.Match[str]) -> str:
-            what = found[1] or "{" + found[2]
-            return what.ljust(len(found[0])) if line[0] in " │" else what
+    def shortened(line: str) -> str:
+        def without(match: re.Match[str]) -> str:
+            what = match[1] or "{" + match[2]
+            return what.ljust(len(match[0])) if line[0] in " │" else what
 
         return re.sub(_OR_NONE, without, line)
 
-    return "".join(map(given, kept))
+    return "".join(map(shortened, lines))
 
 
 def _emptied(default: C, arguments: Sequence[str]) -> C:
     """The defaults, with empty tuples for flags that are given: tyro would append to the default."""
-    given = {word.partition("=")[0] for word in arguments}
+    flags = {word.partition("=")[0] for word in arguments}
     out = copy.copy(default)
     for each in dataclasses.fields(default):  # type: ignore[arg-type]
         value = getattr(default, each.name)
         several = isinstance(value, tuple) or (isinstance(value, str) and _hints(type(default))[each.name] == Texts)
-        if several and f"--{_flag(each.name)}" in given:
+        if several and f"--{_flag(each.name)}" in flags:
             object.__setattr__(out, each.name, ())  # not checked here: the given values replace them
         elif several and isinstance(value, str):
             object.__setattr__(out, each.name, (value,))
@@ -266,7 +266,7 @@ def _one_line(box: str, program: str) -> str:
     """The error text of tyro, without its frame and repetition."""
     body = [line.strip(_FRAME) for line in box.splitlines()[1:]]
     first = next((i for i, line in enumerate(body) if not line), len(body))
-    said = " ".join(body[:first]).strip() or "these arguments make no sense"
+    sentence = " ".join(body[:first]).strip() or "these arguments make no sense"
     hints = [body[i + 1] for i, line in enumerate(body[:-1]) if line.startswith("Perhaps you meant")]
     hint = f"; did you mean {hints[0]}?" if hints else ""
-    return f"{said[0].lower()}{said[1:].rstrip('.')}{hint} (see {program} --help)"
+    return f"{sentence[0].lower()}{sentence[1:].rstrip('.')}{hint} (see {program} --help)"

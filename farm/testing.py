@@ -62,20 +62,20 @@ def same(
         raise ConfigError("there are no seeds; expected one for each rollout")
     if not update and not path.is_file():
         raise ConfigError(f"there is no file {path}: update=True (pytest --golden-update) writes it")
-    found = _simulated(_task(task), policy, words)
-    made = {
+    arrays = _simulated(_task(task), policy, words)
+    origin = {
         "seeds": [None if word is None else word[2] for word in words], "rolloutfarm": __version__,
         "mujoco": version("mujoco"), "numbers": fingerprint.digest()[:8],
     }  # fmt: skip
     if update:
-        _write(path, found, made)
+        _write(path, arrays, origin)
         return
-    kept, then = _read(path)
-    changed = [f"{name} {then.get(name)}, here {value}" for name, value in made.items() if then.get(name) != value]
-    difference = _difference(kept, found)
+    golden, then = _read(path)
+    changed = [f"{name} {then.get(name)}, here {value}" for name, value in origin.items() if then.get(name) != value]
+    difference = _difference(golden, arrays)
     if difference:
-        origin = f" (written with {'; '.join(changed)})" if changed else ""
-        raise AssertionError(f"{path}: {difference}{origin}. If this is meant: pytest --golden-update")
+        hint = f" (written with {'; '.join(changed)})" if changed else ""
+        raise AssertionError(f"{path}: {difference}{hint}. If this is meant: pytest --golden-update")
 
 
 def _word(seed: Any) -> Seed:  # noqa: ANN401  a user's
@@ -89,10 +89,10 @@ def _word(seed: Any) -> Seed:  # noqa: ANN401  a user's
 def _task(task: Any) -> Task:  # noqa: ANN401  a user's
     if isinstance(task, str):
         return build_task(plugins.find("tasks", task), {}, None)
-    found: object = task() if isinstance(task, type) else task
-    if not isinstance(found, Task):
-        raise ConfigError(f"task is a {type(found).__name__}; expected a farm.Task, its class, or its name")
-    return found
+    instance: object = task() if isinstance(task, type) else task
+    if not isinstance(instance, Task):
+        raise ConfigError(f"task is a {type(instance).__name__}; expected a farm.Task, its class, or its name")
+    return instance
 
 
 class _Function:
@@ -113,8 +113,8 @@ def _policy(policy: Any, task: Task, spec: TaskSpec) -> tuple[Acts, FloatArray]:
     if isinstance(policy, str):
         plugin = plugins.find("policies", policy)
         config = settings.from_dict(plugin.target.Config, {}, plugin.wire)
-        made = build_policy(plugin, config, spec, draw_constants(plugin, config, task, spec, seeds.features(0)))
-        return made, np.random.default_rng(0).normal(0.0, 0.5, made.size)
+        built = build_policy(plugin, config, spec, draw_constants(plugin, config, task, spec, seeds.features(0)))
+        return built, np.random.default_rng(0).normal(0.0, 0.5, built.size)
     if hasattr(policy, "problem"):  # a LoadedPolicy, of learner/
         return policy.problem.policy, policy.mu
     if not callable(policy):
@@ -126,26 +126,28 @@ def _simulated(task: Task, policy: Any, words: Sequence[Seed]) -> dict[str, AnyA
     """All that the rollouts give, by name: (B, T, ...), states with their start (B, T + 1, ...), or (B,)."""
     spec = specification(task)
     acts, theta = _policy(policy, task, spec)
-    many = np.repeat(theta[None], len(words), axis=0)
-    found = tried(task, len(words), lambda sim: loop.run(task, acts, sim, many, words))
-    states = {name: np.concatenate([found.start[name][:, None], after], 1) for name, after in found.frames.items()}
+    parameters = np.repeat(theta[None], len(words), axis=0)
+    rollouts = tried(task, len(words), lambda sim: loop.run(task, acts, sim, parameters, words))
+    states = {
+        name: np.concatenate([rollouts.start[name][:, None], after], 1) for name, after in rollouts.frames.items()
+    }
     return {
         **{f"state/{name}": values for name, values in states.items()},
-        "action": found.actions,
-        **{f"reward/{name}": found.terms[:, :, at] for at, name in enumerate(spec.terms)},
-        "steps": found.steps, "success": found.success, "failed": found.failed, "return": found.returns,
+        "action": rollouts.actions,
+        **{f"reward/{name}": rollouts.terms[:, :, at] for at, name in enumerate(spec.terms)},
+        "steps": rollouts.steps, "success": rollouts.success, "failed": rollouts.failed, "return": rollouts.returns,
     }  # fmt: skip
 
 
-def _difference(kept: dict[str, AnyArray], found: dict[str, AnyArray]) -> str:
+def _difference(golden: dict[str, AnyArray], arrays: dict[str, AnyArray]) -> str:
     """The first number that differs, in words; nothing if none does."""
-    if list(kept) != list(found):
-        return f"the arrays are {', '.join(found)}; they were {', '.join(kept)}"
-    for name, old in kept.items():
-        new = found[name]
+    if list(golden) != list(arrays):
+        return f"the arrays are {', '.join(arrays)}; they were {', '.join(golden)}"
+    for name, old in golden.items():
+        new = arrays[name]
         if (old.shape, old.dtype) != (new.shape, new.dtype):
             return f"{name} has shape {new.shape} of {new.dtype}; it had {old.shape} of {old.dtype}"
-    unlike = {name: _unlike(old, found[name]) for name, old in kept.items()}
+    unlike = {name: _unlike(old, arrays[name]) for name, old in golden.items()}
     wrong = np.any([values.reshape(len(values), -1).any(axis=1) for values in unlike.values()], axis=0)
     if not wrong.any():
         return ""
@@ -153,7 +155,7 @@ def _difference(kept: dict[str, AnyArray], found: dict[str, AnyArray]) -> str:
     firsts = {name: np.argwhere(values[rollout]) for name, values in unlike.items()}
     name = min((name for name in firsts if len(firsts[name])), key=lambda name: _moment(name, firsts[name][0]))
     index = tuple(firsts[name][0].tolist())
-    before, now = (values[name][rollout][index].item() for values in (kept, found))
+    before, now = (values[name][rollout][index].item() for values in (golden, arrays))
     inner = "".join(f"[{each}]" for each in index[1:])
     return (
         f"rollout {rollout}{_when(name, index)}: {name}{inner} was {before!r}, is {now!r}; "
@@ -181,8 +183,8 @@ def _unlike(old: AnyArray, new: AnyArray) -> AnyArray:
     return np.ascontiguousarray(old).view(np.int64) != np.ascontiguousarray(new).view(np.int64)
 
 
-def _write(path: Path, found: dict[str, AnyArray], made: dict[str, Any]) -> None:
-    content, arrays = io.BytesIO(), {_MADE: np.array(json.dumps(made)), **found}
+def _write(path: Path, golden: dict[str, AnyArray], origin: dict[str, Any]) -> None:
+    content, arrays = io.BytesIO(), {_MADE: np.array(json.dumps(origin)), **golden}
     np.savez_compressed(content, allow_pickle=False, **arrays)
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -194,7 +196,7 @@ def _write(path: Path, found: dict[str, AnyArray], made: dict[str, Any]) -> None
 def _read(path: Path) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     try:
         with np.load(path, allow_pickle=False) as stored:
-            kept = {name: stored[name] for name in stored.files}
-        return kept, dict(json.loads(str(kept.pop(_MADE))))
+            arrays = {name: stored[name] for name in stored.files}
+        return arrays, dict(json.loads(str(arrays.pop(_MADE))))
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise ConfigError(f"{path} holds no golden rollouts ({type(error).__name__}): remove it, and update") from None

@@ -36,9 +36,9 @@ def main(words: Sequence[str]) -> int:
         LocalWorkers(processes, _flags(command), forked) as pool,
     ):
         while not stop.wait(0.2):
-            ended = pool.tend()
-            if ended and not pool.pids:
-                if max(ended) == 2:
+            statuses = pool.tend()
+            if statuses and not pool.pids:
+                if max(statuses) == 2:
                     raise ConfigError("the workers could not start; see their messages above")
                 raise FarmError("no worker is left; see their messages above")
     return 0

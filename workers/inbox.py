@@ -109,8 +109,8 @@ class Inbox:
 
     def left(self, run: str) -> RoundHeader | None:
         """Drop a run whose learner left; returns its last header."""
-        gone = self._runs.pop(run, None)
-        return gone.header if gone else None
+        messages = self._runs.pop(run, None)
+        return messages.header if messages else None
 
     def _make_room(self, message: RoundHeader | Chunk) -> None:
         """Make sure that a message fits into memory: drop other runs' messages, oldest first; they are requested again.

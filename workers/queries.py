@@ -28,13 +28,13 @@ class Queries:
 
     def ask(self, run: str, key: str, seconds: float = ASK) -> bytes | None:
         """The answer of a run's learner, or None."""
-        begun = time.monotonic()
-        if begun < self._mute.get(run, self._others):
+        start = time.monotonic()
+        if start < self._mute.get(run, self._others):
             return None
         payload = self._session.ask(key, seconds)
         if payload is None:
             now = time.monotonic()
-            self._others = now + _MUTE * (now - begun)
+            self._others = now + _MUTE * (now - start)
             if run in self._mute:
                 self._mute[run] = self._others
         return payload

@@ -94,14 +94,14 @@ def receive(link: socket.socket, kind: type[M], seconds: float | None = None) ->
 
 
 def _exactly(link: socket.socket, count: int, until: float | None) -> bytearray:
-    read = bytearray()
-    while len(read) < count:
+    content = bytearray()
+    while len(content) < count:
         link.settimeout(None if until is None else max(1e-3, until - time.monotonic()))
-        part = link.recv(min(count - len(read), 1 << 20))
+        part = link.recv(min(count - len(content), 1 << 20))
         if not part:
             raise ConnectionResetError("the other side is gone")
-        read += part
-    return read
+        content += part
+    return content
 
 
 def serve(link: socket.socket) -> None:

@@ -54,8 +54,8 @@ class Runners:
                 self._built[header.spec] = runner
                 log.info("serving run %s", header.run)
             except Exception as error:  # says something about this machine, and nothing about the jobs
-                shown = error if is_defect(error) else None
-                self._notices.once(f"cannot serve run {header.run}: {error}", level=logging.ERROR, error=shown)
+                defect = error if is_defect(error) else None
+                self._notices.once(f"cannot serve run {header.run}: {error}", level=logging.ERROR, error=defect)
                 self._built[header.spec] = error
             self._let_go()
         self._built.move_to_end(header.spec)
@@ -95,9 +95,9 @@ class Runners:
         """The runner of a run's jobs; None if a source file is unavailable."""
         files = list(self._config.allow_file)
         here = {(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file()}
-        named = {(plugins.named_file(spec.task), spec.code.get("task", "")),
+        sources = {(plugins.named_file(spec.task), spec.code.get("task", "")),
                  (plugins.named_file(spec.policy), spec.code.get("policy", ""))}  # fmt: skip
-        travels = sorted((name, digest) for name, digest in named - here if name)
+        travels = sorted((name, digest) for name, digest in sources - here if name)
         contents = self._assets(run, spec)
         if contents is None:
             return None

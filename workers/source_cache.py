@@ -86,9 +86,9 @@ class SourceCache:
         """
         if len(content) > FILE_LIMIT or digest_of(content) != digest:
             raise UnservedError(f"a received file of {len(content)} bytes does not match its digest, or is too large")
-        held = sum(path.stat().st_size for path in self.assets.iterdir())
-        if held + len(content) > _ASSETS:
-            raise UnservedError(f"this worker holds {held >> 20} MiB of models' files and takes no more: restart it")
+        total = sum(path.stat().st_size for path in self.assets.iterdir())
+        if total + len(content) > _ASSETS:
+            raise UnservedError(f"this worker holds {total >> 20} MiB of models' files and takes no more: restart it")
         (self.assets / digest).write_bytes(content)
 
     def close(self) -> None:

@@ -31,12 +31,12 @@ class RunnerProcess:
 
     def __init__(self, folder: Path) -> None:
         """Start it in a folder."""
-        self._link, theirs = socket.socketpair()
-        with theirs:
+        self._link, far_end = socket.socketpair()
+        with far_end:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "workers.runner_process", str(theirs.fileno())],
+                [sys.executable, "-P", "-m", "workers.runner_process", str(far_end.fileno())],
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder,
-                env={name: os.environ[name] for name in _KEPT if name in os.environ}, pass_fds=(theirs.fileno(),),
+                env={name: os.environ[name] for name in _KEPT if name in os.environ}, pass_fds=(far_end.fileno(),),
                 start_new_session=True,
             )  # fmt: skip
         self.pid = self._process.pid

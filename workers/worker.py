@@ -200,9 +200,9 @@ class Worker:
 
     def _do(self, chunk: Chunk, runner: AnyRunner, header: RoundHeader, jobs: Jobs) -> None:
         """Run some of a chunk's jobs and publish the results."""
-        begun = time.monotonic()
+        start = time.monotonic()
         simulated = runner.run(header.mu, jobs, header.traces, header.normaliser, terms=header.terms)
-        self._answer(chunk, Results.carrying(simulated, jobs, time.monotonic() - begun, **self._head(chunk)))
+        self._answer(chunk, Results.carrying(simulated, jobs, time.monotonic() - start, **self._head(chunk)))
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
         lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)

@@ -147,8 +147,8 @@ class _OneFriction(FingerGait):
     factor = 1.0
     """Factor of all friction coefficients."""
 
-    def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
-        super()._set_conditions(sim, [replace(each, friction=self.factor) for each in drawn])
+    def _set_conditions(self, sim: Sim, perturbations: Sequence[Perturbation]) -> None:
+        super()._set_conditions(sim, [replace(each, friction=self.factor) for each in perturbations])
 
 
 def _at_friction(policy: LoadedPolicy, factor: float) -> LoadedPolicy:

@@ -139,8 +139,8 @@ def _issue(
             aside = command.dir / f".{folder.name}.new"
             shutil.rmtree(aside, ignore_errors=True)
             undo.callback(shutil.rmtree, aside, ignore_errors=True)
-            own = () if role != "learner" else command.learner if hosts is None else hosts
-            authority.issue(aside, role, name, command.days, own)
+            names = () if role != "learner" else command.learner if hosts is None else hosts
+            authority.issue(aside, role, name, command.days, names)
             moves.append((aside, folder))
             roster[f"{role}s"] = sorted({name, *roster.get(f"{role}s", [])})
         for aside, folder in moves:
@@ -179,13 +179,13 @@ def _hosts(folder: Path) -> tuple[str, ...]:
 @contextmanager
 def _all_or_nothing(folder: Path) -> Iterator[None]:
     """Remove everything from a folder that could not be filled completely."""
-    there = folder.exists()
+    existed = folder.exists()
     try:
         yield
     except BaseException:
         for path in folder.iterdir() if folder.exists() else ():
             shutil.rmtree(path, ignore_errors=True)
-        if not there and folder.exists():
+        if not existed and folder.exists():
             folder.rmdir()
         raise
 

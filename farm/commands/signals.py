@@ -17,7 +17,7 @@ INTERRUPTED: Final = 130
 def stop_flag(doing: str = "ending") -> Iterator[threading.Event]:
     """Set by the first Ctrl-C or SIGTERM, with a message; a second Ctrl-C ends the program at once."""
     flag = threading.Event()
-    said = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
     def handle(number: int, _: object) -> None:
         if flag.is_set() and number == signal.SIGINT:
@@ -26,9 +26,9 @@ def stop_flag(doing: str = "ending") -> Iterator[threading.Event]:
             flag.set()
             # On a separate thread: this one may be in the middle of writing a message.
             # The space separates it from the ^C that a terminal shows.
-            threading.Thread(target=log.warning, args=(" %s: %s", said[signal.Signals(number)], doing)).start()
+            threading.Thread(target=log.warning, args=(" %s: %s", names[signal.Signals(number)], doing)).start()
 
-    before = {number: signal.signal(number, handle) for number in said}
+    before = {number: signal.signal(number, handle) for number in names}
     try:
         yield flag
     finally:

@@ -89,9 +89,11 @@ def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
 
 
 def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
-    shown = [] if bundle is None else [plain(f"as {bundle.role} {bundle.name}, by the certificate in {bundle.folder}")]
+    heading = (
+        [] if bundle is None else [plain(f"as {bundle.role} {bundle.name}, by the certificate in {bundle.folder}")]
+    )
     if not runs:
-        return Group(*shown, "no runs: no learner answers")
+        return Group(*heading, "no runs: no learner answers")
     table = compact(time.strftime("runs at %H:%M:%S"))
     for name in ("run", "generation", "return", "mean policy", "open", "reissued", "refused", "numbers", "ignored"):
         table.add_column(name, justify="left" if name in ("run", "numbers", "ignored") else "right", overflow="fold")
@@ -118,7 +120,7 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
             workers.add_row(*map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored))))
-    return Group(*shown, table, workers)
+    return Group(*heading, table, workers)
 
 
 def _counts(ignored: Mapping[str, int]) -> str:

@@ -159,9 +159,9 @@ def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
     if unknown or missing:
         names = ", ".join(sorted(str(name)[:40] for name in unknown | missing))
         raise MessageError(f"{kind.__name__}: unknown or missing {names}")
-    made = {name: check(value[name]) for name, check in fields.items() if name in value}
+    arguments = {name: check(value[name]) for name, check in fields.items() if name in value}
     try:
-        return kind(**made)
+        return kind(**arguments)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise MessageError(f"{kind.__name__}: {error}") from None
 
@@ -193,8 +193,8 @@ def _check(name: str, hint: Any, metadata: Mapping[str, Any]) -> Check:  # noqa:
     if "dtype" in metadata:
         return functools.partial(_array, name, metadata["dtype"], metadata["ndim"])
     if origin is types.UnionType:
-        some = _check(name, next(h for h in inner if h is not type(None)), metadata)
-        return lambda value: None if value is None else some(value)
+        check = _check(name, next(h for h in inner if h is not type(None)), metadata)
+        return lambda value: None if value is None else check(value)
     if origin is tuple:
         return functools.partial(_tuple, name, hint, _check(name, inner[0], metadata))
     if dataclasses.is_dataclass(hint):

@@ -50,8 +50,8 @@ class WorkRequest:
     """Number of ignored messages by kind."""
 
     def __post_init__(self) -> None:
-        for said in (self.worker, self.version, self.canary, self.host):
-            if len(said) > _SHORT or not said.isprintable():
+        for text in (self.worker, self.version, self.canary, self.host):
+            if len(text) > _SHORT or not text.isprintable():
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
         if len(self.idle) > _RUNS:
             raise ValueError(f"{len(self.idle)} runs")

@@ -195,16 +195,16 @@ class Session:
 
 def _as_daemon(declare: Callable[[], _T]) -> _T:
     """Declare on a daemon thread: Zenoh's callback threads inherit this, and do not keep a program from ending."""
-    made: Future[_T] = Future()
+    result: Future[_T] = Future()
 
     def run() -> None:
         try:
-            made.set_result(declare())
+            result.set_result(declare())
         except BaseException as error:
-            made.set_exception(error)
+            result.set_exception(error)
 
     threading.Thread(target=run, daemon=True).start()
-    return made.result()
+    return result.result()
 
 
 def _address(link: zenoh.Link) -> str:
@@ -276,7 +276,7 @@ def _try(
     bundle: Bundle | None,
 ) -> zenoh.Session:
     where = ", ".join(endpoints)
-    begun = told = time.monotonic()
+    start = reminder = time.monotonic()
     while True:
         try:
             return _open(settings)
@@ -284,20 +284,22 @@ def _try(
             now = time.monotonic()
             if stopped():
                 raise Interrupted(f"stopped before {where} answered") from None
-            if timeout is not None and now - begun > timeout:
+            if timeout is not None and now - start > timeout:
                 raise FarmError(
                     f"no answer from {where} after {timeout:g} s: {_why(endpoints, bundle, error)}"
                 ) from None
-            if now - told >= _REMIND or told == begun:
-                told = now
+            if now - reminder >= _REMIND or reminder == start:
+                reminder = now
                 log.warning("no answer from %s yet, trying again: %s", where, _why(endpoints, bundle, error))
             time.sleep(0.1)  # zenoh itself waits up to _OPEN_S for an address that does not refuse
 
 
 def _why(endpoints: tuple[str, ...], bundle: Bundle | None, error: Exception) -> str:
     """Why none of the endpoints answers; if a probe finds nothing, in Zenoh's words."""
-    found = [probe.reason(endpoint, bundle) or f"no learner or router ({_first_line(error)})" for endpoint in endpoints]
-    return "; ".join(found if len(found) == 1 else map(": ".join, zip(endpoints, found, strict=True)))
+    reasons = [
+        probe.reason(endpoint, bundle) or f"no learner or router ({_first_line(error)})" for endpoint in endpoints
+    ]
+    return "; ".join(reasons if len(reasons) == 1 else map(": ".join, zip(endpoints, reasons, strict=True)))
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:

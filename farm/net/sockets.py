@@ -40,11 +40,11 @@ def raise_descriptors() -> None:
     except ImportError:
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
+    limit = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < limit:
         with suppress(ValueError):  # macOS has a smaller limit than its "infinite" one
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-            soft = wanted
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+            soft = limit
     if soft != resource.RLIM_INFINITY and soft < _FEWEST:
         raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
 
@@ -58,14 +58,14 @@ def silence(peers: Collection[str]) -> None:
     is closed instead would be opened again within milliseconds, and each time costs a handshake: only on systems other
     than Linux, whose sockets take no filter. A system without a list of a process's descriptors changes nothing.
     """
-    for own in _connections() if peers else ():
-        with own, suppress(OSError):
-            host, port, *_ = own.getpeername()
+    for connection in _connections() if peers else ():
+        with connection, suppress(OSError):
+            host, port, *_ = connection.getpeername()
             if f"[{host}]:{port}" in peers or f"{host}:{port}" in peers:
                 if sys.platform == "linux":
-                    own.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, _FILTER)
+                    connection.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, _FILTER)
                 else:
-                    own.shutdown(socket.SHUT_RDWR)
+                    connection.shutdown(socket.SHUT_RDWR)
 
 
 def _connections() -> Iterator[socket.socket]:
@@ -74,8 +74,8 @@ def _connections() -> Iterator[socket.socket]:
         for number in [int(path.name) for path in _OPEN.iterdir()]:
             with suppress(OSError):  # closed in the meantime
                 if stat.S_ISSOCK(os.fstat(number).st_mode):
-                    own = socket.socket(fileno=os.dup(number))
-                    if own.family in (socket.AF_INET, socket.AF_INET6):
-                        yield own
+                    connection = socket.socket(fileno=os.dup(number))
+                    if connection.family in (socket.AF_INET, socket.AF_INET6):
+                        yield connection
                     else:
-                        own.close()
+                        connection.close()

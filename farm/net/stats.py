@@ -64,16 +64,16 @@ class GenerationStats:
         version = values.get("version") if isinstance(values, dict) else None
         if type(version) is not int or version != VERSION:
             raise ValueError(f"not a line of progress.jsonl, version {VERSION}: {str(values)[:80]}")
-        known = [f for f in fields(cls) if f.name in values]
-        missing = [f.name for f in fields(cls) if f not in known and f.default_factory is MISSING]
+        present = [f for f in fields(cls) if f.name in values]
+        missing = [f.name for f in fields(cls) if f not in present and f.default_factory is MISSING]
         if missing:
             raise ValueError(f"progress line without {', '.join(missing)}")
-        for f in known:
+        for f in present:
             if not isinstance(values[f.name], dict if get_origin(f.type) is dict else cast("type", f.type)):
                 raise ValueError(f"progress line whose {f.name} is {str(values[f.name])[:40]!r}")
-        given: dict[str, Any] = {f.name: values[f.name] for f in known}
-        found = cls(**given)
-        for each in (*found.measures.values(), *found.mean_policy_measures.values()):
+        arguments: dict[str, Any] = {f.name: values[f.name] for f in present}
+        stats = cls(**arguments)
+        for each in (*stats.measures.values(), *stats.mean_policy_measures.values()):
             if not isinstance(each, int | float | None):
                 raise ValueError(f"progress line with a measure that is {str(each)[:40]!r}")
-        return found
+        return stats

@@ -92,15 +92,15 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
         return bundle
     if role == "learner":
         return _read(folder / "learner", role)
-    wanted = folder / f"{role}-{name}"
-    if name and wanted.is_dir():
-        return _read(wanted, role)
-    found = sorted(folder.glob(f"{role}-*/cert.pem"))
-    if len(found) == 1 and not name:
-        return _read(found[0].parent, role)
-    if not found:
+    subfolder = folder / f"{role}-{name}"
+    if name and subfolder.is_dir():
+        return _read(subfolder, role)
+    certificates = sorted(folder.glob(f"{role}-*/cert.pem"))
+    if len(certificates) == 1 and not name:
+        return _read(certificates[0].parent, role)
+    if not certificates:
         raise ConfigError(f"{folder} holds no {role}'s certificate: {_ADD.format(folder, role=role)}")
-    names = ", ".join(path.parent.name.removeprefix(f"{role}-") for path in found)
+    names = ", ".join(path.parent.name.removeprefix(f"{role}-") for path in certificates)
     raise ConfigError(f"{folder} holds certificates for these {role}s: {names}; choose one with --name")
 
 
@@ -146,9 +146,9 @@ def _expiry(path: Path) -> datetime:
 
 def private(key: Path) -> None:
     """Check that other users cannot read one of our keys; raises ConfigError otherwise, like ssh."""
-    found = key.stat()
-    if found.st_uid == os.getuid() and found.st_mode & 0o077:
-        mode = stat.S_IMODE(found.st_mode)
+    status = key.stat()
+    if status.st_uid == os.getuid() and status.st_mode & 0o077:
+        mode = stat.S_IMODE(status.st_mode)
         raise ConfigError(f"{key} can be read by other users (mode {mode:04o}): chmod 600 {key}")
 
 
@@ -159,16 +159,16 @@ def access_control(farm: str, roster: Roster) -> dict[str, Any]:
     subjects: list[dict[str, Any]] = []
 
     def admit(name: str, parts: list[tuple[str, list[str], list[str]]]) -> None:
-        own = [
+        entries = [
             {
                 "id": f"{name} {i}", "permission": "allow", "flows": [flow],
                 "messages": messages, "key_exprs": expressions,
             }
             for i, (flow, messages, expressions) in enumerate(parts)
         ]  # fmt: skip
-        rules.extend(own)
+        rules.extend(entries)
         subjects.append({"id": name, "cert_common_names": [name]})
-        policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
+        policies.append({"rules": [rule["id"] for rule in entries], "subjects": [name]})
 
     for name in roster.workers:
         admit(name, _worker(farm, name))
@@ -186,17 +186,17 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
     """What a worker may send and receive."""
-    own, told = f"{name}/**", keys.generation(farm, "*")
-    asked = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), keys.asset(farm, "*", "*"), told]
-    sent = [keys.inbox(farm, own), keys.refused(farm, own), told]
+    mine, rounds = f"{name}/**", keys.generation(farm, "*")
+    queries = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), keys.asset(farm, "*", "*"), rounds]
+    messages = [keys.inbox(farm, mine), keys.refused(farm, mine), rounds]
     return [
-        ("ingress", ["put"], [keys.want(farm, own), keys.result(farm, "*", own)]),
-        ("ingress", ["declare_subscriber"], sent),
-        ("ingress", ["query"], asked),
-        ("ingress", _TOKENS, [keys.worker_token(farm, own)]),
+        ("ingress", ["put"], [keys.want(farm, mine), keys.result(farm, "*", mine)]),
+        ("ingress", ["declare_subscriber"], messages),
+        ("ingress", ["query"], queries),
+        ("ingress", _TOKENS, [keys.worker_token(farm, mine)]),
         ("ingress", _WATCHES, [keys.learner_token(farm, "*")]),
-        ("egress", ["put"], sent),
-        ("egress", ["reply", "declare_queryable"], asked),
+        ("egress", ["put"], messages),
+        ("egress", ["reply", "declare_queryable"], queries),
         ("egress", _TOKENS, [keys.learner_token(farm, "*")]),
         # The learners' own wildcard subscriptions; without them the worker would see no receivers.
         ("egress", ["declare_subscriber"], [keys.want(farm, "**"), keys.result(farm, "*", "**")]),
@@ -206,16 +206,16 @@ def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
 
 def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
     """A viewer may see learners, workers, the runs' descriptions and their reports."""
-    told = [keys.generation(farm, "*"), keys.report(farm, "*"), keys.history(farm, "*")]
+    reports = [keys.generation(farm, "*"), keys.report(farm, "*"), keys.history(farm, "*")]
     names = (keys.spec, keys.generation, keys.status, keys.history)
-    asked = [*(name(farm, "*") for name in names), keys.asset(farm, "*", "*")]
+    queries = [*(name(farm, "*") for name in names), keys.asset(farm, "*", "*")]
     tokens = [keys.learner_token(farm, "*"), keys.worker_token(farm, "**")]
     return [
-        ("ingress", ["declare_subscriber"], told),
-        ("ingress", ["query"], asked),
+        ("ingress", ["declare_subscriber"], reports),
+        ("ingress", ["query"], queries),
         ("ingress", _WATCHES, tokens),
-        ("egress", ["put"], told),
-        ("egress", ["reply", "declare_queryable"], asked),
+        ("egress", ["put"], reports),
+        ("egress", ["reply", "declare_queryable"], queries),
         ("egress", _TOKENS, tokens),
     ]
 

@@ -155,12 +155,12 @@ class Jobs:
             out[explores] += signs[explores] * self.eps[at[rows[explores]]]
         return out
 
-    def take(self, chosen: Sequence[int]) -> "Jobs":
+    def take(self, positions: Sequence[int]) -> "Jobs":
         """Select jobs by position; views of the arrays if the positions are consecutive."""
-        first, end = chosen[0], chosen[-1] + 1
-        if list(chosen) == list(range(first, end)):
+        first, end = positions[0], positions[-1] + 1
+        if list(positions) == list(range(first, end)):
             return Jobs(table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]])
-        table, before = self.table[list(chosen)], np.array([self._before[at] for at in chosen])
+        table, before = self.table[list(positions)], np.array([self._before[at] for at in positions])
         return Jobs(table=table, eps=self.eps[before[table[:, _EXPLORES] != 0]])
 
     @cached_property
@@ -268,12 +268,11 @@ class Results(Simulated):
 
     @classmethod
     def carrying(
-        cls, given: Simulated, jobs: Jobs, seconds: float, *, run: str, incarnation: str, round: int, worker: str
+        cls, simulated: Simulated, jobs: Jobs, seconds: float, *, run: str, incarnation: str, round: int, worker: str
     ) -> "Results":
         """A message with the results of jobs, whose indices are ascending."""
-        own: dict[str, Any] = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
-        own["seconds"] = seconds
-        return cls(**own, jobs=np.ascontiguousarray(jobs.indices), **vars(given))
+        head: dict[str, Any] = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
+        return cls(**head, seconds=seconds, jobs=np.ascontiguousarray(jobs.indices), **vars(simulated))
 
 
 def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
@@ -289,8 +288,8 @@ def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
         return among
     if traces == "none" or not among.size:
         return among[:0]
-    theirs = returns[among]
-    return among[sorted({int(theirs.argmax()), int(theirs.argmin())})]
+    candidates = returns[among]
+    return among[sorted({int(candidates.argmax()), int(candidates.argmin())})]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -100,17 +100,17 @@ def router_settings(
         secured["access_control"] = access_control(farm, bundle.roster())
     settings = {**_COMMON, **_ROUTER, **secured, "listen/endpoints": [endpoint]}
     if routers:
-        joined = bundle.settings("connect") if bundle else {}
-        settings |= {"connect/endpoints": list(routers), **_RETRY, **joined}
+        credentials = bundle.settings("connect") if bundle else {}
+        settings |= {"connect/endpoints": list(routers), **_RETRY, **credentials}
     return settings
 
 
 def _limits(farm: str) -> dict[str, object]:
     """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over one link."""
-    asked, common = keys.want(farm, "**"), {"flows": ["ingress"], "messages": ["put"]}
+    requests, common = keys.want(farm, "**"), {"flows": ["ingress"], "messages": ["put"]}
     return {
-        "low_pass_filter": [{**common, "key_exprs": [asked], "size_limit": _REQUEST}],
-        "downsampling": [{**common, "rules": [{"key_expr": asked, "freq": _REQUESTS}]}],
+        "low_pass_filter": [{**common, "key_exprs": [requests], "size_limit": _REQUEST}],
+        "downsampling": [{**common, "rules": [{"key_expr": requests, "freq": _REQUESTS}]}],
     }
 
 

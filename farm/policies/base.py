@@ -165,8 +165,8 @@ def check_constants(constants: Mapping[str, FloatArray], shapes: Mapping[str, tu
     """
     for name, shape in shapes.items():
         if name not in constants or constants[name].shape != shape:
-            found = constants[name].shape if name in constants else "missing"
-            raise UnservedError(f"constant {name!r} of the policy is {found}; expected an array of shape {shape}")
+            shape_here = constants[name].shape if name in constants else "missing"
+            raise UnservedError(f"constant {name!r} of the policy is {shape_here}; expected an array of shape {shape}")
 
 
 def check_vector(name: str, values: Any, size: int | None = None) -> None:  # noqa: ANN401  what a policy gave

@@ -87,8 +87,8 @@ class Direct(Policy):
         self._dtype = np.dtype("<f4" if single else "<f8")
         # One contiguous row per number of x: W x is then d multiply-adds of (D,) vectors, in order.
         rows = np.ascontiguousarray((constants["frequencies"] / self.config.bandwidth).T)
-        given = rows / unit, constants["phases"] / unit, np.sqrt(2.0 / count)
-        self._rows, self._phases, self._scale = (np.asarray(values, dtype=self._dtype) for values in given)
+        arrays = rows / unit, constants["phases"] / unit, np.sqrt(2.0 / count)
+        self._rows, self._phases, self._scale = (np.asarray(values, dtype=self._dtype) for values in arrays)
         self._together = max(1, _CACHED // count)  # observations, whose features stay in a core's cache
 
     @classmethod

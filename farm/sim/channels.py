@@ -101,18 +101,18 @@ class Channel:
         if not isinstance(shape, tuple | list) or not all(type(each) is int for each in shape):
             raise ConfigError(f"channel {self.name}: shape is {shape!r}; expected a tuple of whole numbers, as (3,)")
         for what in ("labels", "bodies", "geoms"):
-            given: object = getattr(self, what)
-            if not isinstance(given, tuple | list) or not all(isinstance(each, str) for each in given):
-                raise ConfigError(f"channel {self.name}: {what} is {given!r:.60}; expected a tuple of texts")
+            texts: object = getattr(self, what)
+            if not isinstance(texts, tuple | list) or not all(isinstance(each, str) for each in texts):
+                raise ConfigError(f"channel {self.name}: {what} is {texts!r:.60}; expected a tuple of texts")
         for colour in self.colours:
             if not isinstance(colour, tuple | list) or len(colour) != 3 or not all(c in range(256) for c in colour):
                 raise ConfigError(f"channel {self.name}: colour {colour!r}; expected red, green, blue from 0 to 255")
 
     def vectors(self, values: FloatArray) -> FloatArray:
         """Arrows' vectors (..., n, 3) as they are drawn, from values (..., n, 6) [m]."""
-        drawn = values[..., 3:] * self.length
-        extent = np.linalg.norm(drawn, axis=-1, keepdims=True)
-        return drawn * np.minimum(1.0, self.longest / np.where(extent > 0, extent, 1.0))
+        vectors = values[..., 3:] * self.length
+        extent = np.linalg.norm(vectors, axis=-1, keepdims=True)
+        return vectors * np.minimum(1.0, self.longest / np.where(extent > 0, extent, 1.0))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -49,13 +49,13 @@ class BatchEngine:
 
     def field(self, name: str) -> AnyArray:
         """A live array over all rows."""
-        known = self._fields.get(name)
-        if known is None:
+        values = self._fields.get(name)
+        if values is None:
             check_field(name)
-            known = self._fields[name] = self._batch.bind(name)
-            if not known.flags.writeable:
+            values = self._fields[name] = self._batch.bind(name)
+            if not values.flags.writeable:
                 raise Rebound
-        return known
+        return values
 
     def reset(self, ids: IntArray) -> None:
         """Bring rows to the model's own start."""
@@ -164,14 +164,14 @@ class _Rows:
             model, nth = int(self._which[row]), int(self._nth[row])
             if (model, nth) not in self._copies:
                 self._copies[model, nth] = copy.copy(self.models[model])
-            own = self.own[row] = self._copies[model, nth]
+            variant = self.own[row] = self._copies[model, nth]
             for name, values in self._values.items():
                 if values.ndim == 1:  # a number of the options
-                    setattr(own.opt, name.removeprefix("opt."), values[row])
+                    setattr(variant.opt, name.removeprefix("opt."), values[row])
                 else:
-                    own_value(own, name)[:] = values[row]
-            mujoco.mj_resetData(own, data)
-            mujoco.mj_setConst(own, data)
+                    own_value(variant, name)[:] = values[row]
+            mujoco.mj_resetData(variant, data)
+            mujoco.mj_setConst(variant, data)
         return self.own
 
 

@@ -31,41 +31,41 @@ class Marks:
                 scene.index(body)
         self._bodies = {each.name: [scene.model.body(body).id for body in each.bodies] for each in self._channels}
 
-    def put(self, drawn: mujoco.MjvScene, data: mujoco.MjData, values: Mapping[str, FloatArray]) -> None:
+    def put(self, scene: mujoco.MjvScene, data: mujoco.MjData, values: Mapping[str, FloatArray]) -> None:
         """Add one frame's to the scene, as long as it has room.
 
         Args:
-          drawn: the renderer's scene.
+          scene: the renderer's scene.
           data: where the bodies are.
           values: of the channels by name, of their shapes.
         """
         for channel in self._channels:
             marks = self._arrows if channel.kind == "arrows" else self._points
             for add in marks(channel, values[channel.name], data):
-                if drawn.ngeom < drawn.maxgeom:
-                    _add(drawn, **add)
+                if scene.ngeom < scene.maxgeom:
+                    _add(scene, **add)
 
     def _arrows(self, channel: Channel, values: FloatArray, data: mujoco.MjData) -> Iterator[dict[str, Any]]:
         vectors, colours = channel.vectors(values), channel.colours or [_DARK] * len(values)
         for i, (start, vector, colour) in enumerate(zip(values[:, :3], vectors, colours, strict=True)):
-            begin = self._in_world(channel, i, start, data)
-            end = self._in_world(channel, i, start + vector, data)
+            tail = self._in_world(channel, i, start, data)
+            tip = self._in_world(channel, i, start + vector, data)
             if vector.any():
-                yield {"begin": begin, "end": end, "radius": ARROW_RADIUS * self._radius, "colour": glow(1.0, colour)}
+                yield {"place": tail, "tip": tip, "radius": ARROW_RADIUS * self._radius, "colour": glow(1.0, colour)}
 
     def _points(self, channel: Channel, values: FloatArray, data: mujoco.MjData) -> Iterator[dict[str, Any]]:
         colours = channel.colours or [_PAINT] * len(values)
         for i, colour in enumerate(colours):
             if channel.kind == "points":
-                places, shown, radius = values[i, None, :3], values[i, 3:], 2 * POINT_RADIUS
+                places, readings, radius = values[i, None, :3], values[i, 3:], 2 * POINT_RADIUS
             else:
                 assert channel.places is not None
-                shown = values[i].ravel()
-                places, shown, radius = channel.places[i][shown > 0], shown[shown > 0], POINT_RADIUS
-            for place, value in zip(places, shown.tolist(), strict=True):
+                readings = values[i].ravel()
+                places, readings, radius = channel.places[i][readings > 0], readings[readings > 0], POINT_RADIUS
+            for place, value in zip(places, readings.tolist(), strict=True):
                 rgba = glow(value / channel.top, colour)
-                begin = self._in_world(channel, i, place, data)
-                yield {"begin": begin, "end": None, "radius": radius * self._radius, "colour": rgba}
+                centre = self._in_world(channel, i, place, data)
+                yield {"place": centre, "tip": None, "radius": radius * self._radius, "colour": rgba}
 
     def _in_world(self, channel: Channel, i: int, place: FloatArray, data: mujoco.MjData) -> FloatArray:
         """A place (3,) of the channel's i-th value in the world."""
@@ -77,15 +77,15 @@ class Marks:
 
 
 def _add(
-    drawn: mujoco.MjvScene, begin: FloatArray, end: FloatArray | None, radius: float, colour: Sequence[float]
+    scene: mujoco.MjvScene, place: FloatArray, tip: FloatArray | None, radius: float, colour: Sequence[float]
 ) -> None:
     """Add an arrow between two places (3,), or a sphere at one."""
-    geom, drawn.ngeom = drawn.geoms[drawn.ngeom], drawn.ngeom + 1
-    kind = mujoco.mjtGeom.mjGEOM_SPHERE if end is None else mujoco.mjtGeom.mjGEOM_ARROW
-    sizes, turned = np.full(3, radius), np.eye(3).ravel()
-    mujoco.mjv_initGeom(geom, kind, sizes, np.asarray(begin, float), turned, np.array(colour, np.float32))
-    if end is not None:
-        mujoco.mjv_connector(geom, kind, radius, np.asarray(begin, float), np.asarray(end, float))
+    geom, scene.ngeom = scene.geoms[scene.ngeom], scene.ngeom + 1
+    kind = mujoco.mjtGeom.mjGEOM_SPHERE if tip is None else mujoco.mjtGeom.mjGEOM_ARROW
+    sizes, rotation = np.full(3, radius), np.eye(3).ravel()
+    mujoco.mjv_initGeom(geom, kind, sizes, np.asarray(place, float), rotation, np.array(colour, np.float32))
+    if tip is not None:
+        mujoco.mjv_connector(geom, kind, radius, np.asarray(place, float), np.asarray(tip, float))
         geom.size[2] *= 2.0  # MuJoCo draws an arrow half as long as its size
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
 

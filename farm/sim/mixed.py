@@ -14,7 +14,7 @@ from farm.sim.engines import check_field
 from farm.sim.interfaces import Engine, MakeEngine, Rebound
 from farm.sim.model_files import Files, compiled
 from farm.sim.scene import Scene
-from farm.sim.sim import own_values
+from farm.sim.sim import ability, own_values
 
 T = TypeVar("T")
 
@@ -24,11 +24,11 @@ def engine(models: Sequence[mujoco.MjModel], make: MakeEngine) -> Engine:
     return make(models[0]) if len(models) == 1 else MixedEngine(models, make)
 
 
-def compiled_models(given: object, name: str, files: Files, main: str) -> tuple[mujoco.MjModel, ...]:
+def compiled_models(models: object, name: str, files: Files, main: str) -> tuple[mujoco.MjModel, ...]:
     """Models of MJCF texts, or compiled ones, as a task gives them.
 
     Args:
-      given: what it gives.
+      models: what it gives.
       name: of the task in messages.
       files: the only files that texts may read, by path.
       main: the texts' own path among them.
@@ -36,11 +36,11 @@ def compiled_models(given: object, name: str, files: Files, main: str) -> tuple[
     Raises:
       ConfigError: a text cannot be compiled, something is no model, or one cannot be simulated beside the others.
     """
-    if not isinstance(given, list | tuple) or not all(isinstance(each, str | mujoco.MjModel) for each in given):
-        raise ConfigError(f"task {name}: models gave {given!r:.60}; expected a list of MJCF texts or compiled models")
-    made = tuple(compiled(each, name, files, main) if isinstance(each, str) else each for each in given)
-    check_alike(made)
-    return made
+    if not isinstance(models, list | tuple) or not all(isinstance(each, str | mujoco.MjModel) for each in models):
+        raise ConfigError(f"task {name}: models gave {models!r:.60}; expected a list of MJCF texts or compiled models")
+    out = tuple(compiled(each, name, files, main) if isinstance(each, str) else each for each in models)
+    check_alike(out)
+    return out
 
 
 def check_alike(models: Sequence[mujoco.MjModel]) -> None:
@@ -49,7 +49,7 @@ def check_alike(models: Sequence[mujoco.MjModel]) -> None:
     Raises:
       ConfigError: names the first thing in which one differs from the first.
     """
-    said = [
+    tables = [
         {
             "nq": model.nq, "nu": model.nu, "nmocap": model.nmocap, "timestep": model.opt.timestep,
             "ctrlrange": model.actuator_ctrlrange.tolist(), "ctrllimited": model.actuator_ctrllimited.tolist(),
@@ -57,19 +57,19 @@ def check_alike(models: Sequence[mujoco.MjModel]) -> None:
         }
         for model in models
     ]  # fmt: skip
-    for name, own in zip(names(models), said, strict=True):
-        for what, value in own.items():
-            if value != said[0][what]:
+    for name, table in zip(names(models), tables, strict=True):
+        for what, value in table.items():
+            if value != tables[0][what]:
                 raise ConfigError(
-                    f"model {name!r} has {what} {value!s:.60}, but the first model {said[0][what]!s:.60}: models of "
+                    f"model {name!r} has {what} {value!s:.60}, but the first model {tables[0][what]!s:.60}: models of "
                     "one task must agree in that"
                 )
 
 
 def names(models: Sequence[mujoco.MjModel]) -> tuple[str, ...]:
     """Names of models, as their MJCF says, or numbers if two are named alike."""
-    found = tuple(model.names.split(b"\0", 1)[0].decode() for model in models)
-    return found if len(set(found)) == len(found) else tuple(str(index) for index in range(len(models)))
+    texts = tuple(model.names.split(b"\0", 1)[0].decode() for model in models)
+    return texts if len(set(texts)) == len(texts) else tuple(str(index) for index in range(len(models)))
 
 
 @dataclass
@@ -84,13 +84,6 @@ class _Part:
         """Whether the engine can simulate another model beside its own; from then on it does."""
         takes: Callable[[mujoco.MjModel], bool] | None = getattr(self.engine, "takes", None)
         return takes is not None and takes(model)
-
-    def able(self, what: str) -> Any:  # noqa: ANN401  a method that not every engine has
-        """A method of the engine; a TaskError if it has none of this name."""
-        found = getattr(self.engine, what, None)
-        if found is None:
-            raise TaskError(f"sim.{what} is not there on this backend: its {type(self.engine).__name__} has none")
-        return found
 
 
 class MixedEngine:
@@ -130,18 +123,18 @@ class MixedEngine:
 
     def field(self, name: str) -> AnyArray:
         """A live array over all rows."""
-        known = self._host.get(name)
-        if known is None:
+        values = self._host.get(name)
+        if values is None:
             check_field(name)
             parts = _all(partial(part.engine.field, name) for part in self._parts)
             self._check_shapes(f"sim.{name}", parts)
-            known = self._host[name] = np.zeros((self.size, *parts[0].shape[1:]), parts[0].dtype)
+            values = self._host[name] = np.zeros((self.size, *parts[0].shape[1:]), parts[0].dtype)
             if parts[0].flags.writeable:
                 self._states.append(name)
             self._read(np.arange(self.size), [name])
-        known = known.view()
-        known.flags.writeable = name in self._states
-        return known
+        values = values.view()
+        values.flags.writeable = name in self._states
+        return values
 
     def reset(self, ids: IntArray) -> None:
         """Bring rows to their models' own starts."""
@@ -174,23 +167,25 @@ class MixedEngine:
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number."""
-        [found] = self._gathered(ids, lambda part, _, slots: (part.engine.blown_up(slots),))
-        return found
+        [unstable] = self._gathered(ids, lambda part, _, slots: (part.engine.blown_up(slots),))
+        return unstable
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Forces of contacts on every body of rows, (n, nbody, 6)."""
-        [found] = self._gathered(ids, lambda part, _, slots: (part.engine.contact_forces(slots),))
-        return found
+        [forces] = self._gathered(ids, lambda part, _, slots: (part.engine.contact_forces(slots),))
+        return forces
 
     def ray(self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int) -> tuple[FloatArray, IntArray]:
         """Distances and geometries that rays (n, R, 3) hit, (n, R) each."""
         self._write(ids)
-        return self._gathered(ids, lambda part, at, slots: part.able("ray")(slots, points[at], ways[at], without))
+        return self._gathered(
+            ids, lambda part, at, slots: ability(part.engine, "ray")(slots, points[at], ways[at], without)
+        )
 
     def jac(self, ids: IntArray, body: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Jacobians of points (n, 3) of a body, (n, 3, nv) each."""
         self._write(ids)
-        return self._gathered(ids, lambda part, at, slots: part.able("jac")(slots, body, points[at]))
+        return self._gathered(ids, lambda part, at, slots: ability(part.engine, "jac")(slots, body, points[at]))
 
     def expand(self, name: str) -> AnyArray:
         """A field of the models with values for each row; nan, or 0, where a row's model has fewer than another."""
@@ -204,8 +199,8 @@ class MixedEngine:
         """Update derived constants."""
         for part, at, slots in self._split(ids):
             for name, values in self._expanded.items():
-                there = part.engine.expand(name)
-                there[slots] = values[ids[at]][:, *(slice(n) for n in there.shape[1:])]
+                field = part.engine.expand(name)
+                field[slots] = values[ids[at]][:, *(slice(n) for n in field.shape[1:])]
             part.engine.set_const(slots)
 
     def close(self) -> None:
@@ -230,13 +225,13 @@ class MixedEngine:
 
     def _gathered(self, ids: IntArray, call: Callable[[_Part, IntArray, IntArray], tuple[AnyArray, ...]]) -> Any:  # noqa: ANN401
         """Arrays (n, ...) for rows, from those of the parts."""
-        found = _all(partial(lambda part, at, slots: (at, call(part, at, slots)), *each) for each in self._split(ids))
+        pieces = _all(partial(lambda part, at, slots: (at, call(part, at, slots)), *each) for each in self._split(ids))
         out = []
-        for parts in zip(*(values for _, values in found), strict=True):
+        for parts in zip(*(values for _, values in pieces), strict=True):
             self._check_shapes("what the engine gives", parts)
             whole = np.empty((len(ids), *parts[0].shape[1:]), parts[0].dtype)
-            for (at, _), some in zip(found, parts, strict=True):
-                whole[at] = some
+            for (at, _), piece in zip(pieces, parts, strict=True):
+                whole[at] = piece
             out.append(whole)
         return tuple(out)
 
@@ -244,9 +239,9 @@ class MixedEngine:
         shapes = [values.shape[1:] for values in parts]
         if len(set(shapes)) > 1:
             first = [names(self.models)[part.models[0]] for part in self._parts]
-            known = ", ".join(f"{shape} of {name}" for name, shape in zip(first, shapes, strict=False))
+            listing = ", ".join(f"{shape} of {name}" for name, shape in zip(first, shapes, strict=False))
             raise TaskError(
-                f"{what} has other shapes in other models: {known}; a task can read arrays of one shape only"
+                f"{what} has other shapes in other models: {listing}; a task can read arrays of one shape only"
             )
 
     def _write(self, ids: IntArray) -> None:

@@ -53,18 +53,18 @@ def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
     if isinstance(model, str):
         if "file" not in model:
             return {TEXT: model}
-        name, own = TEXT, {TEXT: model}
+        name, texts = TEXT, {TEXT: model}
     elif model.is_absolute():
-        name, folder, own = model.name, model.parent, {}
+        name, folder, texts = model.name, model.parent, {}
     else:
-        name, own = posixpath.normpath(model.as_posix()), {}
+        name, texts = posixpath.normpath(model.as_posix()), {}
     if folder is None:
         raise ConfigError("the model reads files, but its class is in no file: give xml an absolute path")
-    there = _Folder(folder, own)
+    source = _Folder(folder, texts)
     _inside([name], "xml")
-    if there.get(name, True) is None:
+    if source.get(name, True) is None:
         raise ConfigError(f"xml: there is no file {folder / name}")
-    return _named(name, there.get)
+    return _named(name, source.get)
 
 
 def compiled(mjcf: str, name: str, files: Files | None = None, main: str = TEXT) -> "mujoco.MjModel":
@@ -94,19 +94,19 @@ def needed(mjcf: str, files: Files, main: str) -> dict[str, Content]:
     """What an MJCF text reads of these files, by path, itself first; a ConfigError if it reads others."""
     if "file" not in mjcf:
         return {main: mjcf}
-    known = {**files, main: mjcf}
-    return _named(main, lambda path, _: known.get(path))
+    contents = {**files, main: mjcf}
+    return _named(main, lambda path, _: contents.get(path))
 
 
 def _from_files(mjcf: str, files: Files, main: str) -> "mujoco.MjModel":
     """Compile it in a folder that has these files only."""
     import mujoco
 
-    read = needed(mjcf, files, main)
-    if len(read) == 1:
+    contents = needed(mjcf, files, main)
+    if len(contents) == 1:
         return mujoco.MjModel.from_xml_string(mjcf)
     with tempfile.TemporaryDirectory(prefix="rolloutfarm-model-") as folder:
-        write(Path(folder), read)
+        write(Path(folder), contents)
         try:
             return mujoco.MjModel.from_xml_path(str(Path(folder) / main))
         except ValueError as error:
@@ -130,7 +130,7 @@ def split(files: Files) -> tuple[dict[str, str], dict[str, str]]:
 
 def joined(texts: Mapping[str, str], assets: Mapping[str, str], contents: Mapping[str, bytes]) -> dict[str, Content]:
     """The files again, from their contents by SHA-256."""
-    return {**texts, **{name: contents[found] for name, found in assets.items()}}
+    return {**texts, **{name: contents[digest] for name, digest in assets.items()}}
 
 
 def by_digest(files: Files) -> dict[str, bytes]:
@@ -146,8 +146,8 @@ def digest(content: bytes) -> str:
 class _Folder:
     """A folder from which a model reads, within its limits."""
 
-    def __init__(self, folder: Path, own: Mapping[str, Content]) -> None:
-        self._folder, self._read = folder.resolve(), dict(own)
+    def __init__(self, folder: Path, contents: Mapping[str, Content]) -> None:
+        self._folder, self._read = folder.resolve(), dict(contents)
 
     def get(self, name: str, text: bool) -> Content | None:
         """A file's content, read once; None if there is no such file."""
@@ -180,7 +180,7 @@ def _named(main: str, get: _Get) -> dict[str, Content]:
     Raises:
       ConfigError: a file is in none of them, or one of them is outside.
     """
-    found: dict[str, Content] = {}
+    contents: dict[str, Content] = {}
     models = [main]
     for model in models:  # grows by the models that are attached
         texts: dict[str, ET.Element] = {}
@@ -189,8 +189,8 @@ def _named(main: str, get: _Get) -> dict[str, Content]:
             name = waiting.pop(0)
             if name in texts:
                 continue
-            found[name] = get(name, True) or ""
-            texts[name] = _parsed(name, found[name])
+            contents[name] = get(name, True) or ""
+            texts[name] = _parsed(name, contents[name])
             for file in (each.get("file", "") for each in texts[name].iter("include")):
                 waiting += _places(name, "include", file, _bases(model, name), get, text=True)
         for name, element, file in _references(texts):
@@ -200,9 +200,9 @@ def _named(main: str, get: _Get) -> dict[str, Content]:
                 if any(each.get("strippath") == "true" for root in texts.values() for each in root.iter("compiler")):
                     file = posixpath.basename(file)
             places = _places(name, element.tag, file, bases, get, text=text)
-            found |= {place: content for place in places if (content := get(place, text)) is not None}
+            contents |= {place: content for place in places if (content := get(place, text)) is not None}
             models += [place for place in places if text and place not in models]
-    return found
+    return contents
 
 
 def _references(texts: Mapping[str, ET.Element]) -> Iterator[tuple[str, ET.Element, str]]:
@@ -221,10 +221,10 @@ def _places(asking: str, tag: str, file: str, bases: Iterable[str], get: _Get, *
         raise ConfigError(f"{what}: expected a path in the task's folder, with /")
     paths = list(dict.fromkeys(posixpath.normpath(posixpath.join(base, file)) for base in bases))
     _inside(paths, what)
-    there = [path for path in paths if get(path, text) is not None]
-    if not there:
+    places = [path for path in paths if get(path, text) is not None]
+    if not places:
         raise ConfigError(f"{what}: there is no file {' or '.join(paths)}")
-    return there
+    return places
 
 
 def _inside(paths: Iterable[str], what: str) -> None:
@@ -242,10 +242,10 @@ def _ways(roots: Iterable[ET.Element], tag: str) -> list[str]:
     """Folders that `compiler` gives for an element's files."""
     attributes = _DIRS.get(tag, ("meshdir", "texturedir", "assetdir"))
     compilers = [each for root in roots for each in root.iter("compiler")]
-    given = [value for each in compilers for name in attributes if (value := each.get(name))]
-    if any(value.startswith("/") or "\\" in value for value in given):
-        raise ConfigError(f"compiler: {given[0]!r} leads out of the task's folder: give a path inside it, with /")
-    return given or ["."]
+    folders = [value for each in compilers for name in attributes if (value := each.get(name))]
+    if any(value.startswith("/") or "\\" in value for value in folders):
+        raise ConfigError(f"compiler: {folders[0]!r} leads out of the task's folder: give a path inside it, with /")
+    return folders or ["."]
 
 
 def _parsed(name: str, content: Content) -> ET.Element:

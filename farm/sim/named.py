@@ -49,9 +49,9 @@ class Named:
             view: Any = getattr(data, kind)(name)
         except (KeyError, IndexError, TypeError):
             each: Any = getattr(data.model, kind)
-            known = [each(i).name for i in range(getattr(data.model, count))]
-            said = ", ".join(filter(None, known)) or "none with a name"
-            raise TaskError(f"the model has no {kind} {name!r}; it has {said}") from None
+            names = [each(i).name for i in range(getattr(data.model, count))]
+            listing = ", ".join(filter(None, names)) or "none with a name"
+            raise TaskError(f"the model has no {kind} {name!r}; it has {listing}") from None
         parts = {attribute: _part(data, view, prefix, attribute) for attribute in dir(view) if attribute[0] != "_"}
         vars(self).update(
             id=view.id, name=view.name, _arrays=arrays, _kind=kind,
@@ -79,10 +79,10 @@ class Named:
 
 def _part(data: mujoco.MjData, view: Any, prefix: str, attribute: str) -> tuple[str, int, tuple[int, ...]] | None:  # noqa: ANN401
     """The field that has an attribute, where it begins there, and its shape; None if no field has it."""
-    found = [name for name in (prefix + attribute, attribute) if name in mujoco.batch.DATA_FIELDS]
-    if attribute in _NO_PART or not found:
+    fields = [name for name in (prefix + attribute, attribute) if name in mujoco.batch.DATA_FIELDS]
+    if attribute in _NO_PART or not fields:
         return None
-    part, whole = getattr(view, attribute), getattr(data, found[0])
+    part, whole = getattr(view, attribute), getattr(data, fields[0])
     if not part.size:
         return None
-    return found[0], (part.ctypes.data - whole.ctypes.data) // whole.itemsize, part.shape
+    return fields[0], (part.ctypes.data - whole.ctypes.data) // whole.itemsize, part.shape

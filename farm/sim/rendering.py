@@ -92,10 +92,10 @@ class View:
         """What it follows; None: nothing."""
         self._shift = np.zeros(3)
 
-    def moved(self, there: FloatArray) -> FloatArray:
+    def moved(self, place: FloatArray) -> FloatArray:
         """How far the camera has to move if the body is at this place now, [m], (3,)."""
         assert self.mover is not None
-        away = there - self.mover.place - self._shift
+        away = place - self.mover.place - self._shift
         slack = _SLACK * self.mover.radius
         step = away * (1.0 - slack / max(float(np.linalg.norm(away)), slack))
         self._shift += step

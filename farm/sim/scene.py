@@ -184,28 +184,30 @@ class Scene:
 
     def geometries(self) -> list[Geometry]:
         """Everything to draw: primitives and meshes of the groups that MuJoCo's viewers show, of all models."""
-        found: list[tuple[Geometry, list[int]]] = []
+        shapes: list[tuple[Geometry, list[int]]] = []
         for index, scene in enumerate(self.each):
             for geometry in scene._own():
-                known = next((models for other, models in found if other.same(geometry)), None)
-                if known is None:
-                    found.append((geometry, [index]))
+                owners = next((models for other, models in shapes if other.same(geometry)), None)
+                if owners is None:
+                    shapes.append((geometry, [index]))
                 else:
-                    known.append(index)
+                    owners.append(index)
         return [
             geometry
             if len(set(models)) == len(self.each)
             else replace(geometry, name=f"{geometry.name}-{models[0]}", models=tuple(models))
-            for geometry, models in found
+            for geometry, models in shapes
         ]
 
     def _own(self) -> list[Geometry]:
         """Those of this model."""
         bodies = dict(zip(self._drawn, self.bodies, strict=True))
         model = self.model
-        known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
-        shown = [i for i in known if model.geom_group[i] < _GROUPS] or known  # draw the hidden ones rather than nothing
-        geoms = [model.geom(i) for i in shown]
+        drawable = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
+        ids = [
+            i for i in drawable if model.geom_group[i] < _GROUPS
+        ] or drawable  # draw the hidden ones rather than nothing
+        geoms = [model.geom(i) for i in ids]
         return [
             Geometry(
                 name=_name(geom.name, f"geom_{geom.id}"),
@@ -233,9 +235,9 @@ class Scene:
 
     def _colour(self, i: int) -> FloatArray:
         """A geometry's own colour, or its material's, as in MuJoCo's renderer (4,)."""
-        own, material = self.model.geom_rgba[i], int(self.model.geom_matid[i])
-        if material < 0 or not np.allclose(own, _UNPAINTED) or (self.model.mat_texid[material] >= 0).any():
-            return own
+        colour, material = self.model.geom_rgba[i], int(self.model.geom_matid[i])
+        if material < 0 or not np.allclose(colour, _UNPAINTED) or (self.model.mat_texid[material] >= 0).any():
+            return colour
         return self.model.mat_rgba[material]
 
     @cached_property
@@ -265,6 +267,6 @@ def quiet() -> None:
     mujoco.MjLogConfig.set(config)
 
 
-def _name(given: str, fallback: str) -> str:
+def _name(text: str, fallback: str) -> str:
     """A name that can be part of a path; models may use any name, or none."""
-    return re.sub(r"[^\w.-]", "_", given, flags=re.ASCII) or fallback
+    return re.sub(r"[^\w.-]", "_", text, flags=re.ASCII) or fallback

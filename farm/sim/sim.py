@@ -104,17 +104,17 @@ class Sim:
             if name not in self._drafts:
                 self._drafts[name] = self.engine.field(name)[self._ids]  # a copy
             return self._drafts[name]
-        known = self._now.get(name)
-        if known is not None:
-            return known
+        cached = self._now.get(name)
+        if cached is not None:
+            return cached
         values = self.engine.field(name)
         if self._live:
             if not values.flags.writeable and not self._stepped:  # states may have been written
                 self._constants()
                 self.engine.forward(self._ids)
             return values[: len(self)]
-        self._now[name] = taken = self._taken(values)
-        return taken
+        self._now[name] = rows = self._taken(values)
+        return rows
 
     def __setattr__(self, name: str, value: object) -> None:
         if name not in _ATTRIBUTES and not name.startswith("_"):
@@ -123,9 +123,9 @@ class Sim:
 
     def _taken(self, values: AnyArray) -> AnyArray:
         """The rows still going, read-only."""
-        taken = values[self._rows if self._source is None or values.flags.writeable else self._source].view()
-        taken.flags.writeable = False
-        return taken
+        rows = values[self._rows if self._source is None or values.flags.writeable else self._source].view()
+        rows.flags.writeable = False
+        return rows
 
     def begin(self, count: int, which: IntArray | None = None) -> None:
         """Begin `count` rollouts at the model's own start, with `which` model each (None: the first); arrays can be
@@ -201,10 +201,10 @@ class Sim:
 
     def contact_forces(self) -> FloatArray:
         """Contact forces on every body after the last physics step (MuJoCo's cfrc_ext), (B, nbody, 6)."""
-        known = self._now.get("contact_forces")
-        if known is None:
-            known = self._now["contact_forces"] = self.engine.contact_forces(self._ids)
-        return known
+        forces = self._now.get("contact_forces")
+        if forces is None:
+            forces = self._now["contact_forces"] = self.engine.contact_forces(self._ids)
+        return forces
 
     def forward(self) -> None:
         """Compute outputs from the present states, which do not change: after a step outputs are one step behind.
@@ -237,7 +237,7 @@ class Sim:
         if not np.any(rays[1], axis=-1).all():
             raise TaskError("a ray's direction is 0")
         self._constants()
-        return self._able("ray")(self._ids, *rays, self.body(without).id if without else -1)
+        return ability(self.engine, "ray")(self._ids, *rays, self.body(without).id if without else -1)
 
     def jac(self, body: str, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """How points in the world, (3,) or (B, 3), that move with a body move and turn with qvel: MuJoCo's `mj_jac`.
@@ -250,13 +250,7 @@ class Sim:
         """
         self._constants()
         where = np.array(np.broadcast_to(points, (len(self), 3)), dtype=float)
-        return self._able("jac")(self._ids, self.body(body).id, where)
-
-    def _able(self, what: str) -> Any:  # noqa: ANN401  a method that not every engine has
-        found = getattr(self.engine, what, None)
-        if found is None:
-            raise TaskError(f"sim.{what} is not there on this backend: its {type(self.engine).__name__} has none")
-        return found
+        return ability(self.engine, "jac")(self._ids, self.body(body).id, where)
 
     def joint(self, name: str) -> Named:
         """A joint: qpos, qvel, qacc, xanchor, xaxis ... as MuJoCo's `data.joint(name)`, (B, ...) each."""
@@ -341,6 +335,14 @@ class Sim:
             self._dirty = False
 
 
+def ability(engine: Engine, what: str) -> Any:  # noqa: ANN401  a method that not every engine has
+    """A method of an engine; a TaskError if it has none of this name."""
+    method = getattr(engine, what, None)
+    if method is None:
+        raise TaskError(f"sim.{what} is not there on this backend: its {type(engine).__name__} has none")
+    return method
+
+
 def as_rows(ids: IntArray) -> slice | IntArray:
     """An index of rows whose ids rise, (n,): a slice if they are the first n, as it is faster and needs no copy."""
     return slice(len(ids)) if len(ids) and ids[-1] == len(ids) - 1 else ids
@@ -363,16 +365,16 @@ def own_values(models: Sequence[mujoco.MjModel], name: str) -> AnyArray:
 
 def unwritable(line: str) -> str:
     """Why a line of a task's code cannot write what it names of `sim`, and what can be written instead."""
-    found = re.search(r"\bsim(?:\.\w+\([^)]*\))?\.(\w+)", line)  # sim.qpos, or sim.joint("hinge").qpos
-    if not found:
+    match = re.search(r"\bsim(?:\.\w+\([^)]*\))?\.(\w+)", line)  # sim.qpos, or sim.joint("hinge").qpos
+    if not match:
         return f"the array is read-only; {_CAN}"
-    if found[1] == "expand":
+    if match[1] == "expand":
         return "a field of the model can be written in reset and prepare only, before the rollout runs"
-    if found[1] == "ctrl":
+    if match[1] == "ctrl":
         return "act returns the controls"
-    if found[1] in WRITABLE:
-        return f"{found[0]} can be written in act, reset and prepare only, and in no environment of Gymnasium"
-    return f"{found[0]} is computed by MuJoCo; {_CAN}"
+    if match[1] in WRITABLE:
+        return f"{match[0]} can be written in act, reset and prepare only, and in no environment of Gymnasium"
+    return f"{match[0]} is computed by MuJoCo; {_CAN}"
 
 
 def failed_rows(state: FloatArray) -> BoolArray:

@@ -51,14 +51,14 @@ class Trajectory:
     def of(cls, *, channels: Mapping[str, FloatArray], times: FloatArray, value: float, success: bool | None,
            **arrays: FloatArray) -> "Trajectory":  # fmt: skip
         """Make one of numbers in double precision; those that are not finite become large."""
-        shown = {name: single(values) for name, values in channels.items()}
-        made = {name: single(values) for name, values in arrays.items()}
-        return cls(value=value, success=success, channels=shown, times=times, **made)
+        traces = {name: single(values) for name, values in channels.items()}
+        frames = {name: single(values) for name, values in arrays.items()}
+        return cls(value=value, success=success, channels=traces, times=times, **frames)
 
     def arrays(self) -> dict[str, AnyArray]:
         """Every array over the frames but the times: bodies, actions, terms, then `channels/NAME`."""
-        own = {"bodies": self.bodies, "actions": self.actions, "terms": self.terms}
-        return own | {f"channels/{name}": values for name, values in self.channels.items()}
+        arrays = {"bodies": self.bodies, "actions": self.actions, "terms": self.terms}
+        return arrays | {f"channels/{name}": values for name, values in self.channels.items()}
 
     def fits(self, shapes: Mapping[str, tuple[int, ...]]) -> bool:
         """Whether it has exactly these arrays with these shapes per frame."""

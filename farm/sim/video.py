@@ -42,8 +42,8 @@ def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:
     """
     span = times[-1] - times[0]
     count = max(1, round(span / speed * FRAMES))
-    shown = np.linspace(0, len(times) - 1, count + 1).round().astype(int).tolist()
-    return [*shown, *[len(times) - 1] * round(rest * FRAMES)]
+    indices = np.linspace(0, len(times) - 1, count + 1).round().astype(int).tolist()
+    return [*indices, *[len(times) - 1] * round(rest * FRAMES)]
 
 
 def tiled(pictures: Sequence[Picture]) -> Picture:
@@ -70,9 +70,9 @@ def _gif(path: Path, pictures: list[Picture]) -> None:
 
     images = [Image.fromarray(picture) for picture in pictures]
     # One palette for all pictures: colours do not flicker, and parts that do not change take no space.
-    some = images[:: max(1, len(images) // 8)]
-    sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
-    for i, image in enumerate(some):
+    samples = images[:: max(1, len(images) // 8)]
+    sheet = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
+    for i, image in enumerate(samples):
         sheet.paste(image, (0, i * image.height))
     # Half of it are frequent colours; the other half covers rare ones, such as a painted geometry's.
     ways = (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)

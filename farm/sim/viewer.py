@@ -89,18 +89,18 @@ class _Clock:
         """One physics step, shown; false when the viewer was closed or it is time to end."""
         viewer, data = self._viewer, self._data
         with viewer.lock():
-            own = data.xfrc_applied.copy()  # the task's
+            forces = data.xfrc_applied.copy()  # the task's
             data.xfrc_applied[:] = 0.0
             mujoco.mjv_applyPerturbForce(viewer.m, data, viewer.perturb)
-            data.xfrc_applied += own
+            data.xfrc_applied += forces
             mujoco.mj_step(viewer.m, data)
-            data.xfrc_applied[:] = own
+            data.xfrc_applied[:] = forces
             if self._view.mover is not None:
                 viewer.cam.lookat += self._view.moved(data.xpos[self._view.mover.index])
         viewer.sync()
         self._next = max(self._next + self._period, time.monotonic() - 10 * self._period)  # no race after a pause
-        ended = self._wait(max(0.0, self._next - time.monotonic()))
-        self.going = not ended and viewer.is_running()
+        over = self._wait(max(0.0, self._next - time.monotonic()))
+        self.going = not over and viewer.is_running()
         return self.going
 
 
@@ -108,7 +108,7 @@ def _check_window() -> None:
     """Check that a window can be opened: the viewer's own thread would fail silently."""
     import glfw
 
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always")
         window: Any = None
         if glfw.init():
@@ -118,5 +118,5 @@ def _check_window() -> None:
                 glfw.destroy_window(window)
             glfw.terminate()
     if not window:
-        why = f": {' '.join(str(said[-1].message).split())}" if said else ""
+        why = f": {' '.join(str(messages[-1].message).split())}" if messages else ""
         raise RunError(f"cannot open a window{why}. Check DISPLAY, or draw without one: farm replay RUN --video")

@@ -60,12 +60,12 @@ class Acting:
         if self._memory is None:
             action: AnyArray = self._policy.act(self._prepared, x)
             return action
-        given: object = self._policy.act(self._prepared, x, self._memory[rows])
-        if not isinstance(given, tuple) or len(given) != 2:
+        result: object = self._policy.act(self._prepared, x, self._memory[rows])
+        if not isinstance(result, tuple) or len(result) != 2:
             raise TaskError(
-                f"act of the policy gave a {type(given).__name__}; expected (action, memory), as the policy has memory"
+                f"act of the policy gave a {type(result).__name__}; expected (action, memory), as the policy has memory"
             )
-        action, after = given
+        action, after = result
         self._memory[rows] = shaped("memory from act of the policy", after, (len(rows), self._memory.shape[1]))
         return action
 

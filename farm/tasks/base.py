@@ -89,8 +89,8 @@ class TaskSpec:
 
     def shapes(self, bodies: int) -> dict[str, tuple[int, ...]]:
         """Shape of a frame of each of a trajectory's arrays, by the names of `Trajectory.arrays`."""
-        own = {"bodies": (bodies, 7), "actions": (self.action,), "terms": (len(self.terms),)}
-        return own | {f"channels/{channel.name}": channel.shape for channel in self.channels}
+        shapes = {"bodies": (bodies, 7), "actions": (self.action,), "terms": (len(self.terms),)}
+        return shapes | {f"channels/{channel.name}": channel.shape for channel in self.channels}
 
     @property
     def traced(self) -> tuple[Channel, ...]:
@@ -263,9 +263,9 @@ class Task:
             from farm.sim.mixed import compiled_models
             from farm.sim.model_files import TEXT
 
-            given, name = self.models(), type(self).__name__
-            known = self.sources, self.main or TEXT
-            self._models = compiled_models(given, name, *known) if given else (self.compiled(),)
+            models, name = self.models(), type(self).__name__
+            files = self.sources, self.main or TEXT
+            self._models = compiled_models(models, name, *files) if models else (self.compiled(),)
         return self._models
 
     def models(self) -> "Sequence[str | mujoco.MjModel]":

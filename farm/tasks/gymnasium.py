@@ -45,7 +45,7 @@ class EnvironmentConfig(TaskConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        names = [_argument(said)[0] for said in self.env_arg]
+        names = [_argument(argument)[0] for argument in self.env_arg]
         for name in names:
             if names.count(name) > 1:
                 raise ConfigError(f"env-arg: {name} is given twice")
@@ -53,15 +53,15 @@ class EnvironmentConfig(TaskConfig):
     @property
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments of the environment."""
-        return dict(_argument(said) for said in self.env_arg)
+        return dict(_argument(argument) for argument in self.env_arg)
 
 
-def _argument(said: object) -> tuple[str, Any]:
+def _argument(argument: object) -> tuple[str, Any]:
     """Name and value in NAME=VALUE."""
-    name, equals, text = said.partition("=") if isinstance(said, str) else ("", "", "")
+    name, equals, text = argument.partition("=") if isinstance(argument, str) else ("", "", "")
     if not (name.isidentifier() and equals):
         raise ConfigError(
-            f"env-arg is {str(said)[:80]!r}; expected NAME=VALUE, for example terminate_when_unhealthy=false"
+            f"env-arg is {str(argument)[:80]!r}; expected NAME=VALUE, for example terminate_when_unhealthy=false"
         )
     if name in _REFUSED:
         raise ConfigError(f"env-arg {name} is not taken: {_REFUSED[name]}")
@@ -105,15 +105,15 @@ class Environment(Task):
         return make(self.variant, **self.config.arguments)
 
     def _horizon(self) -> int:
-        wanted, _ = self.config.steps, self._first  # made first: it reports errors in the name
+        steps, _ = self.config.steps, self._first  # made first: it reports errors in the name
         import gymnasium
 
-        own = gymnasium.spec(self.variant).max_episode_steps
-        if own and wanted > own:
-            raise ConfigError(f"--steps {wanted}: task gym:{self.variant} ends after {own}")
-        if not (own or wanted):
+        limit = gymnasium.spec(self.variant).max_episode_steps
+        if limit and steps > limit:
+            raise ConfigError(f"--steps {steps}: task gym:{self.variant} ends after {limit}")
+        if not (limit or steps):
             raise ConfigError(f"task gym:{self.variant} ends at no number of steps: give it one with --steps")
-        return min(wanted or STEPS_LIMIT, own or STEPS_LIMIT)
+        return min(steps or STEPS_LIMIT, limit or STEPS_LIMIT)
 
     def compiled(self) -> mujoco.MjModel:
         """The environment's own model."""
@@ -209,8 +209,8 @@ def _releases(env: "gymnasium.Env[Any, Any]") -> str:
     inner = env.unwrapped
     kinds = (type(inner), type(getattr(inner, "physics", inner)))
     modules = dict.fromkeys(("gymnasium", *(kind.__module__.partition(".")[0] for kind in kinds)))
-    known = metadata.packages_distributions() if len(modules) > 1 else {"gymnasium": ["gymnasium"]}
-    packages = [name for module in modules for name in sorted(set(known.get(module, ())))]
+    distributions = metadata.packages_distributions() if len(modules) > 1 else {"gymnasium": ["gymnasium"]}
+    packages = [name for module in modules for name in sorted(set(distributions.get(module, ())))]
     return ", ".join(f"{name} {metadata.version(name)}" for name in packages)
 
 

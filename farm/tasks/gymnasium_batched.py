@@ -326,6 +326,6 @@ _CLASSES: Final[Mapping[str, type[Batched]]] = {
 
 def batched(env: Any) -> Batched | None:  # noqa: ANN401  as gymnasium.make gives it
     """The batched form of an environment; None if there is none."""
-    own = type(env.unwrapped)
-    made = _CLASSES.get(f"{own.__module__}.{own.__name__}".removeprefix("gymnasium.envs.mujoco."))
-    return None if made is None or env.spec.additional_wrappers else made(env.unwrapped)
+    kind = type(env.unwrapped)
+    form = _CLASSES.get(f"{kind.__module__}.{kind.__name__}".removeprefix("gymnasium.envs.mujoco."))
+    return None if form is None or env.spec.additional_wrappers else form(env.unwrapped)

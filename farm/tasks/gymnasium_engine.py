@@ -51,11 +51,11 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
                 env.reset(seed=NOMINAL)  # an unusable value may fail only in a step
                 env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
     except Exception as error:  # an environment may raise anything
-        said = " ".join(str(error).split()) or _place(error)
-        raise ConfigError(f"task gym:{name}: {said}") from None
+        reason = " ".join(str(error).split()) or _place(error)
+        raise ConfigError(f"task gym:{name}: {reason}") from None
     space, actions, box = env.observation_space, env.action_space, gymnasium.spaces.Box
-    own = *simulated(env), getattr(env.unwrapped, "dt", None)
-    if not all(map(isinstance, own, (mujoco.MjModel, mujoco.MjData, float))):
+    parts = *simulated(env), getattr(env.unwrapped, "dt", None)
+    if not all(map(isinstance, parts, (mujoco.MjModel, mujoco.MjData, float))):
         raise ConfigError(f"task gym:{name}: not an environment of MuJoCo")
     for where, part in leaves(space):
         if not isinstance(part, box) or len(part.shape) > _DIMENSIONS or part.dtype.kind == "u":
@@ -75,8 +75,8 @@ def simulated(env: "gymnasium.Env[Any, Any]") -> tuple[mujoco.MjModel, mujoco.Mj
     """What an environment simulates: its own model and data, or those in the `physics` of dm_control's."""
     inner = env.unwrapped
     physics = getattr(inner, "physics", inner)
-    found = (getattr(physics, name, None) for name in ("model", "data"))
-    model, data = (getattr(each, "ptr", each) for each in found)  # dm_control wraps MuJoCo's objects
+    parts = (getattr(physics, name, None) for name in ("model", "data"))
+    model, data = (getattr(each, "ptr", each) for each in parts)  # dm_control wraps MuJoCo's objects
     return model, data
 
 
@@ -160,10 +160,10 @@ class EnvironmentEngine:
                     x, reward, *over, _ = env.step(self._fields["ctrl"][row].astype(self._kind))
                 self._take(row, x, float(reward), over)
 
-    def _take(self, row: int, seen: Any, reward: float, over: Sequence[bool] = (False, False)) -> None:  # noqa: ANN401
+    def _take(self, row: int, observation: Any, reward: float, over: Sequence[bool] = (False, False)) -> None:  # noqa: ANN401
         _, data = simulated(self._envs[row])
-        plain = isinstance(seen, np.ndarray) and seen.ndim == 1  # not rounded to what the space says
-        x: Any = seen if plain else self._flatten(self._space, seen)
+        plain = isinstance(observation, np.ndarray) and observation.ndim == 1  # not rounded to what the space says
+        x: Any = observation if plain else self._flatten(self._space, observation)
         self._bad[row] = not (np.isfinite(x).all() and np.isfinite(reward)) or blown_up(data)
         self._fields["observation"][row] = x
         for name in ("qpos", "mocap_pos", "mocap_quat"):

@@ -87,9 +87,9 @@ def _explained(call: Callable[P, T]) -> Callable[P, T]:
     """Let a task's write to a read-only array be a TaskError of one line; numpy names neither array nor remedy."""
 
     @wraps(call)
-    def method(*values: P.args, **named: P.kwargs) -> T:
+    def method(*values: P.args, **keywords: P.kwargs) -> T:
         try:
-            return call(*values, **named)
+            return call(*values, **keywords)
         except ValueError as error:
             if "read-only" not in str(error):
                 raise
@@ -168,17 +168,17 @@ class Batch:
         sim.t += 1
         failed = sim.blown_up()
         self._reward(action, t, failed)
-        ended = task.ended(sim)
-        ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)
-        self._conclude(failed, ended & ~failed, t)
+        ends = task.ended(sim)
+        ends = np.zeros(len(sim), dtype=bool) if ends is None else shaped("ended", ends, (len(sim),)).astype(bool)
+        self._conclude(failed, ends & ~failed, t)
 
     def _measured(self) -> dict[str, FloatArray]:
         """The values kept of this frame, (n, ...) each."""
-        count, given = len(self.sim), self.task.measure(self.sim)
-        if not isinstance(given, dict):
-            raise TaskError(f"measure gave a {type(given).__name__}; expected arrays by name")
-        own = {name: shaped(name, v, (count, *np.shape(v)[1:])) for name, v in given.items()}
-        return {"qpos": self.sim.qpos, **self._mocap(), **own}
+        count, frame = len(self.sim), self.task.measure(self.sim)
+        if not isinstance(frame, dict):
+            raise TaskError(f"measure gave a {type(frame).__name__}; expected arrays by name")
+        arrays = {name: shaped(name, v, (count, *np.shape(v)[1:])) for name, v in frame.items()}
+        return {"qpos": self.sim.qpos, **self._mocap(), **arrays}
 
     def _mocap(self) -> dict[str, FloatArray]:
         """Poses of mocap bodies (n, nmocap, 7), if there are any: with qpos, where everything is."""
@@ -190,8 +190,8 @@ class Batch:
         """Store the reward terms of a control step, unless whole rollouts are scored."""
         if scores(self.task):
             return
-        given = self.task.reward(self.sim, action)
-        terms = given if isinstance(given, dict) else {"reward": given}
+        reward = self.task.reward(self.sim, action)
+        terms = reward if isinstance(reward, dict) else {"reward": reward}
         if not terms:
             raise TaskError("reward gave no terms; expected an array, or arrays by name")
         values = np.empty((len(self.sim), len(terms)))
@@ -208,20 +208,20 @@ class Batch:
             raise TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine")
         self.terms[self.rows, t] = values
 
-    def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
+    def _conclude(self, failed: BoolArray, ends: BoolArray, t: int) -> None:
         """Remove the finished rollouts; all end with the last step."""
-        over, last = failed | ended, t + 1 == self.task.steps
-        some = bool(over.any())
-        if some or last:
+        over, last = failed | ends, t + 1 == self.task.steps
+        any_over = bool(over.any())
+        if any_over or last:
             success = None if scores(self.task) else self.task.success(self.sim)
             if success is not None:
                 success = shaped("success", success, (len(self.sim),)).astype(bool)
                 done = over | last
                 self._success[self.active[done]] = (success & ~failed)[done]
-        if not some:
+        if not any_over:
             return
         self._steps[self.active[over]] = t + 1
-        self._failed[self.active[failed]], self._ended[self.active[ended]] = True, True
+        self._failed[self.active[failed]], self._ended[self.active[ends]] = True, True
         frames = slice(t * self._parts, (t + 1) * self._parts)
         for values in self.frames.values():
             values[self.active[failed], frames] = 0.0  # discard the numbers of unstable states
@@ -291,22 +291,22 @@ def _run(
     moments: bool,
     observed: bool,
 ) -> Rollouts:
-    batch, seen = Batch(task, sim, seeds, every), None
-    kept: AnyArray = np.empty((len(seeds), 0), "<f4")
+    batch, sums = Batch(task, sim, seeds, every), None
+    history: AnyArray = np.empty((len(seeds), 0), "<f4")
     acting = Acting(policy, theta)
     while not batch.over:
         x = batch.observe()
         if moments:
-            seen = seen or Moments(len(seeds), x.shape[1])
-            seen.add(batch.rows, x)
+            sums = sums or Moments(len(seeds), x.shape[1])
+            sums.add(batch.rows, x)
         if observed:
-            kept = kept if kept.ndim > 2 else np.zeros((len(seeds), task.steps, x.shape[1]), "<f4")
-            kept[batch.rows, sim.t] = single(x)
+            history = history if history.ndim > 2 else np.zeros((len(seeds), task.steps, x.shape[1]), "<f4")
+            history[batch.rows, sim.t] = single(x)
         action = acting.act(x, batch.active)
         columns = np.shape(action)[1:2] or (sim.model.nu,)
         batch.step(shaped("act of the policy", action, (len(batch.active), *columns)))
-    table = np.empty((len(seeds), 0)) if seen is None else seen.table
-    return replace(batch.rollouts(), moments=table, observations=kept)
+    table = np.empty((len(seeds), 0)) if sums is None else sums.table
+    return replace(batch.rollouts(), moments=table, observations=history)
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`
@@ -349,14 +349,14 @@ def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row
     parts = next(iter(rollouts.frames.values())).shape[1] // task.steps
     steps = int(rollouts.steps[row])
     control = np.repeat(np.arange(steps), parts)
-    shown = whole(rollouts, row)
+    frames = whole(rollouts, row)
     terms, actions, which = rollouts.terms[row], rollouts.actions[row], int(rollouts.which[row])
     return Trajectory.of(
         times=np.arange(steps * parts + 1, dtype=float) * (task.period / parts),
-        bodies=scene.each[which].poses(shown["qpos"], shown.get("mocap")),
+        bodies=scene.each[which].poses(frames["qpos"], frames.get("mocap")),
         actions=np.concatenate([np.zeros((1, actions.shape[1])), actions[control]]),
         terms=np.concatenate([np.zeros((1, terms.shape[1])), terms[control]]),
-        channels=task.show(shown) | scene.said(which, len(shown["qpos"])),
+        channels=task.show(frames) | scene.said(which, len(frames["qpos"])),
         value=float(rollouts.returns[row]),
         success=bool(rollouts.success[row]) if spec.success else None,
     )
@@ -381,12 +381,12 @@ def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> An
 
 def _each(call: Callable[..., AnyArray], *parts: Rollouts) -> Rollouts:
     """Apply a function to every array of rollouts, or to the corresponding arrays of several."""
-    made: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     for name in Rollouts.__dataclass_fields__:
         values = [getattr(part, name) for part in parts]
-        made[name] = (
+        arrays[name] = (
             {key: call(*(value[key] for value in values)) for key in values[0]}
             if isinstance(values[0], Mapping)
             else call(*values)
         )
-    return Rollouts(**made)
+    return Rollouts(**arrays)

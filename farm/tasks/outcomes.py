@@ -24,11 +24,11 @@ def drawn(task: Task, rngs: Sequence[np.random.Generator | None]) -> IntArray:
       TaskError: it draws one that there is not.
     """
     count = len(task.simulated)
-    found = [0 if rng is None else task.which(rng) for rng in rngs]
-    for each in found:
+    indices = [0 if rng is None else task.which(rng) for rng in rngs]
+    for each in indices:
         if isinstance(each, bool) or not isinstance(each, int | np.integer) or not 0 <= each < count:
             raise TaskError(f"which gave {each!r}; expected the index of a model, 0 to {count - 1}")
-    return np.array(found, dtype=int)
+    return np.array(indices, dtype=int)
 
 
 def measured(task: Task, record: Record) -> FloatArray:
@@ -40,11 +40,11 @@ def measured(task: Task, record: Record) -> FloatArray:
     count = len(record.steps)
     if not task.measures:
         return np.empty((count, 0))
-    given, out = task.outcomes(record), np.empty((count, len(task.measures)))
-    if not isinstance(given, dict):
-        raise TaskError(f"outcomes gave a {type(given).__name__}; expected arrays by name")
+    outcomes, out = task.outcomes(record), np.empty((count, len(task.measures)))
+    if not isinstance(outcomes, dict):
+        raise TaskError(f"outcomes gave a {type(outcomes).__name__}; expected arrays by name")
     for column, each in enumerate(task.measures):
-        values = np.where(record.failed, each.low, shaped(f"outcomes {each.name!r}", given.get(each.name), (count,)))
+        values = np.where(record.failed, each.low, shaped(f"outcomes {each.name!r}", outcomes.get(each.name), (count,)))
         if bad := [value for value in values.tolist() if not each.low <= value <= each.high]:
             raise TaskError(
                 f"measure {each.name!r} is {bad[0]:g}; its bounds are {each.low:g} to {each.high:g}: widen them, or "
@@ -72,8 +72,8 @@ def shares(task: Task, terms: FloatArray, clamped: BoolArray) -> FloatArray:
 
 def step_shapes(spec: TaskSpec) -> dict[str, tuple[int, ...]]:
     """Shape of each part of a control step, in the order of a trace of kind `steps`."""
-    own = {"observation": (spec.observation,), "action": (spec.action,), "terms": (len(spec.terms),)}
-    return own | {f"channels/{channel.name}": channel.shape for channel in spec.channels}
+    shapes = {"observation": (spec.observation,), "action": (spec.action,), "terms": (len(spec.terms),)}
+    return shapes | {f"channels/{channel.name}": channel.shape for channel in spec.channels}
 
 
 def whole(spec: TaskSpec) -> tuple[int, int]:
@@ -86,12 +86,13 @@ def stepped(task: Task, spec: TaskSpec, rollouts: "Rollouts", rows: IntArray) ->
 
     Observation and action are those before a step's physics, terms and channels those after it.
     """
-    shown = task.show({name: frames[rows] for name, frames in rollouts.frames.items()})
+    channels = task.show({name: frames[rows] for name, frames in rollouts.frames.items()})
     if len(task.simulated) > 1:
         which = np.eye(len(task.simulated))[rollouts.which[rows]]
-        shown = shown | {MODEL: np.repeat(which[:, None], task.steps, axis=1)}
-    channels = [flat(spec.channels, shown)] if spec.channels else []
-    parts = [rollouts.observations[rows], rollouts.actions[rows], rollouts.terms[rows], *channels]
+        channels = channels | {MODEL: np.repeat(which[:, None], task.steps, axis=1)}
+    parts = [rollouts.observations[rows], rollouts.actions[rows], rollouts.terms[rows]]
+    if spec.channels:
+        parts.append(flat(spec.channels, channels))
     values = np.concatenate([single(part) for part in parts], axis=2)
     values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
     return values

@@ -34,32 +34,34 @@ def specification(task: Task) -> TaskSpec:
       ConfigError: the class cannot be a task.
       TaskError: it returns invalid arrays.
     """
-    found = task.spec() or _found(task)
+    spec = task.spec() or _found(task)
     measures: object = task.measures
     if not isinstance(measures, tuple | list) or not all(isinstance(each, Measure) for each in measures):
         raise ConfigError(f"task {type(task).__name__}: measures is {measures!r:.60}; expected a tuple of farm.Measure")
     names = [each.name for each in task.measures]
     if len(set(names)) < len(names):
         raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
-    for what, count in (("observations", found.observation), ("actions", found.action)):
+    for what, count in (("observations", spec.observation), ("actions", spec.action)):
         _check_quantities(task, what, count)
     several = (_models(task),) if len(task.simulated) > 1 else ()
-    return replace(found, measures=tuple(task.measures), channels=(*found.channels, *several))
+    return replace(spec, measures=tuple(task.measures), channels=(*spec.channels, *several))
 
 
 def _check_quantities(task: Task, what: str, count: int) -> None:
     """Check the quantities that a task names in an attribute, if it names any."""
-    given: object = getattr(task, what)
-    if not isinstance(given, tuple | list) or not all(isinstance(each, Quantity) for each in given):
-        raise ConfigError(f"task {type(task).__name__}: {what} is {given!r:.60}; expected a tuple of farm.Quantity")
-    if given and len(given) != count:
-        raise ConfigError(f"task {type(task).__name__}: {what} names {len(given)} numbers; there are {count}")
+    quantities: object = getattr(task, what)
+    if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
+        raise ConfigError(
+            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected a tuple of farm.Quantity"
+        )
+    if quantities and len(quantities) != count:
+        raise ConfigError(f"task {type(task).__name__}: {what} names {len(quantities)} numbers; there are {count}")
 
 
 def _models(task: Task) -> Channel:
     """The channel that says which of several models a rollout has."""
-    known = mixed.names(task.simulated)
-    return Channel(name=MODEL, kind="flags", shape=(len(known),), labels=known)
+    names = mixed.names(task.simulated)
+    return Channel(name=MODEL, kind="flags", shape=(len(names),), labels=names)
 
 
 def tried(task: Task, rollouts: int, look: Callable[[Sim], T]) -> T:
@@ -122,11 +124,11 @@ def _check_class(task: Task) -> None:
     if not task.model.nu:
         raise ConfigError(f"task {name}: its model has no actuator, so that there is nothing to learn")
     for method in _METHODS:
-        own, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
+        signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
         try:
-            own.bind(*base.parameters)
+            signature.bind(*base.parameters)
         except TypeError:
-            raise ConfigError(f"task {name}: {method}{own}; expected ({', '.join(base.parameters)})") from None
+            raise ConfigError(f"task {name}: {method}{signature}; expected ({', '.join(base.parameters)})") from None
 
 
 def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
@@ -138,6 +140,6 @@ def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
     missing = [c.name for c in task.channels if c.name not in frames]
     if missing and type(task).show is Task.show:
         raise TaskError(f"channel {missing[0]!r} is not measured: measure gives {', '.join(frames)}")
-    shown = task.show({name: values[:, :1] for name, values in frames.items()})
+    channels = task.show({name: values[:, :1] for name, values in frames.items()})
     for channel in task.channels:
-        shaped(f"channel {channel.name!r}", shown.get(channel.name), (1, 1, *channel.shape))
+        shaped(f"channel {channel.name!r}", channels.get(channel.name), (1, 1, *channel.shape))

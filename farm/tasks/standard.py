@@ -19,8 +19,8 @@ _FLOOR: Final = 1.0 / 3.0  # of a part's mean spread
 
 def start(task: Task) -> tuple[FloatArray, FloatArray | None]:
     """Positions at the nominal start (nq,), and poses of the mocap bodies (nmocap, 7); None without any."""
-    found = tried(task, 1, lambda sim: Batch(task, sim, [None]).start)
-    return found["qpos"][0], found["mocap"][0] if "mocap" in found else None
+    arrays = tried(task, 1, lambda sim: Batch(task, sim, [None]).start)
+    return arrays["qpos"][0], arrays["mocap"][0] if "mocap" in arrays else None
 
 
 def nominal(task: Task) -> FloatArray:
@@ -45,15 +45,15 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
       ConfigError: the task cannot start.
       TaskError: an observation is not finite.
     """
-    seen = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, len(task.limits[0]))))
-    low, high = np.quantile(seen, (0.25, 0.75), axis=0)
-    spread, parts = (high - low) / _QUARTILES, task.parts or (seen.shape[1],)
+    x = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, len(task.limits[0]))))
+    low, high = np.quantile(x, (0.25, 0.75), axis=0)
+    spread, parts = (high - low) / _QUARTILES, task.parts or (x.shape[1],)
     if sum(parts) != len(spread):
         raise TaskError(f"parts are {parts}; expected sizes that add up to the observation's {len(spread)}")
     for part in np.split(spread, np.cumsum(parts)[:-1]):  # views
         mean = part.mean()
         np.maximum(part, _FLOOR * mean if mean > 0.0 else 1.0, out=part)
-    return {"origin": seen[0].copy(), "spread": spread}
+    return {"origin": x[0].copy(), "spread": spread}
 
 
 def observed(task: Task, count: int) -> FloatArray:
@@ -73,17 +73,18 @@ def _observed(task: Task, actions: FloatArray) -> FloatArray:
     """Observations of rollouts with constant actions (B, A) from the nominal start, which is the first, (N, d)."""
 
     def look(sim: Sim) -> list[FloatArray]:
-        seen, size = [], sim.engine.size  # of a task's own engine, which may have fewer rows than there are actions
-        for some in np.split(actions, range(size, len(actions), size)):
-            batch = Batch(task, sim, [None] * max(1, len(some)))
-            seen.append(np.array(batch.observe(), dtype=float))
-            while len(some) and not batch.over:
-                batch.step(some[batch.active])
+        # A task's own engine may have fewer rows than there are actions.
+        observations, size = [], sim.engine.size
+        for constant in np.split(actions, range(size, len(actions), size)):
+            batch = Batch(task, sim, [None] * max(1, len(constant)))
+            observations.append(np.array(batch.observe(), dtype=float))
+            while len(constant) and not batch.over:
+                batch.step(constant[batch.active])
                 if not batch.over:
-                    seen.append(np.array(batch.observe(), dtype=float))
-        return seen
+                    observations.append(np.array(batch.observe(), dtype=float))
+        return observations
 
-    seen = np.concatenate(tried(task, max(1, len(actions)), look))
-    if not np.isfinite(seen).all():
+    x = np.concatenate(tried(task, max(1, len(actions)), look))
+    if not np.isfinite(x).all():
         raise TaskError("observe is not finite")
-    return seen
+    return x

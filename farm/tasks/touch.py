@@ -116,15 +116,15 @@ class Touch:
           ConfigError: there is no such sensor, it is of another kind, or the numbers do not fill the pictures.
         """
         self._config, self._steps, self._name = config, steps, name
-        found = [[_sensor(model, sensor) for sensor in sensors] for sensors in pads.values()]
-        counts = [sum(len(each.at) for each in pad) for pad in found]
+        by_pad = [[_sensor(model, sensor) for sensor in sensors] for sensors in pads.values()]
+        counts = [sum(len(each.at) for each in pad) for pad in by_pad]
         height, width = shape or (1, counts[0] if counts else 0)
         if not counts or set(counts) != {height * width}:
             raise ConfigError(
                 f"touch: the pads' sensors give {', '.join(map(str, counts)) or 'no'} numbers; expected "
                 f"{height} x {width} for each"
             )
-        sensors = [each for pad in found for each in pad]
+        sensors = [each for pad in by_pad for each in pad]
         units = {each.unit for each in sensors}
         if len(units) > 1:
             raise ConfigError(f"touch: the sensors' units are {' and '.join(sorted(units))}; expected one")
@@ -132,12 +132,12 @@ class Touch:
         self._found = np.concatenate([each.found.ravel() for each in sensors])
         slots = [each.at.shape[1] for each in sensors for _ in each.at]
         self._first = np.cumsum([0, *slots[:-1]])  # where each number's slots begin, (n,)
-        places = [_places(model, pad) for pad in found]
+        places = [_places(model, pad) for pad in by_pad]
         where: dict[str, Any] = {}
         if all(place is not None for place in places):
             where = {"bodies": tuple(p[0] for p in places if p), "places": np.stack([p[1] for p in places if p])}
         self.channel = Channel(
-            name=name, kind="images", shape=(len(found), height, width), labels=tuple(pads), top=top, unit=units.pop(),
+            name=name, kind="images", shape=(len(by_pad), height, width), labels=tuple(pads), top=top, unit=units.pop(),
             trace=True, **where,
         )  # fmt: skip
         """What shows the true readings; on the pads too, if each is on one body with a name."""
@@ -189,8 +189,8 @@ def _sensor(model: mujoco.MjModel, name: str) -> _Sensor:
         return _Sensor(at, at, "N", int(model.site_bodyid[of]), model.site_pos[of][None].copy())
     if what == "tactile":
         at = first + np.arange(size // 3)[:, None]  # depths come first, then two slips of each vertex
-        begin, count = int(model.mesh_vertadr[of]), int(model.mesh_vertnum[of])
-        places = _turned(model, other, model.mesh_vert[begin : begin + count])
+        start, count = int(model.mesh_vertadr[of]), int(model.mesh_vertnum[of])
+        places = _turned(model, other, model.mesh_vert[start : start + count])
         return _Sensor(at, at, "m", int(model.geom_bodyid[other]), places)
     if what == "contact":
         fields = [bit for bit in range(len(_FIELDS)) if int(model.sensor_intprm[i, 0]) >> bit & 1]

@@ -74,17 +74,17 @@ class WarpEngine:
 
     def field(self, name: str) -> AnyArray:
         """A live array over all rows."""
-        known = self._host.get(name)
-        if known is None:
+        values = self._host.get(name)
+        if values is None:
             check_field(name)
             if not hasattr(self._data, name):
                 raise AttributeError(f"sim has no {name!r} on the backend warp: MuJoCo Warp does not give it")
             like = np.asarray(getattr(self._example, name))
-            known = self._host[name] = np.zeros((self.size, *like.shape), like.dtype)
+            values = self._host[name] = np.zeros((self.size, *like.shape), like.dtype)
             self._read(name)
-        known = known.view()
-        known.flags.writeable = name in STATE_FIELDS
-        return known
+        values = values.view()
+        values.flags.writeable = name in STATE_FIELDS
+        return values
 
     def reset(self, ids: IntArray) -> None:
         """Set all rows to the model's initial state."""
@@ -139,8 +139,8 @@ class WarpEngine:
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row."""
         if name not in self._expanded:
-            own = np.asarray(own_value(self.model, name))
-            self._expanded[name] = np.tile(own, (self.size, *[1] * own.ndim))
+            value = np.asarray(own_value(self.model, name))
+            self._expanded[name] = np.tile(value, (self.size, *[1] * value.ndim))
             self._model()
         return self._expanded[name]
 
@@ -168,9 +168,9 @@ class WarpEngine:
 
     def _model(self) -> None:
         fields = {*self._expanded, *(_DERIVED if self._expanded else ())}
-        there = {name: self._worlds for name in fields if np.size(own_value(self.model, name))}
+        sizes = {name: self._worlds for name in fields if np.size(own_value(self.model, name))}
         try:
-            self._device = mujoco_warp.put_model(self._plain, batch_sizes=there)
+            self._device = mujoco_warp.put_model(self._plain, batch_sizes=sizes)
         except (NotImplementedError, ValueError) as error:
             raise FarmError(f"MuJoCo Warp cannot simulate this model: {error}") from None
         self._device.opt.warn_overflow = False
@@ -222,8 +222,8 @@ class WarpEngine:
 
     def _read(self, name: str) -> None:
         if self._has(name):
-            known = self._host[name]
-            known[: self._worlds] = _numbers(getattr(self._data, name)).reshape(self._worlds, *known.shape[1:])
+            values = self._host[name]
+            values[: self._worlds] = _numbers(getattr(self._data, name)).reshape(self._worlds, *values.shape[1:])
 
 
 def _numbers(values: Any) -> AnyArray:  # noqa: ANN401  a warp array
@@ -233,11 +233,11 @@ def _numbers(values: Any) -> AnyArray:  # noqa: ANN401  a warp array
 
 def _like(values: AnyArray, field: Any) -> AnyArray:  # noqa: ANN401  a warp array
     """Values of the host in the device's type and shape."""
-    there = field.numpy()
-    return np.ascontiguousarray(values.reshape(there.shape), dtype=there.dtype)
+    array = field.numpy()
+    return np.ascontiguousarray(values.reshape(array.shape), dtype=array.dtype)
 
 
 def _defaults(model: mujoco.MjModel) -> tuple[int, int]:
     """Numbers of contacts and constraints that MuJoCo Warp allocates per world by default."""
-    made = mujoco_warp.make_data(model)
-    return made.naconmax, made.njmax
+    data = mujoco_warp.make_data(model)
+    return data.naconmax, data.njmax

@@ -83,10 +83,10 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
     ) -> tuple[FloatArray, dict[str, Any]]:
         """Release the object; with perturb=True under conditions drawn from the seed."""
         super().reset(seed=seed, options=options)
-        drawn = None
+        words = None
         if self._task.config.perturb:  # as the farm has seeds: four words
-            drawn = tuple(self.np_random.integers(0, 2**32, 4).tolist())
-        self._batch = Batch(self._task, self._sim, [drawn])
+            words = tuple(self.np_random.integers(0, 2**32, 4).tolist())
+        self._batch = Batch(self._task, self._sim, [words])
         self._x = self._look()
         return self._x.copy(), self._info(np.zeros(len(self._terms)), success=False)
 
@@ -94,14 +94,14 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         """Move for one control step of 0.1 s."""
         batch, t = self._batch, self._sim.t
         batch.step(np.asarray(action, dtype=float)[None])
-        ended, over = not len(batch.active), self._sim.t >= self._task.steps
-        if not ended:
+        terminated, over = not len(batch.active), self._sim.t >= self._task.steps
+        if not terminated:
             self._x = self._look()
         score = self._task.score(batch.record())
         assert score.success is not None
         terms = score.terms[0, t]
         info = self._info(terms, success=bool(over and score.success[0]))
-        return self._x.copy(), self._task.return_scale * float(terms.sum()), ended, over and not ended, info
+        return self._x.copy(), self._task.return_scale * float(terms.sum()), terminated, over and not terminated, info
 
     def render(self) -> AnyArray | None:  # type: ignore[override]  (Gymnasium's may be a list as well)
         """A picture of 480 x 640 pixels, None without a render mode."""

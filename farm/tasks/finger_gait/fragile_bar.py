@@ -136,10 +136,10 @@ class FragileBar(HandTask):
 
     def _succeeded(self, record: Record, force: FloatArray, middle: FloatArray) -> BoolArray:
         last, pose = slice(-SUCCESS_STEPS, None), slice(len(JOINTS), None)
-        held = (force[:, last] >= PRESSES).all(axis=(1, 2))
-        there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose]).all(axis=1)
+        pressed = (force[:, last] >= PRESSES).all(axis=(1, 2))
+        still = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose]).all(axis=1)
         whole = (middle <= BREAKS).all(axis=1) & (record.steps == self.steps) & ~record.failed
-        return np.asarray(_gentle(middle[:, last]).all(axis=1) & held & there & whole)
+        return np.asarray(_gentle(middle[:, last]).all(axis=1) & pressed & still & whole)
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:  # type: ignore[override]  # as the finger gait's

@@ -123,7 +123,7 @@ class HandTask(Task):
     def hands(self) -> tuple[model.Hand, ...]:
         """And into that of each object."""
         pose = POSES[self.pose]
-        return tuple(model.Hand(*named, pose) for named in zip(self.simulated, self.objects, strict=True))
+        return tuple(model.Hand(*pair, pose) for pair in zip(self.simulated, self.objects, strict=True))
 
     @property
     def action(self) -> str:
@@ -189,22 +189,22 @@ class HandTask(Task):
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
         """Set friction and mass, close the start grip around the frozen object, and release the object."""
         nominal = Perturbation.none(self.steps)
-        drawn = [nominal if rng is None else self._drawn(rng) for rng in rngs]
-        if self.config.friction != 1.0 or any(each is not nominal for each in drawn):
-            self._set_conditions(sim, drawn)
-        self._close(sim, self.start_commands[sim.which], np.stack([each.displacement for each in drawn]))
+        perturbations = [nominal if rng is None else self._drawn(rng) for rng in rngs]
+        if self.config.friction != 1.0 or any(each is not nominal for each in perturbations):
+            self._set_conditions(sim, perturbations)
+        self._close(sim, self.start_commands[sim.which], np.stack([each.displacement for each in perturbations]))
         for name in ("noise", "force_noise", "lost"):
-            sim.own[name] = np.stack([getattr(each, name) for each in drawn])
+            sim.own[name] = np.stack([getattr(each, name) for each in perturbations])
         sim.own["target"] = self.start_commands[sim.which]
         sim.own["released"] = sim.qpos[:, len(JOINTS) :].copy()
 
     def _drawn(self, rng: np.random.Generator) -> Perturbation:
         return Perturbation.draw(rng, self.steps, self.config)
 
-    def _set_conditions(self, sim: Sim, drawn: Sequence[Perturbation]) -> None:
+    def _set_conditions(self, sim: Sim, perturbations: Sequence[Perturbation]) -> None:
         friction, mass, inertia = (sim.expand(f) for f in ("geom_friction", "body_mass", "body_inertia"))
         body = self.hand.object_body
-        for row, each in enumerate(drawn):
+        for row, each in enumerate(perturbations):
             friction[row] *= each.friction * self.config.friction
             mass[row, body] *= each.mass
             inertia[row, body] *= each.mass
@@ -236,7 +236,7 @@ class HandTask(Task):
 
     def observe(self, sim: Sim) -> FloatArray:
         """The state base's x, (B, d)."""
-        state, (own, place, force) = STATES[self.config.state], self.scales
+        state, (angle, place, force) = STATES[self.config.state], self.scales
         joints = self.joints(sim)
         images = points = behind = joints  # unused by a state base without touch
         if state.touch:
@@ -245,7 +245,7 @@ class HandTask(Task):
             images = images * force
         if self.zeroed:
             behind = sensing.deflections(sim, joints, self.config.stiffness)
-        return state.observe(Felt(joints * own, images, points, behind))
+        return state.observe(Felt(joints * angle, images, points, behind))
 
     def joints(self, sim: Sim) -> FloatArray:
         """The joint readings (B, 8) [rad]."""

@@ -47,8 +47,8 @@ def files(names: Sequence[str], pose: str, stiffness: float = 1.0) -> dict[str, 
       ConfigError: an object does not exist.
     """
     parts = {name: (folder() / name).read_text("utf-8") for name in ("hand.xml", "finger_gait.xml")}
-    own = {object_file(i): _object(name) for i, name in enumerate(names)}
-    return posed({**parts, **own}, POSES[pose], stiffness)
+    bodies = {object_file(i): _object(name) for i, name in enumerate(names)}
+    return posed({**parts, **bodies}, POSES[pose], stiffness)
 
 
 def object_file(index: int) -> str:
@@ -57,10 +57,10 @@ def object_file(index: int) -> str:
 
 
 def _object(name: str) -> str:
-    known = objects()
+    names = objects()
     path = Path(name) if name.endswith(".xml") else folder() / f"objects/{name}.xml"
-    if not name.endswith(".xml") and name not in known:
-        raise ConfigError(f"unknown object {name!r}; known are {', '.join(known)}, or a file NAME.xml")
+    if not name.endswith(".xml") and name not in names:
+        raise ConfigError(f"unknown object {name!r}; known are {', '.join(names)}, or a file NAME.xml")
     try:
         return path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -93,7 +93,7 @@ def _in_radians(thing: ET.Element) -> bool:
     compilers = thing.findall("compiler")
     if any(compiler.get("angle") == "radian" for compiler in compilers):
         return False
-    found = bool(compilers)
+    any_angle = bool(compilers)
     for element in thing.iter():
         hinge = element.tag == "joint" and element.get("type", "hinge") in ("hinge", "ball")
         for name, first in (_TURNS | _OF_HINGES if hinge else _TURNS).items():
@@ -102,11 +102,11 @@ def _in_radians(thing: ET.Element) -> bool:
                 angles = [repr(math.radians(float(number))) for number in numbers[first:]]
                 if angles:
                     element.set(name, " ".join([*numbers[:first], *angles]))
-                    found = True
-    if found:
+                    any_angle = True
+    if any_angle:
         for compiler in compilers or [ET.SubElement(thing, "compiler")]:
             compiler.set("angle", "radian")
-    return found
+    return any_angle
 
 
 def _body(root: ET.Element, name: str) -> ET.Element:

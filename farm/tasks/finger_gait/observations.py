@@ -61,7 +61,7 @@ class StateBase:
         angles = zip(JOINTS, LOWER * joints, UPPER * joints, strict=True)
         taxels, axes = [f"taxel {i}" for i in range(TAXELS)], [f"contact {axis}" for axis in "xyz"]
         forces = _times(force, "N"), 0.0
-        known = {
+        quantities = {
             "joints": [Quantity(name, _times(joints, "rad"), *map(float, bounds)) for name, *bounds in angles],
             "images": [Quantity(f"{finger} {name}", *forces) for finger in FINGERS for name in taxels],
             "points": [
@@ -72,7 +72,7 @@ class StateBase:
             "forces": [Quantity(f"{finger} force", *forces) for finger in FINGERS],
             "behind": [Quantity(f"{name} deflection", "N") for name in JOINTS],
         }
-        return tuple(each for part in self.parts for each in known[part])
+        return tuple(each for part in self.parts for each in quantities[part])
 
     @property
     def touch(self) -> bool:

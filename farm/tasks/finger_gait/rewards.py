@@ -98,8 +98,8 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
     rows, last = np.arange(count), steps - 1
     out = np.where((np.arange(horizon) < steps[:, None])[..., None], terms, 0.0)
     out[rows[failed], last[failed]] = 0.0
-    ended = dropped | failed
-    out[rows[ended], last[ended], 4] = -weights.drop
+    cut = dropped | failed
+    out[rows[cut], last[cut], 4] = -weights.drop
     return out
 
 

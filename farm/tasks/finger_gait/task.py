@@ -82,16 +82,16 @@ class FingerGaitConfig(SensingConfig):
     """Factor of the taxels' forces [N] in the state."""
 
     def __post_init__(self) -> None:
-        given = (self.object,) if isinstance(self.object, str) else self.object
-        object.__setattr__(self, "object", given)
+        objects = (self.object,) if isinstance(self.object, str) else self.object
+        object.__setattr__(self, "object", objects)
         super().__post_init__()
         # A path so that a run can be repeated from anywhere.
-        names = tuple(str(Path(each).resolve()) if each.endswith(".xml") else each for each in given)
+        names = tuple(str(Path(each).resolve()) if each.endswith(".xml") else each for each in objects)
         stems = [Path(each).stem for each in names]
         if len(set(stems)) < len(stems) or not stems:
             raise ConfigError(f"object is {', '.join(names) or 'empty'}; expected one name, or several different ones")
         object.__setattr__(self, "object", names if len(names) > 1 else names[0])
-        for kind, name, known in (
+        for kind, name, options in (
             ("pose", self.pose, POSES),
             ("grip", self.start_grip, GRIPS),
             ("grip", self.goal_grip, GRIPS),
@@ -99,8 +99,8 @@ class FingerGaitConfig(SensingConfig):
             ("reward", self.reward, REWARDS),
             ("weights", self.weights, WEIGHTS),
         ):
-            if name not in known:
-                raise ConfigError(f"unknown {kind} {name!r}; known are {', '.join(known)}")
+            if name not in options:
+                raise ConfigError(f"unknown {kind} {name!r}; known are {', '.join(options)}")
         if self.steps and not SUCCESS_STEPS <= self.steps <= 1000:
             raise ConfigError(f"steps is {self.steps}; expected {SUCCESS_STEPS} to 1000")
 
@@ -134,11 +134,11 @@ class FingerGait(HandTask):
 
     def __init__(self, config: Any = None, variant: str = "", files: Files | None = None) -> None:  # noqa: ANN401
         """Take what the settings say of object, hand and grip."""
-        own: Any = self.Config() if config is None else config
-        self.pose, self.start_grip, self.clip = own.pose, own.start_grip, own.clip
-        self.scales = own.joints_scale, own.contacts_scale, own.tactile_scale
-        self.terms = (*TERMS, *(["motion"] if own.motion else []))
-        super().__init__(own, variant, files)
+        settings: Any = self.Config() if config is None else config
+        self.pose, self.start_grip, self.clip = settings.pose, settings.start_grip, settings.clip
+        self.scales = settings.joints_scale, settings.contacts_scale, settings.tactile_scale
+        self.terms = (*TERMS, *(["motion"] if settings.motion else []))
+        super().__init__(settings, variant, files)
 
     @property
     def object(self) -> str:  # type: ignore[override]  # a setting here
@@ -148,8 +148,8 @@ class FingerGait(HandTask):
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of all objects."""
-        given = self.config.object
-        return (given,) if isinstance(given, str) else given
+        names = self.config.object
+        return (names,) if isinstance(names, str) else names
 
     @property
     def return_scale(self) -> float:  # type: ignore[override]  # a setting here
@@ -164,8 +164,8 @@ class FingerGait(HandTask):
         Raises:
           ConfigError: the fingers cannot reach an object, or a grip does not hold it.
         """
-        grip, found = self.config.goal_grip, enumerate(self._find_start(sim))
-        self.goals = [self._demonstrate(sim, grip, each.command(GRIPS[grip]), which) for which, each in found]
+        grip, starts = self.config.goal_grip, enumerate(self._find_start(sim))
+        self.goals = [self._demonstrate(sim, grip, each.command(GRIPS[grip]), which) for which, each in starts]
 
     # A chain of gaits
 
@@ -211,8 +211,8 @@ class FingerGait(HandTask):
         terms = np.empty((*record.actions.shape[:2], len(TERMS)))
         for which in np.unique(record.which).tolist():
             its, goal = record.which == which, self.goals[which]
-            some = Felt(felt.joints[its], felt.images[its], felt.points[its])
-            terms[its] = call(some, record.actions[its], goal, weights)
+            part = Felt(felt.joints[its], felt.images[its], felt.points[its])
+            terms[its] = call(part, record.actions[its], goal, weights)
         return terms
 
     def _motion(self, record: Record) -> FloatArray:
@@ -225,8 +225,8 @@ class FingerGait(HandTask):
         last = slice(-SUCCESS_STEPS, None)
         grips = pressing(record.frames["force"][:, last]) == self._wanted
         pose = slice(len(JOINTS), None)
-        there = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
-        return np.asarray(grips.all(axis=(1, 2)) & there.all(axis=1))
+        still = stayed(record.frames["qpos"][:, last, pose], record.start["qpos"][:, None, pose])
+        return np.asarray(grips.all(axis=(1, 2)) & still.all(axis=1))
 
     def exported(self) -> dict[str, Any]:
         """Everything that `observe`, `act` and `score` use, with the first object."""

@@ -80,13 +80,13 @@ class Turning(HandTask):
         """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d)."""
         # 1 - cosine is zero where a cycle begins, as the sine is: only a policy's offsets change the grip there.
         phase = 2.0 * np.pi * _HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
-        seen = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
+        parts = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
         if "joints" in self.config.state:
-            seen.append(self.joints(sim) - self.start_commands[sim.which])
+            parts.append(self.joints(sim) - self.start_commands[sim.which])
         if "forces" in self.config.state:
             exact = not self.config.numb
-            seen.append(_FORCE * (self.measure(sim)["force"] if exact else self.images(sim)).sum(axis=-1))
-        return np.concatenate(seen, axis=1)
+            parts.append(_FORCE * (self.measure(sim)["force"] if exact else self.images(sim)).sum(axis=-1))
+        return np.concatenate(parts, axis=1)
 
     def ended(self, sim: Sim) -> BoolArray:
         """Whether the plate is tilted too far, out of place, or touched by no fingertip, (B,)."""
@@ -97,8 +97,8 @@ class Turning(HandTask):
     def score(self, record: Record) -> Score:
         """Reward terms; success: the plate is still held, and turned at half the wanted speed or more on average."""
         pose, start = record.frames["qpos"][..., len(JOINTS) :], record.start["qpos"][:, None, len(JOINTS) :]
-        wanted = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
-        speed = turned(np.concatenate([start, pose], axis=1)) / wanted
+        target = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
+        speed = turned(np.concatenate([start, pose], axis=1)) / target
         shift, _ = distance(pose, start)
         change = np.diff(record.frames["target"], axis=1, prepend=record.start["target"][:, None])
         lean = (1.0 - upright(pose)) / (1.0 - _LEVEL)
