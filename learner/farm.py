@@ -172,11 +172,11 @@ class Farm:
           RunError: an evaluation failed on every worker that tried it, or the pool is closed.
         """
         theta = self._parameters(thetas)
-        drawn = self._seeds(seeds, len(theta))
+        words = self._seeds(seeds, len(theta))
         if not len(theta):
             return np.empty(0)
         with self._turn():
-            self._begin(Jobs.exploring(theta, (1,), drawn))
+            self._begin(Jobs.exploring(theta, (1,), words))
             return self._collected().returns.copy()
 
     def evaluate(
@@ -197,26 +197,26 @@ class Farm:
           ConfigError: traces are wanted, but no channel of the task is traced.
         """
         theta, spec = self._parameters(thetas), self._problem.spec
-        drawn = self._seeds(seeds, len(theta))
+        words = self._seeds(seeds, len(theta))
         if traces and not spec.traced:
             raise ConfigError("traces: no channel of the task has trace=True")
         count = len(theta)
         if not count:
             sizes = ((0,), (0, len(spec.measures)), (0, len(spec.terms)), (0, *spec.trace))
-            none, own, terms, trace = (np.zeros(size) for size in sizes)
+            none, measures, terms, trace = (np.zeros(size) for size in sizes)
             flags, empty = none.astype(bool), trace.astype("<f4") if traces else None
-            return Evaluated(none, own, flags if spec.success else None, flags, none.astype(int), terms, empty)
+            return Evaluated(none, measures, flags if spec.success else None, flags, none.astype(int), terms, empty)
         with self._turn():
-            self._begin(Jobs.exploring(theta, (1,), drawn), "all" if traces else "none", terms=True)
-            found = self._collected()
+            self._begin(Jobs.exploring(theta, (1,), words), "all" if traces else "none", terms=True)
+            results = self._collected()
         return Evaluated(
-            returns=found.returns,
-            measures=found.measures if spec.measures else np.zeros((count, 0)),
-            success=found.flags[:, 0] if spec.success else None,
-            failed=found.flags[:, 2],
-            steps=found.steps,
-            terms=found.terms,
-            traces=np.stack([found.traces[row] for row in range(count)]) if traces else None,
+            returns=results.returns,
+            measures=results.measures if spec.measures else np.zeros((count, 0)),
+            success=results.flags[:, 0] if spec.success else None,
+            failed=results.flags[:, 2],
+            steps=results.steps,
+            terms=results.terms,
+            traces=np.stack([results.traces[row] for row in range(count)]) if traces else None,
         )
 
     def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
@@ -225,8 +225,8 @@ class Farm:
         The call ends when its last pair was taken, or when the iterator is closed. Until then other calls wait.
         """
         theta = self._parameters(thetas)
-        drawn = self._seeds(seeds, len(theta))
-        return self._as_they_come(Jobs.exploring(theta, (1,), drawn)) if len(theta) else iter(())
+        words = self._seeds(seeds, len(theta))
+        return self._as_they_come(Jobs.exploring(theta, (1,), words)) if len(theta) else iter(())
 
     def _as_they_come(self, jobs: Jobs) -> Iterator[tuple[int, float]]:
         with self._turn():
@@ -242,9 +242,9 @@ class Farm:
     def rollout(self, theta: Any, seed: int | None = None) -> Trajectory:  # noqa: ANN401
         """One rollout at physics rate, with its channels, of parameters (P,)."""
         (one,) = self._parameters([theta])
-        drawn = self._seeds(None if seed is None else [seed], 1)
+        words = self._seeds(None if seed is None else [seed], 1)
         with self._turn():
-            self._begin(Jobs.single(one, "physics", None if drawn is None else drawn[0]))
+            self._begin(Jobs.single(one, "physics", None if words is None else words[0]))
             trajectory = self._collected().trajectory(0)
         assert trajectory is not None
         return trajectory
@@ -252,13 +252,13 @@ class Farm:
     def close(self) -> None:
         """Stop the local workers; a waiting call raises RunError. Closing twice is allowed."""
         self._closed.set()
-        mine = self._holder == threading.get_ident()  # an unfinished imap of this thread
-        if not mine:
+        within_imap = self._holder == threading.get_ident()  # an unfinished imap of this thread
+        if not within_imap:
             self._taken.acquire()
         try:
             self._finish()
         finally:
-            if not mine:
+            if not within_imap:
                 self._taken.release()
 
     def __enter__(self) -> "Farm":
@@ -307,16 +307,16 @@ class Farm:
     def _parameters(self, thetas: Any) -> FloatArray:  # noqa: ANN401
         expected = f"expected numbers of shape (B, {self.size})"
         try:
-            given = np.asarray(thetas)
+            array = np.asarray(thetas)
         except (TypeError, ValueError, RuntimeError):  # such as rows of different lengths, or a tensor with a gradient
             raise ConfigError(f"thetas is a {type(thetas).__name__} that is not an array; {expected}") from None
-        if given.shape == (0,):
+        if array.shape == (0,):
             return np.empty((0, self.size))
-        if given.dtype.kind not in "biuf":  # text or complex numbers would be converted
-            raise ConfigError(f"thetas is a {type(thetas).__name__} of {given.dtype.name}; {expected}")
-        theta = np.ascontiguousarray(given, dtype=np.float64)
-        if given.ndim != 2 or given.shape[1] != self.size:
-            raise ConfigError(f"thetas has shape {given.shape}; expected (B, {self.size})")
+        if array.dtype.kind not in "biuf":  # text or complex numbers would be converted
+            raise ConfigError(f"thetas is a {type(thetas).__name__} of {array.dtype.name}; {expected}")
+        theta = np.ascontiguousarray(array, dtype=np.float64)
+        if array.ndim != 2 or array.shape[1] != self.size:
+            raise ConfigError(f"thetas has shape {array.shape}; expected (B, {self.size})")
         if not np.isfinite(theta).all():
             row = int(np.flatnonzero(~np.isfinite(theta).all(axis=1))[0])
             raise ConfigError(f"thetas[{row}] is not finite; expected finite numbers")

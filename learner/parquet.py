@@ -41,11 +41,11 @@ def write(path: Path, columns: Mapping[str, "AnyArray | tuple[str, Sequence[Any]
 
     kinds = {"int": pyarrow.int64(), "number": pyarrow.float64(), "truth": pyarrow.bool_(), "text": pyarrow.string()}
     kinds["texts"] = pyarrow.list_(pyarrow.string())
-    made = {
-        name: _nested(given) if isinstance(given, np.ndarray) else pyarrow.array(list(given[1]), kinds[given[0]])
-        for name, given in columns.items()
+    arrays = {
+        name: _nested(values) if isinstance(values, np.ndarray) else pyarrow.array(list(values[1]), kinds[values[0]])
+        for name, values in columns.items()
     }
-    table = pyarrow.table(made)
+    table = pyarrow.table(arrays)
     if index:
         table = table.replace_schema_metadata({"pandas": _pandas(list(columns), index)})
     content = pyarrow.BufferOutputStream()

@@ -41,9 +41,9 @@ class ARS(Mirrored):
     def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
         """The next mu; if all used returns are equal, it does not move."""
         top = self.top or -(-self.pairs // 2)
-        used = np.sort(np.argsort(-returns.max(axis=1), kind="stable")[:top])
-        spread = float(returns[used].std())
-        contrast = returns[used, 0] - returns[used, 1]
-        step = weighted_sum(contrast, eps[used] / state.sigma)
+        rows = np.sort(np.argsort(-returns.max(axis=1), kind="stable")[:top])
+        spread = float(returns[rows].std())
+        contrast = returns[rows, 0] - returns[rows, 1]
+        step = weighted_sum(contrast, eps[rows] / state.sigma)
         rate = self.learning_rate_mu / (top * spread) if spread > 0.0 else 0.0
         return {"mu": state.mu + rate * step}

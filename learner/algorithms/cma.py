@@ -36,10 +36,10 @@ class CMAState(SearchState):
 
     def _check_sizes(self) -> None:
         size = self.mu.size
-        wanted = {"sigma": (size,), "step": (1,), "covariance": (size, size * (size + 1) // 2)}
+        sizes = {"sigma": (size,), "step": (1,), "covariance": (size, size * (size + 1) // 2)}
         for name in self._vectors()[1:]:
-            if (found := getattr(self, name).size) not in wanted.get(name, (size,)) or not found:
-                raise ValueError(f"state: {name} has {found} entries, with {size} parameters")
+            if (entries := getattr(self, name).size) not in sizes.get(name, (size,)) or not entries:
+                raise ValueError(f"state: {name} has {entries} entries, with {size} parameters")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +74,8 @@ class CMAES(Settings):
         least, most = self.sizes
         if not least <= size <= most:
             raise ConfigError(f"the policy has {size} parameters; {self.name} takes {least} to {most}")
-        begun = self._library()(mean=np.full(size, float(self.initial_mu)), sigma=float(self.initial_sigma))
-        return CMAState(**self._read(begun))
+        search = self._library()(mean=np.full(size, float(self.initial_mu)), sigma=float(self.initial_sigma))
+        return CMAState(**self._read(search))
 
     def restore(self, values: Mapping[str, StateValue]) -> CMAState:
         """Return the state from which `to_dict` made these values."""
@@ -108,10 +108,10 @@ class CMAES(Settings):
         with np.errstate(all="ignore"):
             try:
                 search.tell([(state.mu + row, -float(value)) for row, value in zip(eps, returns[:, 0], strict=True)])
-                told = self._read(search)
+                arrays = self._read(search)
             except (AssertionError, ArithmeticError, np.linalg.LinAlgError) as error:
                 raise Diverged(f"the update after generation {state.generation} failed: {error}") from None
-        return moved(state, returns, **told)
+        return moved(state, returns, **arrays)
 
     def _entries(self, size: int) -> int:
         """Number of values that store the covariance of this number of parameters."""
@@ -128,19 +128,19 @@ class CMAES(Settings):
         """The library's object in this state."""
         mean, step = np.array(state.mu), float(state.step[0])
         search = self._library()(mean=mean, sigma=step, population_size=self.population)
-        own = {"_p_sigma": np.array(state.step_path), "_pc": np.array(state.covariance_path), "_g": state.generation}
-        search.__setstate__({**search.__getstate__(), **own, self.stored: np.array(state.covariance)})
+        values = {"_p_sigma": np.array(state.step_path), "_pc": np.array(state.covariance_path), "_g": state.generation}
+        search.__setstate__({**search.__getstate__(), **values, self.stored: np.array(state.covariance)})
         return search
 
     def _read(self, search: Any) -> dict[str, Any]:  # noqa: ANN401
         """Arrays of our state from the library's object."""
-        found = search.__getstate__()
-        step, covariance = float(found["_sigma"]), np.array(found[self.stored])
-        deviation = np.sqrt(self._diagonal(covariance, len(found["_mean"])))
+        values = search.__getstate__()
+        step, covariance = float(values["_sigma"]), np.array(values[self.stored])
+        deviation = np.sqrt(self._diagonal(covariance, len(values["_mean"])))
         return {
-            "mu": np.array(found["_mean"]), "sigma": step * deviation, "step": np.array([step]),
-            "covariance": covariance, "step_path": np.array(found["_p_sigma"]),
-            "covariance_path": np.array(found["_pc"]),
+            "mu": np.array(values["_mean"]), "sigma": step * deviation, "step": np.array([step]),
+            "covariance": covariance, "step_path": np.array(values["_p_sigma"]),
+            "covariance_path": np.array(values["_pc"]),
         }  # fmt: skip
 
     def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:

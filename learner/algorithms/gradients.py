@@ -76,8 +76,8 @@ def level(best: float, baseline: float) -> bool:
 
 def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
     """Divide; the result is 0 if numerator or denominator is 0."""
-    wanted = (numerator != 0.0) & (denominator != 0.0)
-    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=wanted)
+    mask = (numerator != 0.0) & (denominator != 0.0)
+    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=mask)
 
 
 def optimal_baseline(middle: FloatArray, eps: FloatArray, sigma: FloatArray) -> float:

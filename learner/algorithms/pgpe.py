@@ -173,15 +173,15 @@ class PGPE(Settings):
         self, state: PGPEState, eps: FloatArray, returns: FloatArray, best: float
     ) -> tuple[FloatArray, FloatArray, float | None]:
         middle = middle_returns(returns)
-        used, following = self._baselines(state, eps, middle)
-        to_sigma = baseline_contrast(middle, used, best)
+        baseline, following = self._baselines(state, eps, middle)
+        to_sigma = baseline_contrast(middle, baseline, best)
         if self.estimator == "symmetric":
             to_mu = pair_contrast(returns, best, self.normaliser)
         elif self.normaliser == "sehnke":
             to_mu = to_sigma
         else:
-            to_mu = plain_contrast(middle, used)
-            to_sigma = np.zeros_like(to_mu) if level(best, used) else to_mu
+            to_mu = plain_contrast(middle, baseline)
+            to_sigma = np.zeros_like(to_mu) if level(best, baseline) else to_mu
         if self.baseline == "moving-average" and state.baseline is None:
             to_sigma = np.zeros_like(to_sigma)  # the first generation only sets the baseline
         return to_mu, to_sigma, following
@@ -222,11 +222,11 @@ class PGPE(Settings):
 
     def _memory(self) -> tuple[str, ...]:
         """Names of the state's arrays that this optimiser uses."""
-        kept = {"sgd": (), "clipup": ("velocity",), "adam": ("first_moment", "second_moment")}
-        return kept[self.optimiser]
+        arrays = {"sgd": (), "clipup": ("velocity",), "adam": ("first_moment", "second_moment")}
+        return arrays[self.optimiser]
 
     def _check_memory(self, state: PGPEState) -> None:
         for name in ("velocity", "first_moment", "second_moment"):
-            wanted = state.mu.size if name in self._memory() else 0
-            if (found := getattr(state, name).size) != wanted:
-                raise ValueError(f"state: {name} has {found} entries, expected {wanted} with {self.optimiser}")
+            expected = state.mu.size if name in self._memory() else 0
+            if (entries := getattr(state, name).size) != expected:
+                raise ValueError(f"state: {name} has {entries} entries, expected {expected} with {self.optimiser}")

@@ -81,8 +81,8 @@ class SearchState:
         if self.sigma.size != size:
             raise ValueError(f"state: sigma must have mu's size {size}, not {self.sigma.size}")
         for name in self._vectors()[2:]:
-            if (found := getattr(self, name).size) not in (0, size):
-                raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {found}")
+            if (entries := getattr(self, name).size) not in (0, size):
+                raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {entries}")
 
     def to_dict(self) -> dict[str, StateValue]:
         """Every field by its name, for a checkpoint; `from_dict` restores the same bits."""
@@ -96,19 +96,19 @@ class SearchState:
             ValueError: a key is missing or unknown, or its value has a wrong type, shape or range;
                 the message names the key.
         """
-        known = {each.name for each in fields(cls)}
-        if missing := sorted(known - set(values)):
+        names = {each.name for each in fields(cls)}
+        if missing := sorted(names - set(values)):
             raise ValueError(f"state: missing {', '.join(missing)}")
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(known))}")
+        if unknown := sorted(set(values) - names):
+            raise ValueError(f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(names))}")
         return cls(**dict(values))  # type: ignore[arg-type]  # __post_init__ checks every type
 
 
 def _read_only(name: str, value: object) -> FloatArray:
     """Return a read-only copy of a finite float64 vector."""
     if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.ndim != 1:
-        found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else f"{value!r:.60}"
-        raise ValueError(f"state: {name} must be a float64 vector, not {found}")
+        description = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else f"{value!r:.60}"
+        raise ValueError(f"state: {name} must be a float64 vector, not {description}")
     if not np.isfinite(value).all():
         raise ValueError(f"state: {name} must be finite everywhere")
     copy = np.array(value, dtype=np.float64, order="C")

@@ -16,13 +16,13 @@ class WeightsAndBiases:
         """
         import wandb
 
-        known, self._last = folder / "wandb" / "id", folder / "wandb" / "last"
-        known.parent.mkdir(exist_ok=True)
+        identity, self._last = folder / "wandb" / "id", folder / "wandb" / "last"
+        identity.parent.mkdir(exist_ok=True)
         last = int(self._last.read_text("utf-8")) if self._last.exists() else 0
-        if not known.exists() or last > done:
-            known.write_text(secrets.token_hex(8), "utf-8")
+        if not identity.exists() or last > done:
+            identity.write_text(secrets.token_hex(8), "utf-8")
         self._run = wandb.init(
-            name=folder.resolve().name, id=known.read_text("utf-8"), resume="allow", dir=str(folder),
+            name=folder.resolve().name, id=identity.read_text("utf-8"), resume="allow", dir=str(folder),
             config=dict(config), settings=wandb.Settings(console="off", silent=True),
         )  # fmt: skip
 

@@ -62,12 +62,12 @@ def finished(spec: TaskSpec, eye: Eye, generations: int) -> rrb.Blueprint:
     All views are drawn on the timeline that plays, which is not that of generations; the tab of the curves says so.
     """
     horizon = spec.steps * spec.period
-    begin, end = (round(1e9 * number * horizon) for number in (generations, generations + 1))
+    start, end = (round(1e9 * number * horizon) for number in (generations, generations + 1))
     panel = rrb.TimePanel(
         timeline="sim_time",
         play_state="playing",
         loop_mode="selection",
-        time_selection=rrb.components.AbsoluteTimeRange(min=begin, max=end - _SEAM),
+        time_selection=rrb.components.AbsoluteTimeRange(min=start, max=end - _SEAM),
     )
     return _blueprint(_run(spec, eye, f"Learning (sim_time: {horizon:g} s per generation)"), panel)
 
@@ -76,7 +76,7 @@ def _run(spec: TaskSpec, eye: Eye, curves: str) -> rrb.Container:
     """`curves` is the name of the tab of the learning curves."""
     pictures = rrb.Horizontal(*_images(spec), name="Images")
     traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
-    parts = [part for part, there in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if there]
+    parts = [part for part, present in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if present]
     left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
     horizon = spec.steps * spec.period
@@ -86,9 +86,9 @@ def _run(spec: TaskSpec, eye: Eye, curves: str) -> rrb.Container:
 
 def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
     """Layout of rollouts that are played one after the other; curves show `window` [s] around the cursor."""
-    shown = rrb.TextDocumentView(origin="/rollout", name="Shown")
+    caption = rrb.TextDocumentView(origin="/rollout", name="Shown")
     images = _images(spec)
-    below = rrb.Horizontal(shown, *images) if images else shown
+    below = rrb.Horizontal(caption, *images) if images else caption
     tabs = rrb.Tabs(_rollout(spec, window), _config())
     left = [_scene("Replay", eye), below]
     return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), _playing())
@@ -101,8 +101,8 @@ def comparison(
 
     Without `learning` they are rollouts, which have no learning curves.
     """
-    drawn = [f"+ {root}/{part}" for root in roots for part in ("world/**", "label")]
-    scenes = _scene("Final policies: play the timeline sim_time" if learning else "Rollouts", eye, "/", drawn)
+    contents = [f"+ {root}/{part}" for root in roots for part in ("world/**", "label")]
+    scenes = _scene("Final policies: play the timeline sim_time" if learning else "Rollouts", eye, "/", contents)
     left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs" if learning else "Rollouts")]
 
     def plot(name: str, entity: str, legend: rrb.Corner2D | None = None) -> rrb.View:
@@ -223,8 +223,8 @@ def _plot(name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.
     """Curves over all their time, also while the cursor moves and after a change of the timeline."""
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))
-    shown = rrb.PlotLegend(legend, visible=legend is not None)
-    return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=shown, axis_x=whole)
+    key = rrb.PlotLegend(legend, visible=legend is not None)
+    return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=key, axis_x=whole)
 
 
 def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:

@@ -120,15 +120,15 @@ class ChannelDrawing:
 
     def _arrows(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
         origins, vectors = self.arrows(values, bodies)
-        drawn = (vectors != 0).any(axis=-1)
+        visible = (vectors != 0).any(axis=-1)
         colours = [pack(colour) for colour in self._channel.colours or [_ARROW] * values.shape[1]]
         columns = rr.Arrows3D.columns(
-            origins=origins[drawn],
-            vectors=vectors[drawn],
-            colors=np.broadcast_to(np.array(colours, np.uint32), drawn.shape)[drawn],
-            radii=np.full(int(drawn.sum()), ARROW_RADIUS * self._size),
+            origins=origins[visible],
+            vectors=vectors[visible],
+            colors=np.broadcast_to(np.array(colours, np.uint32), visible.shape)[visible],
+            radii=np.full(int(visible.sum()), ARROW_RADIUS * self._size),
         )
-        return columns.partition(drawn.sum(axis=1))
+        return columns.partition(visible.sum(axis=1))
 
     def _points(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
         frames, count, _ = values.shape
@@ -186,8 +186,8 @@ def scale(entity: str, width: int, height: int, top: float, unit: str) -> Iterat
     steps = [[(x, lower), (x, upper)] for lower, upper in pairwise(ends.tolist())]
     shades = ramp(np.linspace(0.0, top, _SHADES), top)
     yield f"{entity}/scale", rr.LineStrips2D(steps, colors=shades, radii=thick)
-    said = [f"{top:g} {unit}".strip(), "0"]
-    yield f"{entity}/scale/ends", labels([(x + 0.2 * height, 0.0), (x + 0.2 * height, 0.95 * height)], said)
+    texts = [f"{top:g} {unit}".strip(), "0"]
+    yield f"{entity}/scale/ends", labels([(x + 0.2 * height, 0.0), (x + 0.2 * height, 0.95 * height)], texts)
 
 
 def labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Points2D:

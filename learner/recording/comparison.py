@@ -93,8 +93,8 @@ def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
 def _compared(runs: Sequence[Shown]) -> Channel | None:
     """The first channel of scalars, if all runs have one of its name and labels."""
     first = next((channel for channel in runs[0].drawing.spec.channels if channel.kind == "scalars"), None)
-    known = [{(c.name, c.kind, c.names) for c in run.drawing.spec.channels} for run in runs]
-    return first if first and all((first.name, first.kind, first.names) in names for names in known) else None
+    channels = [{(c.name, c.kind, c.names) for c in run.drawing.spec.channels} for run in runs]
+    return first if first and all((first.name, first.kind, first.names) in names for names in channels) else None
 
 
 def _names(run: Shown, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:

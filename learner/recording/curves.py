@@ -105,13 +105,16 @@ _CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, fl
 def static(*, success: bool, measures: Sequence[Measure] = ()) -> list[tuple[str, Any]]:
     """Names and colours of the learning curves; with success if the task defines it, and with its measures."""
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
-    own: list[tuple[str, Any]] = [("/learning/return_std", band), ("/learning/mean_policy/return", _MEAN_POLICY)]
+    entities: list[tuple[str, Any]] = [("/learning/return_std", band), ("/learning/mean_policy/return", _MEAN_POLICY)]
     if success:
-        own += [("/learning/success", lines(("exploring",), (SKY,))), ("/learning/mean_policy/success", _MEAN_POLICY)]
+        entities += [
+            ("/learning/success", lines(("exploring",), (SKY,))),
+            ("/learning/mean_policy/success", _MEAN_POLICY),
+        ]
     for each in measures:
-        own += [(f"/learning/measures/{each.name}", lines(("exploring",), (SKY,)))]
-        own += [(f"/learning/mean_policy/measures/{each.name}", _MEAN_POLICY)]
-    return own + [(entity, names) for entity, names, _ in _CURVES]
+        entities += [(f"/learning/measures/{each.name}", lines(("exploring",), (SKY,)))]
+        entities += [(f"/learning/mean_policy/measures/{each.name}", _MEAN_POLICY)]
+    return entities + [(entity, names) for entity, names, _ in _CURVES]
 
 
 def statistics(reports: Sequence[Report]) -> Iterator[Columns]:

@@ -70,9 +70,9 @@ class Drawing:
         """Check that a rollout belongs to this scene and task; raises ValueError otherwise."""
         count, arrays = len(rollout.times), rollout.arrays()
         for name, shape in self.spec.shapes(len(self.scene.bodies)).items():
-            found = arrays[name].shape if name in arrays else None
-            if found != (count, *shape):
-                raise ValueError(f"{name} of shape {found}, expected {(count, *shape)}: another scene or task?")
+            present = arrays[name].shape if name in arrays else None
+            if present != (count, *shape):
+                raise ValueError(f"{name} of shape {present}, expected {(count, *shape)}: another scene or task?")
 
     def captions(self, rollouts: Sequence[tuple[str, Trajectory]]) -> Iterator[Columns]:
         """Texts in the scene for the frames of named rollouts, one rollout after the other; and what the eye follows.
@@ -114,8 +114,8 @@ class Drawing:
                 moved = rr.Transform3D.columns(translation=poses[:, :3], quaternion=xyzw(poses[:, 3:]))
                 yield Columns(f"/world/{name}", moved)
         for geometry in self._some:  # a scale of 0 hides it
-            there = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)
-            yield Columns(_entity(geometry), rr.Transform3D.columns(scale=np.repeat(there[:, None], 3, axis=1)))
+            visible = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)
+            yield Columns(_entity(geometry), rr.Transform3D.columns(scale=np.repeat(visible[:, None], 3, axis=1)))
         yield Columns("/reward/terms", scalars(rollout.terms))
         yield Columns("/actions", scalars(rollout.actions))
         begins = np.cumsum(rollout.times == 0.0)

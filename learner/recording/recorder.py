@@ -214,17 +214,17 @@ class Recorder:
             send(self._stream, self._columns(reports), "generation", numbers, numbers * self._horizon, wall)
             before, policies = numbers - 1, curves.mean_policies([report.progress for report in reports])
             send(self._stream, policies, "generation", before, before * self._horizon, wall)
-        held, self._held = self._held, []
-        if not held:
+        rollouts, self._held = self._held, []
+        if not rollouts:
             return
-        lengths = [len(one.sim) for one in held]
-        numbers = np.repeat([one.generation for one in held], lengths)
-        sim, wall = np.concatenate([one.sim for one in held]), np.concatenate([one.wall for one in held])
-        captions = self._drawing.captions([(f"generation {one.generation}", one.rollout) for one in held])
-        columns = [*self._drawing.columns(joined([one.rollout for one in held])), *captions]
+        lengths = [len(one.sim) for one in rollouts]
+        numbers = np.repeat([one.generation for one in rollouts], lengths)
+        sim, wall = np.concatenate([one.sim for one in rollouts]), np.concatenate([one.wall for one in rollouts])
+        captions = self._drawing.captions([(f"generation {one.generation}", one.rollout) for one in rollouts])
+        columns = [*self._drawing.columns(joined([one.rollout for one in rollouts])), *captions]
         send(self._stream, columns, "generation", numbers, sim, wall)
         whole = self._horizon - 0.5 * self._drawing.spec.period
-        if early := [one.sim[-1] + SEAM for one in held if one.rollout.times[-1] < whole]:
+        if early := [one.sim[-1] + SEAM for one in rollouts if one.rollout.times[-1] < whole]:
             send_gaps(self._stream, self._drawing.gaps(len(early)), np.array(early))
 
     def _columns(self, reports: Sequence[Report]) -> Iterator[Columns]:
@@ -235,8 +235,8 @@ class Recorder:
         for name in ("best", "worst"):
             rows = [row for row, report in enumerate(reports) if name in report.traces]
             if rows:
-                drawn = pictures([reports[row].traces[name] for row in rows])
-                yield Columns(f"/traces/{name}", drawn, np.array(rows))
+                images = pictures([reports[row].traces[name] for row in rows])
+                yield Columns(f"/traces/{name}", images, np.array(rows))
         for number, report in enumerate(reports):
             if "all" in report.traces:
                 values = np.ascontiguousarray(report.traces["all"], dtype=np.float32)

@@ -62,9 +62,9 @@ class _Abandoned:
 
 def send_properties(stream: rr.RecordingStream, name: str, values: Mapping[str, object]) -> None:
     """Send properties that a table of recordings shows; later values replace earlier ones."""
-    known: dict[str, Any] = {key: value for key, value in values.items() if value is not None}
-    if known:
-        stream.send_property(name, rr.AnyValues(**known))
+    present: dict[str, Any] = {key: value for key, value in values.items() if value is not None}
+    if present:
+        stream.send_property(name, rr.AnyValues(**present))
 
 
 def log_static(stream: rr.RecordingStream, entities: Iterable[tuple[str, Any]]) -> None:
@@ -116,9 +116,9 @@ def send(
     """Send entities' rows; timelines are those of `times`, of all their frames."""
     whole = times(counter, numbers, sim, wall)
     for part in columns:
-        at, some = whole, part.rows
-        if some is not None:
-            at = times(counter, numbers[some], sim[some], None if wall is None else wall[some])
+        at, rows = whole, part.rows
+        if rows is not None:
+            at = times(counter, numbers[rows], sim[rows], None if wall is None else wall[rows])
         stream.send_columns(part.entity, at, part.columns)
 
 

@@ -202,8 +202,8 @@ def again(folder: str, ending: str, stats: GenerationStats) -> str:
     The displayed rollout is of the mean policy after that generation.
     """
     replay = f"farm replay {folder} --generation"
-    chosen = ["--best 5", "--worst 5", *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else [])]
-    side = "\n".join(f"{replay} {stats.generation} {which}" for which in chosen)
+    selections = ["--best 5", "--worst 5", *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else [])]
+    side = "\n".join(f"{replay} {stats.generation} {which}" for which in selections)
     return (
         f"### Generation {stats.generation} again\n\nThe rollout in view, at physics rate:\n\n"
         f"```\n{replay} {stats.generation}\n```\n\nExploring rollouts, side by side:\n\n```\n{side}\n```"

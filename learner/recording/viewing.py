@@ -30,10 +30,10 @@ def free_port(rather: int = 0) -> int:
         return int(probe.getsockname()[1])
 
 
-def listens(port: int, gone: Callable[[], bool]) -> bool:
+def listens(port: int, ended: Callable[[], bool]) -> bool:
     """Wait until a program listens on a port of this machine; false if the viewer ends before."""
     until = time.monotonic() + _LOADING
-    while time.monotonic() < until and not gone():
+    while time.monotonic() < until and not ended():
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
                 return True
@@ -53,14 +53,14 @@ def show_newest(viewer: ViewerClient, state: ViewerState) -> None:
     last = {line.name: line.end for line in recording.timelines}
     if recording.current_timeline == "sim_time" and last.get("generation"):
         rollouts = last["generation"] + 1  # one after the other, all given the same time
-        begin = 1e-9 * (last["sim_time"] or 0) * (rollouts - 1) / rollouts
-        viewer.set_time("sim_time", duration=begin, play_state="playing")
+        start = 1e-9 * (last["sim_time"] or 0) * (rollouts - 1) / rollouts
+        viewer.set_time("sim_time", duration=start, play_state="playing")
 
 
-def once_loaded(port: int, gone: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
+def once_loaded(port: int, ended: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
     """Call a function with the viewer on this port as soon as its recordings are loaded; return whether it was done."""
     until = time.monotonic() + _LOADING
-    while time.monotonic() < until and not gone():
+    while time.monotonic() < until and not ended():
         try:
             viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             state = viewer.get_state()

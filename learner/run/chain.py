@@ -42,8 +42,8 @@ def first(config: RunConfig, written: Mapping[str, Any] | None = None) -> str:
     settings = configs.flat(config)
     if written is not None:
         parts = [written, *(values for values in written.values() if isinstance(values, Mapping))]
-        known = {name.replace("_", "-") for part in parts for name in part}
-        settings = {name: value for name, value in settings.items() if name in known}
+        names = {name.replace("_", "-") for part in parts for name in part}
+        settings = {name: value for name, value in settings.items() if name in names}
     left_out = configs.AT_THE_END
     table = {name: str(value).rpartition("/")[2] for name, value in settings.items() if name not in left_out}
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
@@ -59,7 +59,7 @@ def state_of(at: Checkpoint) -> str:
 
 
 def following(
-    before: str, line: GenerationStats, mu: FloatArray, sigma: FloatArray, seen: FloatArray, state: str
+    before: str, line: GenerationStats, mu: FloatArray, sigma: FloatArray, normaliser: FloatArray, state: str
 ) -> str:
     """The digest of a generation.
 
@@ -68,14 +68,14 @@ def following(
       line: its line of progress.jsonl.
       mu: after it, (P,).
       sigma: after it, (P,).
-      seen: normaliser after it, (2, d) or (2, 0).
+      normaliser: after it, (2, d) or (2, 0).
       state: that of `state_of`.
     """
     numbers = {name: value for name, value in line.to_dict().items() if name not in OF_MACHINES}
-    hashed = hashlib.sha256(f"{before} {state} {json.dumps(numbers, sort_keys=True)}\n".encode())
-    for values in (mu, sigma, seen):
-        hashed.update(values.astype("<f8").tobytes())
-    return hashed.hexdigest()
+    sha256 = hashlib.sha256(f"{before} {state} {json.dumps(numbers, sort_keys=True)}\n".encode())
+    for values in (mu, sigma, normaliser):
+        sha256.update(values.astype("<f8").tobytes())
+    return sha256.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -91,18 +91,18 @@ class ChainFile:
 
     def read(self) -> Mapping[int, Link]:
         """Every readable line, by generation; the last one of several."""
-        found: dict[int, Link] = {}
+        links: dict[int, Link] = {}
         with suppress(OSError):
             for words in map(str.split, self.path.read_text("utf-8", "replace").splitlines()):
                 if len(words) == 3 and words[0].isdecimal() and len(words[0]) < 20:
-                    found[int(words[0])] = Link(*words[1:])
-        return found
+                    links[int(words[0])] = Link(*words[1:])
+        return links
 
     def rewind(self, generation: int) -> None:
         """Remove what is newer than a generation."""
         if self.path.exists():
-            kept = ((at, link) for at, link in sorted(self.read().items()) if at <= generation)
-            replace_text(self.path, "".join(_line(at, link) for at, link in kept))
+            older = ((at, link) for at, link in sorted(self.read().items()) if at <= generation)
+            replace_text(self.path, "".join(_line(at, link) for at, link in older))
 
 
 def _line(generation: int, link: Link) -> str:

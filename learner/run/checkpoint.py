@@ -134,11 +134,11 @@ def load(path: Path) -> Checkpoint:
         return _read(path)
     except CheckpointError as error:
         try:
-            found = _read(_safe(path))
+            copy = _read(_safe(path))
         except CheckpointError:
             raise error from None
         log.warning("%s is missing or damaged; continuing from its copy %s", path, _safe(path).name)
-        return found
+        return copy
 
 
 def _read(path: Path) -> Checkpoint:

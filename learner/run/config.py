@@ -114,8 +114,8 @@ class RunConfig(Settings):
 
     def algorithm_of(self, pairs: int) -> Algorithm[Any]:
         """The algorithm with this number of pairs; 0: the number in its settings."""
-        own: Any = self.algorithm_config
-        return replace(own, pairs=pairs) if pairs else own
+        algorithm: Any = self.algorithm_config
+        return replace(algorithm, pairs=pairs) if pairs else algorithm
 
     def pairs_after(self, pairs: int, steps: int) -> int:
         """Pairs of the generation after one with these pairs and control steps; 0: as in the algorithm's settings."""
@@ -141,14 +141,14 @@ def _filled(config: RunConfig) -> dict[str, Any]:
     if all(parts) and config.generations is not None:
         return {}
     table = presets(config.task)
-    given: dict[str, Any] = dict(next(iter(table.values()), {}))
+    preset: dict[str, Any] = dict(next(iter(table.values()), {}))
     out: dict[str, Any] = {}
     if config.generations is None:
-        out["generations"] = given.get("generations", _GENERATIONS)
+        out["generations"] = preset.get("generations", _GENERATIONS)
     for part, kind in PARTS.items():
-        name = getattr(config, part) or given.get(part) or _GENERAL[part]
-        own = getattr(config, f"{part}_config")
-        out |= {part: name, f"{part}_config": own or _part(kind, name, given)}
+        name = getattr(config, part) or preset.get(part) or _GENERAL[part]
+        options = getattr(config, f"{part}_config")
+        out |= {part: name, f"{part}_config": options or _part(kind, name, preset)}
     return out
 
 
@@ -213,20 +213,20 @@ def _undecorated(config: type) -> bool:
     return any(name not in _fields(config) for name in vars(config).get("__annotations__", {}))
 
 
-def _part(kind: str, name: str, given: Mapping[str, Any]) -> Any:  # noqa: ANN401  settings of that plug-in
+def _part(kind: str, name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401  settings of that plug-in
     config = settings_class(kind, name)
-    known = {each: value for each, value in given.items() if each in _fields(config)}
-    return settings.from_dict(config, known, name)
+    arguments = {each: value for each, value in values.items() if each in _fields(config)}
+    return settings.from_dict(config, arguments, name)
 
 
 def presets(task: str) -> dict[str, Mapping[str, Any]]:
     """Settings that runs of a task start from, by preset and flag; the first preset is the default."""
     settings_class("tasks", task)
     plugin = plugins.find("tasks", task)
-    own = plugin.target.presets
-    if not isinstance(own, Mapping) or not own or not all(isinstance(each, Mapping) for each in own.values()):
+    tables = plugin.target.presets
+    if not isinstance(tables, Mapping) or not tables or not all(isinstance(each, Mapping) for each in tables.values()):
         raise ConfigError(f"presets of {task}: expected tables of settings by name, one or more")
-    return {name: given or _general(plugin) for name, given in own.items()}
+    return {name: table or _general(plugin) for name, table in tables.items()}
 
 
 def configure(task: str = "finger-gait", preset: str | None = None, **changed: Any) -> RunConfig:  # noqa: ANN401
@@ -247,31 +247,31 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
     name = preset or next(iter(table))
     if name not in table:
         raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
-    begin = RunConfig(task=task)
-    given: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
+    general = RunConfig(task=task)
+    values: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
     for part, kind in PARTS.items():  # another policy keeps settings of the preset, another algorithm none
-        own = given.get(part, getattr(begin, part))
-        chosen = changed.get(part, own)
-        others = set(_fields(settings_class(kind, chosen))) if part == "policy" or chosen == own else set()
-        given = {k: v for k, v in given.items() if k in others or k not in _fields(settings_class(kind, own))}
-    return changed_by(begin, {**given, **changed}, fresh=True)
+        default = values.get(part, getattr(general, part))
+        choice = changed.get(part, default)
+        others = set(_fields(settings_class(kind, choice))) if part == "policy" or choice == default else set()
+        values = {k: v for k, v in values.items() if k in others or k not in _fields(settings_class(kind, default))}
+    return changed_by(general, {**values, **changed}, fresh=True)
 
 
-def changed_by(config: RunConfig, given: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
+def changed_by(config: RunConfig, values: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
     """A configuration with some settings changed, each by its flag's name.
 
     A part that is replaced (or all, if `fresh`) starts with its own defaults.
     """
     parts: dict[str, Any] = {}
-    known = {"task", "policy", "algorithm"}
+    names = {"task", "policy", "algorithm"}
     for part, kind in PARTS.items():
-        name = given.get(part, getattr(config, part))
+        name = values.get(part, getattr(config, part))
         old = getattr(config, f"{part}_config")
-        begin = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
-        known |= set(_fields(settings_class(kind, name)))
-        parts |= {part: name, f"{part}_config": _part(kind, name, {**begin, **given})}
-    run = {k: v for k, v in given.items() if k in _fields(config) and k not in known}
-    if unknown := [k for k in given if k not in known and k not in run]:
+        before = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
+        names |= set(_fields(settings_class(kind, name)))
+        parts |= {part: name, f"{part}_config": _part(kind, name, {**before, **values})}
+    run = {k: v for k, v in values.items() if k in _fields(config) and k not in names}
+    if unknown := [k for k in values if k not in names and k not in run]:
         raise ConfigError(f"unknown setting {', '.join(unknown)}")
     return replace(config, **parts, **run)
 
@@ -298,8 +298,8 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
     """Its form in config.json and in a checkpoint."""
     parts = {part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
              for part in PARTS}  # fmt: skip
-    own = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in PARTS}
-    return {"version": VERSION, **parts, **own}
+    rest = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in PARTS}
+    return {"version": VERSION, **parts, **rest}
 
 
 def from_dict(values: object, where: str) -> RunConfig:
@@ -309,19 +309,19 @@ def from_dict(values: object, where: str) -> RunConfig:
       ConfigError: another version, unknown names, wrong types or impossible values; `where` is named.
     """
     if not isinstance(values, dict) or values.get("version") != VERSION:
-        found = values.get("version") if isinstance(values, dict) else None
-        raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(found)[:40]!r})")
-    made: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *PARTS)}
-    if unknown := [name for name in (f"{part}_config" for part in PARTS) if name in made]:
+        version = values.get("version") if isinstance(values, dict) else None
+        raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(version)[:40]!r})")
+    arguments: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *PARTS)}
+    if unknown := [name for name in (f"{part}_config" for part in PARTS) if name in arguments]:
         raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}")
     for part, kind in PARTS.items():
         table = values.get(part)
         if not isinstance(table, dict) or type(table.get("name")) is not str:
             raise ConfigError(f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name")
-        own = {k: v for k, v in table.items() if k != "name"}
-        config = settings.from_dict(settings_class(kind, table["name"]), own, f"{where}: {part}")
-        made |= {part: table["name"], f"{part}_config": config}
-    return settings.from_dict(RunConfig, made, where)
+        options = {k: v for k, v in table.items() if k != "name"}
+        config = settings.from_dict(settings_class(kind, table["name"]), options, f"{where}: {part}")
+        arguments |= {part: table["name"], f"{part}_config": config}
+    return settings.from_dict(RunConfig, arguments, where)
 
 
 def read(path: Path) -> RunConfig:
@@ -365,9 +365,12 @@ def flags(config: RunConfig) -> list[str]:
     """The flags with which `farm run` takes this configuration."""
     parts = {part: getattr(config, part) for part in PARTS}
     general = configure(parts["task"])
-    begin = changed_by(general, {part: parts[part] for part in ("policy", "algorithm")})
-    own = [("task", RunConfig.task, parts["task"]), *((part, getattr(general, part), parts[part]) for part in parts)]
-    return [word for name, old, new in (*own, *changes(begin, config)) if old != new for word in _flag(name, new)]
+    base = changed_by(general, {part: parts[part] for part in ("policy", "algorithm")})
+    choices = [
+        ("task", RunConfig.task, parts["task"]),
+        *((part, getattr(general, part), parts[part]) for part in parts),
+    ]
+    return [word for name, old, new in (*choices, *changes(base, config)) if old != new for word in _flag(name, new)]
 
 
 def _flag(name: str, value: object) -> list[str]:

@@ -51,23 +51,23 @@ def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
     return Jobs.joined([*([trials] if rollouts else []), Jobs.mean("physics", [None])])
 
 
-def outcome(spec: TaskSpec, found: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
+def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
     """The part of GenerationStats that follows from a round: exploring rollouts, then the mean policy's."""
-    returns, flags = found.returns[:rollouts], found.flags[:rollouts]
-    _, ended, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
+    returns, flags = results.returns[:rollouts], results.flags[:rollouts]
+    _, ends, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
     return {
         "return_mean": float(returns.mean()),
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "return_std": float(returns.std()),
-        "mean_policy_return": float(found.returns[rollouts]),
-        "mean_policy_success": bool(found.flags[rollouts, 0]) if spec.success else None,
+        "mean_policy_return": float(results.returns[rollouts]),
+        "mean_policy_success": bool(results.flags[rollouts, 0]) if spec.success else None,
         "success_rate": success_rate(spec, flags),
-        "ended": ended,
+        "ended": ends,
         "failed": failed,
         "clamped": clamped,
-        "measures": means_of_measures(spec, found, slice(rollouts)),
-        "mean_policy_measures": means_of_measures(spec, found, slice(rollouts, rollouts + 1)),
+        "measures": means_of_measures(spec, results, slice(rollouts)),
+        "mean_policy_measures": means_of_measures(spec, results, slice(rollouts, rollouts + 1)),
     }
 
 
@@ -76,8 +76,8 @@ def success_rate(spec: TaskSpec, flags: BoolArray) -> float | None:
     return float(np.mean(flags[:, 0])) if spec.success else None
 
 
-def means_of_measures(spec: TaskSpec, found: RoundResults | Simulated, rows: slice) -> dict[str, float | None]:
+def means_of_measures(spec: TaskSpec, results: RoundResults | Simulated, rows: slice) -> dict[str, float | None]:
     """Means of the task's measures over rollouts that did not fail, by name."""
-    sound = np.flatnonzero(~found.flags[rows, 2])
+    sound = np.flatnonzero(~results.flags[rows, 2])
     columns = enumerate(each.name for each in spec.measures)
-    return {name: float(found.measures[rows][sound, at].mean()) if sound.size else None for at, name in columns}
+    return {name: float(results.measures[rows][sound, at].mean()) if sound.size else None for at, name in columns}

@@ -53,20 +53,20 @@ class ProgressFile:
         """Remove what is newer than a generation, and damaged lines, of which a copy is kept."""
         path = self.path
         try:
-            read, lost, torn = self._lines()
+            readable, damaged, torn = self._lines()
         except FileNotFoundError:
-            read, lost, torn = [], [], False
-        kept = [stats for _, stats in read if stats.generation <= generation]
-        if torn and (not read or read[-1][1].generation < generation):
-            lost.append(path.read_bytes().count(b"\n") + 1)  # otherwise it is of a later generation
-        if lost:
+            readable, damaged, torn = [], [], False
+        older = [stats for _, stats in readable if stats.generation <= generation]
+        if torn and (not readable or readable[-1][1].generation < generation):
+            damaged.append(path.read_bytes().count(b"\n") + 1)  # otherwise it is of a later generation
+        if damaged:
             copy = _copy(path)
-            which = ", ".join(map(str, lost[:10])) + (", ..." if len(lost) > 10 else "")
+            which = ", ".join(map(str, damaged[:10])) + (", ..." if len(damaged) > 10 else "")
             log.warning(
                 "%s: %d damaged line(s) dropped (line %s), %d kept; all of it is in %s",
-                path, len(lost), which, len(kept), copy,
+                path, len(damaged), which, len(older), copy,
             )  # fmt: skip
-        replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in kept))
+        replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in older))
 
     def _lines(self) -> tuple[list[tuple[int, GenerationStats]], list[int], bool]:
         """Readable lines by number; numbers of unreadable ones; whether the last one is incomplete.
@@ -74,14 +74,14 @@ class ProgressFile:
         A damaged line never affects other lines, neither by its contents nor by its generation.
         """
         *lines, end = self.path.read_text("utf-8", "replace").split("\n")
-        read = []
+        readable = []
         for number, line in enumerate([*lines, end], 1):
             with suppress(ValueError, RecursionError):
-                read.append((number, GenerationStats.from_dict(json.loads(line))))
-        read = [read[i] for i in _rising([stats.generation for _, stats in read])]
-        known = {number for number, _ in read}
-        lost = [number for number in range(1, len(lines) + 1) if number not in known]
-        return read, lost, bool(end) and len(lines) + 1 not in known
+                readable.append((number, GenerationStats.from_dict(json.loads(line))))
+        readable = [readable[i] for i in _rising([stats.generation for _, stats in readable])]
+        numbers = {number for number, _ in readable}
+        damaged = [number for number in range(1, len(lines) + 1) if number not in numbers]
+        return readable, damaged, bool(end) and len(lines) + 1 not in numbers
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,12 @@ class ParametersFile:
         body = self.path.read_bytes()[offset:]
         kind = _row_type(head["parameters"], head.get("observation", 0))
         rows = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
-        kept = rows["generation"]
-        if (kept[:1] <= 0).any() or (kept % head["every"]).any() or (np.diff(kept) != head["every"]).any():
+        generations = rows["generation"]
+        if (
+            (generations[:1] <= 0).any()
+            or (generations % head["every"]).any()
+            or (np.diff(generations) != head["every"]).any()
+        ):
             raise ConfigError(f"{self.path} is damaged: its generations do not rise as its first line says; {_ASIDE}")
         return rows
 
@@ -132,13 +136,13 @@ class ParametersFile:
           ConfigError: it is not kept; names the generations that are.
         """
         rows = self.rows()
-        kept = rows["generation"]
-        found = np.flatnonzero(kept == generation)
-        if not len(found):
+        generations = rows["generation"]
+        matches = np.flatnonzero(generations == generation)
+        if not len(matches):
             raise ConfigError(
-                f"generation {generation} is not stored in {self.path.parent}: {_offer(kept, generation)}"
+                f"generation {generation} is not stored in {self.path.parent}: {_offer(generations, generation)}"
             )
-        row = rows[found[0]]
+        row = rows[matches[0]]
         return row["mu"], row["normaliser"] if "normaliser" in row.dtype.names else NONE
 
     def average(self, generation: int, mu: FloatArray, count: int) -> FloatArray:
@@ -147,13 +151,13 @@ class ParametersFile:
         if first >= generation:
             return mu
         step = self.every(mu.size, generation)
-        wanted = [each for each in range(first, generation) if each % step == 0]
+        generations = [each for each in range(first, generation) if each % step == 0]
         rows = self.rows() if self.path.exists() else np.empty(0, _row_type(mu.size, 0))
-        before = rows[np.isin(rows["generation"], wanted)]
-        if len(before) < len(wanted):
+        before = rows[np.isin(rows["generation"], generations)]
+        if len(before) < len(generations):
             log.warning(
                 "%s lacks means of generations %d to %d: the average is of %d instead of %d",
-                self.path, first, generation - 1, len(before) + 1, len(wanted) + 1,
+                self.path, first, generation - 1, len(before) + 1, len(generations) + 1,
             )  # fmt: skip
         return np.asarray(np.mean([*before["mu"], mu], axis=0))
 
@@ -176,13 +180,13 @@ class ParametersFile:
             raise CheckpointError(f"{path} is of {head['parameters']} parameters, the checkpoint of {size}: {_ASIDE}")
         if not len(rows) and generation >= head["every"] and path.stat().st_size > offset:
             raise CheckpointError(f"{path} is damaged: it holds no row as its first line describes them; {_ASIDE}")
-        kept = rows["generation"][rows["generation"] <= generation]
-        if len(kept) and kept[-1] + head["every"] <= generation:
+        generations = rows["generation"][rows["generation"] <= generation]
+        if len(generations) and generations[-1] + head["every"] <= generation:
             raise CheckpointError(
-                f"{path} ends with generation {kept[-1]}, the checkpoint is of {generation}; if there is a "
+                f"{path} ends with generation {generations[-1]}, the checkpoint is of {generation}; if there is a "
                 f"{checkpoint}.safe, put it in the checkpoint's place, or move {path.name} elsewhere"
             )
-        return offset + len(kept) * rows.itemsize
+        return offset + len(generations) * rows.itemsize
 
     def truncate(self, size: int | None) -> None:
         """Cut the file at a size from `until`."""
@@ -205,11 +209,11 @@ def _rising(numbers: list[int]) -> list[int]:
         length = bisect_left(ends, number, key=numbers.__getitem__)
         before.append(ends[length - 1] if length else None)
         ends[length : length + 1] = [i]
-    found, at = [], ends[-1] if ends else None
+    positions, at = [], ends[-1] if ends else None
     while at is not None:
-        found.append(at)
+        positions.append(at)
         at = before[at]
-    return found[::-1]
+    return positions[::-1]
 
 
 def _copy(path: Path) -> Path:
@@ -224,20 +228,22 @@ def _copy(path: Path) -> Path:
     return copy
 
 
-def _offer(kept: IntArray, wanted: int) -> str:
+def _offer(generations: IntArray, generation: int) -> str:
     """The available generations, for an error."""
-    if not len(kept):
+    if not len(generations):
         return "none is"
-    first, last = int(kept[0]), int(kept[-1])
+    first, last = int(generations[0]), int(generations[-1])
     if first == last:
         return f"only {first} is"
-    every = "" if kept[1] - first == 1 else f" in steps of {kept[1] - first}"
-    return f"stored are {first} to {last}{every}, the nearest is {kept[np.abs(kept - wanted).argmin()]}"
+    every = "" if generations[1] - first == 1 else f" in steps of {generations[1] - first}"
+    return (
+        f"stored are {first} to {last}{every}, the nearest is {generations[np.abs(generations - generation).argmin()]}"
+    )
 
 
 def _row_type(parameters: int, observation: int) -> "np.dtype[Any]":
-    own: list[Any] = [("normaliser", "<f8", (2, observation))] if observation else []
-    return np.dtype([("generation", "<i8"), ("mu", "<f8", (parameters,)), ("sigma", "<f8", (parameters,)), *own])
+    normaliser: list[Any] = [("normaliser", "<f8", (2, observation))] if observation else []
+    return np.dtype([("generation", "<i8"), ("mu", "<f8", (parameters,)), ("sigma", "<f8", (parameters,)), *normaliser])
 
 
 def _head(parameters: int, generations: int, observation: int) -> str:

@@ -152,14 +152,14 @@ class RunFolder:
         Raises:
           CheckpointError: one is missing or damaged.
         """
-        found: dict[str, bytes] = {}
+        contents: dict[str, bytes] = {}
         for name, digest in at.assets.items():
             path = self.path / "assets" / digest
             content = path.read_bytes() if path.is_file() else b""
             if digest_of(content) != digest:
                 raise CheckpointError(f"{path}, the run's {name}, is missing or damaged: put the file back there")
-            found[digest] = content
-        return joined(at.files, at.assets, found)
+            contents[digest] = content
+        return joined(at.files, at.assets, contents)
 
     def discard(self) -> None:
         """Remove a new run that could not start."""
@@ -260,5 +260,5 @@ def _in_the_way(path: Path) -> str:
 
 def _makes_sense(summary: dict[str, Any]) -> bool:
     """Whether the shown values of a summary have the right types."""
-    known = [(summary[name], kinds) for name, kinds in _SUMMARY.items() if name in summary]
-    return all(type(value) in kinds and (type(value) is not int or abs(value) < 2**63) for value, kinds in known)
+    values = [(summary[name], kinds) for name, kinds in _SUMMARY.items() if name in summary]
+    return all(type(value) in kinds and (type(value) is not int or abs(value) < 2**63) for value, kinds in values)

@@ -314,17 +314,17 @@ def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[]
     """
     if not place.connect:
         return
-    taken = NameTakenError(f"a learner of run {run} is on farm {place.farm} already: choose a different --name")
+    error = NameTakenError(f"a learner of run {run} is on farm {place.farm} already: choose a different --name")
     until = time.monotonic() + _REMEMBERED
     while link.present(keys.learner_token(place.farm, run), 1.0):
         if time.monotonic() > until or stopped():
-            raise taken
-    mine = f"{time.time_ns():020}-{secrets.token_hex(8)}".encode()
-    link.answer(keys.claim(place.farm, run), lambda: mine)
+            raise error
+    claim = f"{time.time_ns():020}-{secrets.token_hex(8)}".encode()
+    link.answer(keys.claim(place.farm, run), lambda: claim)
     for pause in (0.0, _LOOK):  # again, because routers take time to forward a claim
         time.sleep(pause)
-        if any(other < mine for other in link.ask_all(keys.claim(place.farm, run), 1.0)):
-            raise taken
+        if any(other < claim for other in link.ask_all(keys.claim(place.farm, run), 1.0)):
+            raise error
 
 
 def connected(place: Placement, problem: Problem, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:

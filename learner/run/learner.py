@@ -133,7 +133,7 @@ class Learner:
           RunError: a job failed on several workers, or a file cannot be written.
           Stopped: the user asked to stop; the last complete generation is saved.
         """
-        begun = time.monotonic() - self._at.seconds
+        start = time.monotonic() - self._at.seconds
         if self.over:
             return
         diagnosis = Diagnosis(self.config.algorithm_config)
@@ -147,7 +147,7 @@ class Learner:
             before = self.state
             learnt = learnt_from(self.config, self.problem.task, returns, results.steps[: returns.size])
             self.state = algorithms.tell(self._algorithm, before, eps, learnt)
-            self._note(before, results, returns, learnt, time.monotonic() - begun, dispatcher)
+            self._note(before, results, returns, learnt, time.monotonic() - start, dispatcher)
             if not self.over:
                 eps = self._explore(dispatcher)
             progress = self._progress(results, returns, dispatcher)
@@ -199,9 +199,11 @@ class Learner:
         with suppress(OSError):  # if the disk is full, the generation's end says so
             self.folder.save(self._at)
         if (generation := goes_back_to(self._at)) is not None:
-            said = f"the run goes back to generation {generation}, before the first answer of a host that is expelled"
-            log.warning("%s; what follows is repeated", said)
-            raise RolledBack(f"{said}: --resume {self.folder.path} repeats what follows")
+            outcome = (
+                f"the run goes back to generation {generation}, before the first answer of a host that is expelled"
+            )
+            log.warning("%s; what follows is repeated", outcome)
+            raise RolledBack(f"{outcome}: --resume {self.folder.path} repeats what follows")
 
     def evaluate(self, dispatcher: Dispatcher) -> Evaluation:
         """The mean policy at the end of the run, averaged over its last generations if the run says so."""
@@ -298,18 +300,18 @@ class Learner:
         before: SearchState,
         results: RoundResults,
         returns: FloatArray,
-        told: FloatArray,
+        scores: FloatArray,
         seconds: float,
         dispatcher: Dispatcher,
     ) -> None:
-        """Update the checkpoint after the algorithm was told (rows, signs), from the returns (S,) of all rollouts."""
+        """Update the checkpoint from the scores (rows, signs) that the algorithm was told, and all returns (S,)."""
         best, generation = self._at.best, self._at.best_generation
         steps = int(results.steps[: returns.size].sum())
-        replayed = self._at.replayed or len(results) > len(told) * self.config.episodes + 1
-        if before.best is None or told.max() > before.best:
-            row, column = divmod(int(told.argmax()), len(self._signs))
-            episode = int(returns.reshape(-1, *told.shape)[:, row, column].argmax())  # the best one of the best
-            job = results.jobs.take([episode * len(told) + row])
+        replayed = self._at.replayed or len(results) > len(scores) * self.config.episodes + 1
+        if before.best is None or scores.max() > before.best:
+            row, column = divmod(int(scores.argmax()), len(self._signs))
+            episode = int(returns.reshape(-1, *scores.shape)[:, row, column].argmax())  # the best one of the best
+            job = results.jobs.take([episode * len(scores) + row])
             seed, theta = job.seeds()[column], job.theta(before.mu)[column]
             best = BestRollout(seed=seed, theta=theta, normaliser=normaliser(self._at.moments))
             generation, replayed = self.state.generation, False
@@ -351,11 +353,11 @@ class Learner:
     def _save(self, progress: GenerationStats, last: Checkpoint) -> None:
         if self._at.first != last.first:
             self.folder.states.keep(last)
-        mu, sigma, seen = self.state.mu, self.state.sigma, normaliser(self._at.moments)
+        mu, sigma, statistics = self.state.mu, self.state.sigma, normaliser(self._at.moments)
         state = chain.state_of(self._at)
-        link = chain.Link(chain.following(last.chain, progress, mu, sigma, seen, state), state)
+        link = chain.Link(chain.following(last.chain, progress, mu, sigma, statistics, state), state)
         self._at = replace(self._at, chain=link.digest)
-        self.folder.append(progress, mu, sigma, self.config.generations, seen, link)
+        self.folder.append(progress, mu, sigma, self.config.generations, statistics, link)
         now = time.monotonic()
         durable = now - self._durable > DURABLE_EVERY
         self._durable = now if durable else self._durable
@@ -371,10 +373,10 @@ def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[Flo
     algorithm, episodes = config.algorithm_of(pairs), config.episodes
     eps = algorithms.ask(algorithm, state, seeds.exploration(config.seed, state.generation))
     starts = range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
-    drawn = None
+    words = None
     if config.task_config.perturb:
-        drawn = [seeds.training(config.seed, state.generation, start) for start in starts]
-    return eps, Jobs.exploring(eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), drawn)
+        words = [seeds.training(config.seed, state.generation, start) for start in starts]
+    return eps, Jobs.exploring(eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), words)
 
 
 def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:

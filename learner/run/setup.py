@@ -80,11 +80,11 @@ class Problem:
         Raises:
           ConfigError: the policy's start is invalid; TaskError: the algorithm's state is.
         """
-        size, found = self.policy.size, self.policy.start(seeds.start(self.config.seed))
-        check_vector(f"start of {self._plugins['policy'].wire}", found, size)
-        if found is not None and self.policy.scale is not None:
-            found = found / self.policy.scale
-        return algorithms.begin(self.config.algorithm_config, size, found)
+        size, mu = self.policy.size, self.policy.start(seeds.start(self.config.seed))
+        check_vector(f"start of {self._plugins['policy'].wire}", mu, size)
+        if mu is not None and self.policy.scale is not None:
+            mu = mu / self.policy.scale
+        return algorithms.begin(self.config.algorithm_config, size, mu)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -123,21 +123,21 @@ def problem(
     plugin = plugins.find("policies", config.policy)
     if constants is None:
         constants = draw_constants(plugin, config.policy_config, task, spec, seeds.features(config.seed))
-    found = Problem(config, task, spec, build_policy(plugin, config.policy_config, spec, constants))
-    _check_size(found)
-    return found
+    result = Problem(config, task, spec, build_policy(plugin, config.policy_config, spec, constants))
+    _check_size(result)
+    return result
 
 
-def _check_size(found: Problem) -> None:
+def _check_size(problem: Problem) -> None:
     """Check that a mean fits into a message.
 
     Raises:
       ConfigError: it does not; names the largest size that does.
     """
-    size, most = found.policy.size, MESSAGE_LIMIT // 8
+    size, most = problem.policy.size, MESSAGE_LIMIT // 8
     if size > most:
         raise ConfigError(f"the policy has {size} parameters; at most {most} fit into a message")
-    constants = sum(values.nbytes for values in found.policy.constants.values())
+    constants = sum(values.nbytes for values in problem.policy.constants.values())
     if constants > MESSAGE_LIMIT:
         raise ConfigError(
             f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit into a message"
@@ -195,19 +195,19 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
       ConfigError: the task is not available here, or the run to start from cannot be used.
     """
     other = None if config.init_from is None else _other(config)
-    begun = problem(config, other.constants if other else None, files)
-    state = begun.begin()
+    subject = problem(config, other.constants if other else None, files)
+    state = subject.begin()
     if other is not None:
         state = _taken_over(config, state, other)
-    moments = np.zeros(1 + 2 * begun.spec.observation if config.policy_config.normalise else 0)
-    texts, assets = split(begun.task.sources)
+    moments = np.zeros(1 + 2 * subject.spec.observation if config.policy_config.normalise else 0)
+    texts, assets = split(subject.task.sources)
     checkpoint = Checkpoint(
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
-        solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True, code=begun.code,
-        files=texts, assets=assets, constants=dict(begun.policy.constants),
+        solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True,
+        code=subject.code, files=texts, assets=assets, constants=dict(subject.policy.constants),
         moments=other.moments if other else moments, chain=chain.first(config),
     )  # fmt: skip
-    return begun, checkpoint
+    return subject, checkpoint
 
 
 def resumed(
@@ -226,24 +226,24 @@ def resumed(
         )
     if not at.canary.startswith(numbers):
         raise CheckpointError(f"--numbers {numbers}: the run in {folder.path} began with {at.canary}, and keeps it")
-    found = problem(config, at.constants, folder.files(at))
-    if len(at.moments) != (1 + 2 * found.spec.observation if config.policy_config.normalise else 0):
+    subject = problem(config, at.constants, folder.files(at))
+    if len(at.moments) != (1 + 2 * subject.spec.observation if config.policy_config.normalise else 0):
         raise CheckpointError(f"{folder.checkpoint}: its statistics are of other observations than its task's")
-    changed = [name for name, digest in found.code.items() if at.code.get(name) != digest]
+    changed = [name for name, digest in subject.code.items() if at.code.get(name) != digest]
     if changed and not mixed:
         raise CheckpointError(
             f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back, "
             "begin a new run with --init-from, or continue with --mixed (then the run is not reproducible)"
         )
-    return found, at
+    return subject, at
 
 
 def _other(config: RunConfig) -> Checkpoint:
     """The run to start from, if its parameters have the same meaning."""
     folder = RunFolder.open(Path(str(config.init_from)))
-    theirs = folder.read_config()
+    other = folder.read_config()
     for name in ("task", "policy", "policy_config"):
-        there, here = getattr(theirs, name), getattr(config, name)
+        there, here = getattr(other, name), getattr(config, name)
         if there != here:
             raise ConfigError(
                 f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"

@@ -28,9 +28,9 @@ class States:
         path = self._file(at.state["generation"])
         checkpoints.save(path, at)
         checkpoints.flush(path)
-        kept = self._generations()
-        if len(kept) > MOST:
-            gaps = {kept[i]: kept[i + 1] - kept[i - 1] for i in range(1, len(kept) - 1)}
+        generations = self._generations()
+        if len(generations) > MOST:
+            gaps = {generations[i]: generations[i + 1] - generations[i - 1] for i in range(1, len(generations) - 1)}
             self._file(min(gaps, key=lambda each: gaps[each])).unlink()
 
     def without(self, at: Checkpoint) -> Checkpoint:
@@ -42,11 +42,11 @@ class States:
         generation = goes_back_to(at)
         if generation is None:
             return at
-        kept = [each for each in self._generations() if each <= generation]
-        there = checkpoints.load(self._file(kept[-1] if kept else 0))
+        generations = [each for each in self._generations() if each <= generation]
+        earlier = checkpoints.load(self._file(generations[-1] if generations else 0))
         return replace(
-            there, config=at.config, expelled=at.expelled, seconds=at.seconds, reissued=at.reissued,
-            undone=at.undone + at.state["generation"] - there.state["generation"],
+            earlier, config=at.config, expelled=at.expelled, seconds=at.seconds, reissued=at.reissued,
+            undone=at.undone + at.state["generation"] - earlier.state["generation"],
         )  # fmt: skip
 
     def forget_after(self, generation: int) -> None:

@@ -122,11 +122,11 @@ class Audit:
         """
         if not self._part or self._ended or len({host(worker) for worker in workers}) < 2:
             return
-        chosen = self._choose(results, end=end)
+        indices = self._choose(results, end=end)
         best, value = results.best() if end else (-1, -np.inf)
         if value > self._best and self._by[best] >= 0:
-            chosen.insert(0, best)
-        for index in chosen:
+            indices.insert(0, best)
+        for index in indices:
             if index not in self._agreed:
                 self._checks.setdefault(index, _Check({self._whose(index): results.answer(index)}))
         self._chosen, self._ended = True, end
@@ -178,16 +178,16 @@ class Audit:
     def answered(self, worker: str, index: int, first: bytes, second: bytes) -> bool:
         """Take another answer to a job that is done; return whether a check had asked this worker for it."""
         party, check = self._party(worker), self._checks.get(index)
-        asked = check is not None and check.asked == worker
+        expected = check is not None and check.asked == worker
         if not self._part or self._by[index] < 0 or (check is None and first == second):
-            return asked
+            return expected
         whose = self._whose(index)
         if party == whose or party.canary != whose.canary:
-            return asked
+            return expected
         check = self._checks.setdefault(index, _Check({whose: first}))
         check.answers.setdefault(party, second)
         check.asked = ""
-        return asked
+        return expected
 
     def settle(self, judge: Callable[[int, str], bytes | None] | None = None) -> dict[str, int]:
         """Close the checks in which two hosts agree; return each host that disagreed, and the job.
@@ -220,8 +220,8 @@ class Audit:
 
     def expel(self, name: str) -> list[int]:
         """Discard a host's answers; return its jobs of this round, which must be repeated."""
-        theirs = [at for at, party in enumerate(self._parties) if party.host == name]
-        jobs = np.flatnonzero(np.isin(self._by, theirs)).tolist()
+        parties = [at for at, party in enumerate(self._parties) if party.host == name]
+        jobs = np.flatnonzero(np.isin(self._by, parties)).tolist()
         self._by[jobs] = -1
         self._trust[name] = _Trust()
         self._right.discard(name)
@@ -251,7 +251,7 @@ class Audit:
 
         A check that no worker can answer is dropped, unless two answers differ; then it waits for one.
         """
-        asked: dict[str, list[int]] = {}
+        assignments: dict[str, list[int]] = {}
         queue = deque((name, self._party(name)) for name in workers)
         for index, check in list(self._checks.items()):
             if check.asked and now - check.since > patience:
@@ -265,7 +265,7 @@ class Audit:
                 queue.rotate(-1)
                 if party.canary == canary and party.host not in hosts | check.passed:
                     check.asked, check.since = name, now
-                    asked.setdefault(name, []).append(index)
+                    assignments.setdefault(name, []).append(index)
                     break
             if check.asked:
                 continue
@@ -273,7 +273,7 @@ class Audit:
                 del self._checks[index]
             else:
                 check.passed.clear()
-        return asked
+        return assignments
 
     @property
     def disputed(self) -> str:
@@ -292,8 +292,8 @@ class Audit:
         return list(dict.fromkeys(self._parties[at].host for at in sorted({*by.tolist()} - {-1})))
 
     def _jobs_of(self, name: str) -> np.ndarray:
-        mine = np.array([*(party.host == name for party in self._parties), False])  # -1: nobody's
-        return np.flatnonzero(mine[self._by])
+        mask = np.array([*(party.host == name for party in self._parties), False])  # -1: nobody's
+        return np.flatnonzero(mask[self._by])
 
     def _choose(self, results: RoundResults, *, end: bool) -> list[int]:
         """The jobs that are drawn; and of each host that is due its best and another, if none of the others is."""
@@ -306,16 +306,16 @@ class Audit:
             chance[done] = np.where(self._first, 1.0, _AT_THE_END)[done] * self._part
         new = [self._trust[party.host].passed < _EARNED for party in self._parties]
         chance[done] *= np.where(np.array(new, dtype=bool)[self._by[done]], _NEW, 1.0)
-        chosen = np.flatnonzero(self._rng.random(len(chance)) < chance).tolist()
+        indices = np.flatnonzero(self._rng.random(len(chance)) < chance).tolist()
         if self._late and not end:
-            return chosen
+            return indices
         returns, checked = results.job_returns(), {self._whose(index).host for index in self._checks} | self._right
         for name in self._answered(self._by):
             if not self._trust[name].due or name in checked:
                 continue
-            theirs = self._jobs_of(name)
-            best = int(theirs[returns[theirs].argmax()])
-            others = theirs[theirs != best]
-            if not set(chosen).intersection(others.tolist()):
-                chosen += [int(self._rng.choice(others)), best] if len(others) else [best]
-        return chosen
+            jobs = self._jobs_of(name)
+            best = int(jobs[returns[jobs].argmax()])
+            others = jobs[jobs != best]
+            if not set(indices).intersection(others.tolist()):
+                indices += [int(self._rng.choice(others)), best] if len(others) else [best]
+        return indices

@@ -340,8 +340,8 @@ class Dispatcher:
             raise MessageError("an error at no job of this round", "bad")
         self.notices.once(f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback)
         if self._ledger.scheduler.error(failure.worker, failure.index, time.monotonic()):
-            mine = None if self.admission.mixed else self._judging.right(failure.index, self.admission.canary)
-            if mine is not None:  # with devices, this machine's simulation says nothing about theirs
+            judgement = None if self.admission.mixed else self._judging.right(failure.index, self.admission.canary)
+            if judgement is not None:  # with devices, this machine's simulation says nothing about theirs
                 for worker in self._ledger.scheduler.failed_at(failure.index):
                     self._decline(worker, f"it failed at job {failure.index}, which this machine can do")
                 return
@@ -364,8 +364,8 @@ class Dispatcher:
         # Without block: a frozen host must not delay the others; deadlines cover lost messages.
         head = {"run": self.run, "incarnation": self.incarnation, "round": self._header.round}
         for worker, indices in jobs:
-            for some in self._ledger.round.messages(indices):
-                chunk = Chunk.carrying(self._ledger.round.jobs.take(some), **head)
+            for part in self._ledger.round.messages(indices):
+                chunk = Chunk.carrying(self._ledger.round.jobs.take(part), **head)
                 self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)
 
     def _refresh_status(self) -> None:

@@ -122,8 +122,8 @@ class JobTable:
 
     def trial(self, worker: str, now: float) -> int:
         """Give a new worker one job, an open one if there is one; others may take it too, so nobody waits for it."""
-        tried, last = set(self.trials.values()), next(reversed(self.open), self.size - 1)
-        index = next((index for index in reversed(self.open) if index not in tried), last)
+        trials, last = set(self.trials.values()), next(reversed(self.open), self.size - 1)
+        index = next((index for index in reversed(self.open) if index not in trials), last)
         del self.asking[worker]
         if worker not in self._again:
             self.known[worker].bench(self.known[worker].late + 1, now)
@@ -147,16 +147,16 @@ class JobTable:
 
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
-        taken: list[int] = []
-        pending, held, queue = self._pending, self.workers[worker].held, self.full if self.copies == 1 else self.out
-        while pending and len(taken) < count:
+        indices: list[int] = []
+        pending, holdings, queue = self._pending, self.workers[worker].held, self.full if self.copies == 1 else self.out
+        while pending and len(indices) < count:
             index = heapq.heappop(pending)
             if index in self.open:
-                taken.append(index)
+                indices.append(index)
                 self.open[index].append(worker)  # a pending job has no holder and is in no queue
-                held[index] = queue[index] = now
-        self.given[worker].update(taken)
-        return tuple(taken)
+                holdings[index] = queue[index] = now
+        self.given[worker].update(indices)
+        return tuple(indices)
 
     def give(self, index: int, worker: str, now: float) -> None:
         """Give a worker a job that is in no queue, or that other workers hold as well."""
@@ -180,13 +180,13 @@ class JobTable:
         """Note results of jobs of this round; return for each whether it was not done before."""
         if indices:
             self.prove(worker)
-        held: dict[int, float] = {}
+        holdings: dict[int, float] = {}
         state = self.workers.get(worker)
         if state is not None:
-            held, state.benched = state.held, False
+            holdings, state.benched = state.held, False
         done: list[bool] = []
         for index in indices:
-            held.pop(index, None)
+            holdings.pop(index, None)
             self._unqueue(index)
             done.append(self.open.pop(index, None) is not None)
         return done
@@ -197,8 +197,8 @@ class JobTable:
         if state is None or index not in self.given[worker]:
             return False, False
         state.benched = True
-        held = state.held.pop(index, None) is not None
-        if index not in self.open or (not held and worker in self.errors[index]):
+        holder = state.held.pop(index, None) is not None
+        if index not in self.open or (not holder and worker in self.errors[index]):
             return False, False  # done in the meantime, or a duplicate message
         self.errors[index][worker] += 1
         if not self._leave(worker, index, now):
@@ -226,7 +226,7 @@ class JobTable:
 
     def free(self, most: int) -> list[tuple[int, str]]:
         """Return a heap of (jobs held, worker) of the workers that may hold one more job."""
-        free = [(held, name) for held, name in self.able() if held < min(self.workers[name].credits, most)]
+        free = [(load, name) for load, name in self.able() if load < min(self.workers[name].credits, most)]
         heapq.heapify(free)
         return free
 
@@ -247,7 +247,7 @@ class JobTable:
         silent = {name for name, state in self.workers.items() if not state.proven and state.overdue(late)}
         if len(silent) == len(self.workers):
             silent.clear()
-        spare = [(not self.workers[name].proven, held, name) for held, name in self.free(most) if name not in silent]
+        spare = [(not self.workers[name].proven, load, name) for load, name in self.free(most) if name not in silent]
         heapq.heapify(spare)
         return spare
 
@@ -256,13 +256,13 @@ class JobTable:
         passed: list[tuple[bool, int, str]] = []
         picked = None
         while spare and picked is None:
-            new, held, name = heapq.heappop(spare)
+            new, load, name = heapq.heappop(spare)
             if name in avoided or index in self.workers[name].held:
-                passed.append((new, held, name))
+                passed.append((new, load, name))
                 continue
             picked = name
-            if held + 1 < min(self.workers[name].credits, most):
-                passed.append((new, held + 1, name))
+            if load + 1 < min(self.workers[name].credits, most):
+                passed.append((new, load + 1, name))
         for entry in passed:
             heapq.heappush(spare, entry)
         return picked

@@ -53,15 +53,15 @@ class Judging:
 
     def right(self, index: int, canary: str) -> bytes | None:
         """The judge's answer to a job of this round, as machines with this canary compute it; None without one."""
-        found = self._asked(canary, self._mu, self._round.jobs.take([index]), self._normaliser, self._terms)
-        if found is not None:
+        answer = self._asked(canary, self._mu, self._round.jobs.take([index]), self._normaliser, self._terms)
+        if answer is not None:
             self.decided.add(index)
-        return found
+        return answer
 
     def ended(self, audit: Audit) -> None:
         """A round is over: keep an answer of each host whose check was due and not possible, one per host."""
         owed = audit.owed()
-        self._owed = {name: kept for name, kept in self._owed.items() if audit.unchecked(name)}
+        self._owed = {name: debt for name, debt in self._owed.items() if audit.unchecked(name)}
         for name, index in owed.items():
             job = self._round.jobs.take([index])
             self._owed[name] = _Owed(
@@ -76,10 +76,10 @@ class Judging:
         """
         wrong = {}
         for name, owed in self._owed.items():
-            found = self._asked(owed.canary, owed.mu, owed.job, owed.normaliser, owed.terms)
-            if found == owed.answer:
+            answer = self._asked(owed.canary, owed.mu, owed.job, owed.normaliser, owed.terms)
+            if answer == owed.answer:
                 audit.credit(name)
-            elif found is not None:
+            elif answer is not None:
                 wrong[name] = owed.generation
             else:
                 kind = "the learner's machine does not round as it does, or cannot simulate the task"
@@ -88,5 +88,5 @@ class Judging:
         return wrong
 
     def _asked(self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray, terms: bool) -> bytes | None:
-        found = self._judge(self._canary or canary, mu, job, normaliser, terms=terms) if self._judge else None
-        return None if found is None else bits(found, slice(None))
+        simulated = self._judge(self._canary or canary, mu, job, normaliser, terms=terms) if self._judge else None
+        return None if simulated is None else bits(simulated, slice(None))

@@ -66,8 +66,8 @@ class Ledger:
             return verdicts, {}
         for at, (job, verdict) in enumerate(zip(message.jobs.tolist(), verdicts, strict=True)):
             if verdict in ("doubled", "tried"):  # for a check, after a copy, a trial: two hosts must agree to the bit
-                stored, sent = self.round.answer(job), self.round.given(message, job)
-                verdicts[at] = "new" if self.audit.answered(message.worker, job, stored, sent) else verdict
+                stored, answer = self.round.answer(job), self.round.given(message, job)
+                verdicts[at] = "new" if self.audit.answered(message.worker, job, stored, answer) else verdict
         return verdicts, self.audit.settle(judge)
 
     def lost(self, worker: str) -> int:

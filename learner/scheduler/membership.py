@@ -107,7 +107,7 @@ class Attendance:
 
     def absent(self, now: float) -> list[str]:
         """Forget requests whose token did not follow in time; return the workers' names."""
-        gone = [worker for worker, (_, since) in self._early.items() if now - since > _SOON]
-        for worker in gone:
+        workers = [worker for worker, (_, since) in self._early.items() if now - since > _SOON]
+        for worker in workers:
             del self._early[worker]
-        return gone
+        return workers

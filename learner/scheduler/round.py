@@ -118,9 +118,9 @@ class RoundResults:
         returns = self.returns[:rollouts]
         rows = {"best": int(returns.argmax()), "worst": int(returns.argmin())}
         # If machines round differently, a job that ran twice may have sent the trace of another rollout.
-        kept = {name: self.traces[row].copy() for name, row in rows.items() if row in self.traces}
+        extremes = {name: self.traces[row].copy() for name, row in rows.items() if row in self.traces}
         whole = {"all": np.stack([self.traces[row] for row in range(rollouts)])} if self._traces == "all" else {}
-        return kept | whole
+        return extremes | whole
 
     def answer(self, job: int) -> bytes:
         """The stored results of a job, as bytes."""
@@ -158,38 +158,40 @@ class RoundResults:
         if first < 0 or last >= len(self):
             return None
         rows = np.arange(self._starts[first], self._starts[last + 1])
-        seen = self._seen[first : last + 1]
+        shows = self._seen[first : last + 1]
         if len(jobs) <= last - first:  # rare: some in between are missing
-            mine = np.isin(np.arange(first, last + 1), jobs)
-            rows, seen = rows[np.repeat(mine, self._rollouts[first : last + 1])], seen[mine]
-        if any(given.shape != _expected(own, len(rows)) for own, given in self._more(results)):
+            mask = np.isin(np.arange(first, last + 1), jobs)
+            rows, shows = rows[np.repeat(mask, self._rollouts[first : last + 1])], shows[mask]
+        if any(values.shape != _expected(array, len(rows)) for array, values in self._more(results)):
             return None
-        if len(results.returns) != len(rows) or len(results.trajectories) != np.count_nonzero(seen):
+        if len(results.returns) != len(rows) or len(results.trajectories) != np.count_nonzero(shows):
             return None
         if not ((1 <= results.steps) & (results.steps <= self._trace[0])).all():
             return None
-        wanted = traced(self._traces, results.returns, self._exploring[rows])
-        traces = len(results.traces) == len(wanted) and (not len(wanted) or results.traces.shape[1:] == self._trace)
+        with_trace = traced(self._traces, results.returns, self._exploring[rows])
+        traces = len(results.traces) == len(with_trace) and (
+            not len(with_trace) or results.traces.shape[1:] == self._trace
+        )
         if not (traces and all(trajectory.fits(self._shapes) for trajectory in results.trajectories)):
             return None
-        return Place(rows, wanted, jobs[seen])
+        return Place(rows, with_trace, jobs[shows])
 
-    def put(self, results: Results, place: "Place", chosen: BoolArray) -> None:
-        """Store the results of the chosen jobs; `chosen` has one entry per job of the message."""
-        rows, new = place.rows, np.repeat(chosen, self._rollouts[results.jobs])
-        some = slice(None) if chosen.all() else new
-        self.returns[rows[some]] = results.returns[some]
-        self.flags[rows[some]], self.steps[rows[some]] = results.flags[some], results.steps[some]
-        for own, given in self._more(results):
-            if own.size:
-                own[rows[some]] = given[some]
+    def put(self, results: Results, place: "Place", mask: BoolArray) -> None:
+        """Store the results of the jobs in the mask, which has one entry per job of the message."""
+        rows, mask_of_rows = place.rows, np.repeat(mask, self._rollouts[results.jobs])
+        selection = slice(None) if mask.all() else mask_of_rows
+        self.returns[rows[selection]] = results.returns[selection]
+        self.flags[rows[selection]], self.steps[rows[selection]] = results.flags[selection], results.steps[selection]
+        for array, values in self._more(results):
+            if array.size:
+                array[rows[selection]] = values[selection]
         for at, trace in zip(place.traced.tolist(), results.traces, strict=True):
-            if new[at]:
+            if mask_of_rows[at]:
                 self.traces[int(rows[at])] = trace
-        self.done[results.jobs[chosen]] = True
-        wanted = set(results.jobs[chosen].tolist())
+        self.done[results.jobs[mask]] = True
+        indices = set(results.jobs[mask].tolist())
         for job, trajectory in zip(place.shown.tolist(), results.trajectories, strict=True):
-            if job in wanted:
+            if job in indices:
                 self._trajectories[job] = trajectory
 
     def _more(self, results: Results) -> tuple[tuple[FloatArray, FloatArray], ...]:
@@ -199,9 +201,9 @@ class RoundResults:
         )  # fmt: skip
 
 
-def _expected(own: FloatArray, count: int) -> tuple[int, int]:
+def _expected(array: FloatArray, count: int) -> tuple[int, int]:
     """Shape of a message's array of this number of rollouts."""
-    return (count, own.shape[1]) if own.size else (0, 0)
+    return (count, array.shape[1]) if array.size else (0, 0)
 
 
 def bits(of: RoundResults | Simulated, rows: slice) -> bytes:

@@ -145,11 +145,11 @@ class Scheduler:
         """
         self._tick(now)
         self._learn(worker, indices, seconds)
-        given = self._table.given.get(worker, ())
-        new = iter(self._table.finish(worker, [index for index in indices if index in given]))
+        issued = self._table.given.get(worker, ())
+        new = iter(self._table.finish(worker, [index for index in indices if index in issued]))
         return [
             "stale" if not 0 <= index < self._table.size
-            else "unasked" if index not in given
+            else "unasked" if index not in issued
             else "new" if next(new)
             else "tried" if self._table.trials.get(worker) == index
             else "doubled"
@@ -227,9 +227,9 @@ class Scheduler:
         state = self._table.workers.get(worker)
         if state is None:
             return
-        sent = [state.held[index] for index in set(indices) if index in state.held]
-        if sent:
-            self._chunking.learn(len(sent), self._now - max(state.answered, min(sent)), seconds)
+        times = [state.held[index] for index in set(indices) if index in state.held]
+        if times:
+            self._chunking.learn(len(times), self._now - max(state.answered, min(times)), seconds)
             state.answered = self._now
 
     def _size(self) -> int:
@@ -242,24 +242,24 @@ class Scheduler:
             return []
         size = self._size()
         free = self._table.free(2 * size)
-        load = sum(held for held, _ in free)
+        total = sum(load for load, _ in free)
         chunks: list[Assignment] = []
         while free and self._table.any_pending():
-            held, name = heapq.heappop(free)
+            load, name = heapq.heappop(free)
             # Two chunks fit into the credits, so that one travels while the other is computed.
             credits = self._table.workers[name].credits
             chunk = min(size, (credits + 1) // 2)
-            if held > chunk:
-                load -= held
+            if load > chunk:
+                total -= load
                 continue
-            even = -(-(self._table.waiting + load) // (len(free) + 1)) - held  # until all hold the same number
-            taken = self._table.take(name, min(chunk, even, credits - held), self._now)
-            chunks.append(Assignment(name, taken))
-            load -= held
-            held += len(taken)
-            if held < credits and held <= chunk:
-                heapq.heappush(free, (held, name))
-                load += held
+            even = -(-(self._table.waiting + total) // (len(free) + 1)) - load  # until all hold the same number
+            indices = self._table.take(name, min(chunk, even, credits - load), self._now)
+            chunks.append(Assignment(name, indices))
+            total -= load
+            load += len(indices)
+            if load < credits and load <= chunk:
+                heapq.heappush(free, (load, name))
+                total += load
         return chunks
 
     def _trials(self) -> list[Assignment]:
@@ -284,7 +284,7 @@ class Scheduler:
                 self._reissued += queue is not self._table.failed  # failed jobs were counted before
                 self._table.give(index, name, self._now)
                 chunks.setdefault(name, []).append(index)
-        return [Assignment(name, tuple(taken)) for name, taken in chunks.items()]
+        return [Assignment(name, tuple(indices)) for name, indices in chunks.items()]
 
     def _wait(self, queue: dict[int, float]) -> float:
         return self._chunking.patience * (_GIVE_UP if queue is self._table.full else 1.0)

@@ -25,7 +25,7 @@ class StatusAnswer:
 
     def make(self, status: Callable[[], RunStatus]) -> None:
         """Make it anew."""
-        begun = time.monotonic()
+        start = time.monotonic()
         self.payload = codec.encode(status())
         now = time.monotonic()
-        self._due = max(begun + _PERIOD, now + (now - begun) / _PART)
+        self._due = max(start + _PERIOD, now + (now - start) / _PART)

@@ -80,9 +80,9 @@ class Publisher(logging.Handler):
         logging.getLogger().removeHandler(self)
         super().close()
 
-    def _page(self, asked: str) -> bytes:
+    def _page(self, query: str) -> bytes:
         """Past reports from a generation on: `from=<generation>`; called on another thread."""
-        digits = asked.removeprefix("from=")[:12]
+        digits = query.removeprefix("from=")[:12]
         first = int(digits) if digits.isascii() and digits.isdigit() else 1
         run = self._run  # before the reports, which may grow meanwhile
         return codec.encode(replace(run, reports=self._reports.page(first)))

@@ -44,14 +44,14 @@ class ReportLog:
     def page(self, generation: int) -> tuple[Report, ...]:
         """Reports from that generation on, as many as fit into a page; at least one, if there is one."""
         with self._lock:
-            chosen: list[Report] = []
+            reports: list[Report] = []
             size = 0
             for i in range(self._first(generation), len(self._reports)):
-                chosen.append(self._at(i))
-                size += _PLAIN + chosen[-1].nbytes
+                reports.append(self._at(i))
+                size += _PLAIN + reports[-1].nbytes
                 if size >= self._page:
                     break
-            return tuple(chosen)
+            return tuple(reports)
 
     def _first(self, generation: int) -> int:
         """Position of the first report of this generation or a later one; reports may be missing."""
