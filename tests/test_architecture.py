@@ -66,10 +66,7 @@ PURE = (
     *(f"farm/tasks/finger_gait/{name}.py" for name in ("hand", "observations", "rewards", "touch")),
     *(f"learner/algorithms/{name}.py" for name in ("ars", "gradients", "mirrored", "pgpe", "snes", "state")),
     *("learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
-    *(
-        f"learner/scheduler/{name}.py"
-        for name in ("audit", "chunking", "judging", "ledger", "membership", "roster", "round")
-    ),
+    *(f"learner/scheduler/{name}.py" for name in ("audit", "chunking", "judging", "ledger", "membership", "round")),
 )
 """Modules without network, simulator, clock or file."""
 

@@ -12,7 +12,7 @@ from learner.scheduler.round import bits
 log = logging.getLogger(__name__)
 
 
-class Judge:
+class LocalJudge:
     """Simulates single jobs on this machine; the simulation is prepared when it is first needed."""
 
     def __init__(self, problem: Problem) -> None:

@@ -37,7 +37,7 @@ from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.evaluation import Evaluation
 from learner.run.folder import RunFolder
-from learner.run.judge import Judge
+from learner.run.judge import LocalJudge
 from learner.run.learner import Learner
 from learner.run.setup import Problem, fitted, resumed, start
 from learner.run.states import RolledBack
@@ -282,7 +282,7 @@ def dispatch(
     for digest, content in by_digest(problem.task.sources).items():
         link.answer(keys.asset(place.farm, name, digest), partial(bytes, content))
     join = None if place.workers else how_to_join(place, problem)
-    spec, judge = problem.specification(name), stack.enter_context(closing(Judge(problem)))
+    spec, judge = problem.specification(name), stack.enter_context(closing(LocalJudge(problem)))
     dispatcher = Dispatcher(
         link, place.farm, spec, generations, join, tend, admission, problem.shapes(steps=steps), place.scheduler, judge
     )

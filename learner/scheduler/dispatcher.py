@@ -26,8 +26,7 @@ from farm.net.telemetry import RunStatus, WorkerStatus
 from farm.net.work import NOT_NORMALISED, Chunk, Failure, Jobs, Results, RoundHeader
 from learner.scheduler.judging import Judge, Judging
 from learner.scheduler.ledger import Ledger
-from learner.scheduler.membership import Admission, Attendance
-from learner.scheduler.roster import Roster
+from learner.scheduler.membership import Admission, Attendance, Members
 from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import SchedulerConfig
 from learner.scheduler.status import StatusAnswer
@@ -80,9 +79,9 @@ class Dispatcher:
         self._session, self._farm, self._stopped, self._shapes = session, farm, stopped, shapes
         self._how_to_join, self._generations = how_to_join, generations
         config = scheduler or SchedulerConfig()
-        self._attendance, self._roster = Attendance(config.instances), Roster(admission)
+        self._attendance, self._members = Attendance(config.instances), Members(admission)
         secret = np.random.default_rng(secrets.randbits(128))  # decides what is checked, and no number of the run
-        self._ledger = Ledger(config, self._roster.canary if admission.mixed else None, secret)
+        self._ledger = Ledger(config, self._members.canary if admission.mixed else None, secret)
         simulated = codec.encode(spec)
         self._header = RoundHeader(
             run=self.run, incarnation=secrets.token_hex(8), round=0, generation=0,
@@ -113,7 +112,7 @@ class Dispatcher:
 
     def census(self) -> tuple[WorkerStatus, ...]:
         """Workers that take part, with their recent rates."""
-        return self._roster.status(time.monotonic())
+        return self._members.status(time.monotonic())
 
     @property
     def reissued(self) -> int:
@@ -238,11 +237,11 @@ class Dispatcher:
             self._admit(want)
 
     def _admit(self, want: WorkRequest) -> None:
-        reason = self._roster.refusal(want)
+        reason = self._members.refusal(want)
         if reason is not None:
             self._refuse(want.worker, reason)
             return
-        if want.worker in self._roster.declined:
+        if want.worker in self._members.declined:
             return
         if want.worker not in self._ledger.scheduler.workers:
             log.info("worker %s joined (release %s)", want.worker, want.version)
@@ -250,13 +249,13 @@ class Dispatcher:
         self._ledger.scheduler.want(want.worker, want.credits, now, idle=idle)
         if idle:
             self._ledger.audit.lost(want.worker)
-        self._roster.asked(want, now)
+        self._members.asked(want, now)
 
     def _refuse(self, worker: str, reason: str) -> None:
         """Log the refusal here, and send it to the worker each time it asks, in case a message was lost."""
         self.notices.once(f"worker {worker} is refused: {reason}")
         self._ledger.lost(worker)
-        self._roster.refuse(worker, reason)
+        self._members.refuse(worker, reason)
         message = codec.encode(Refusal(run=self.run, reason=reason))
         self._session.publish(keys.refused(self._farm, worker), message, block=False)
 
@@ -266,7 +265,7 @@ class Dispatcher:
             self._came(worker)
             return
         self._attendance.left(worker)
-        self._roster.left(worker)
+        self._members.left(worker)
         if worker in self._ledger.scheduler.workers:
             again = self._ledger.lost(worker)
             log.info("worker %s left%s", worker, f"; {again} of its jobs are sent again" if again else "")
@@ -290,7 +289,7 @@ class Dispatcher:
 
     def _result(self, event: Event) -> None:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
-        if sender in self._roster.refused:
+        if sender in self._members.refused:
             raise MessageError("a result of a worker that is not admitted", "refused")
         if kind := self._ledger.scheduler.unread(sender):  # before it is decoded: a flood must cost little
             raise MessageError("a result of a worker without jobs of this round", kind)
@@ -324,11 +323,11 @@ class Dispatcher:
         self.notices.ignored.update(verdict for verdict in verdicts if verdict not in ("new", "tried"))
         if "unasked" in verdicts:
             self.notices.once(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
-        self._roster.did(message.worker, len(message.returns), now)
+        self._members.did(message.worker, len(message.returns), now)
 
     def _expel(self, host: str, reason: str) -> None:
         """A host's numbers are wrong: exclude it, and repeat its jobs of this round."""
-        for worker in self._roster.expel(host, reason):
+        for worker in self._members.expel(host, reason):
             self._refuse(worker, reason)
         log.error("%s; it is expelled, and %d of its jobs are repeated", reason, self._ledger.expel(host))
 
@@ -357,7 +356,7 @@ class Dispatcher:
             self.notices.once(f"worker {worker} does not serve this run: {reason}", traceback)
             self._ledger.scheduler.refused(worker)
             self._ledger.lost(worker)
-            self._roster.decline(worker, reason)
+            self._members.decline(worker, reason)
 
     def _send(self, jobs: Iterable[tuple[str, Sequence[int]]]) -> None:
         """Send jobs, by worker, to their inboxes."""
@@ -379,7 +378,7 @@ class Dispatcher:
             run=self.run, generation=self._header.generation, generations=self._generations,
             return_mean=last.return_mean if last else None,
             mean_policy_return=last.mean_policy_return if last else None,
-            open=self._ledger.scheduler.remaining, reissued=self.reissued, refused=len(self._roster.reasons),
+            open=self._ledger.scheduler.remaining, reissued=self.reissued, refused=len(self._members.reasons),
             ignored=dict(ignored), workers=self.census(), numbers=self.admission.canary,
         )  # fmt: skip
 
@@ -393,8 +392,8 @@ class Dispatcher:
         if self._ledger.scheduler.workers:
             self._alone = now
         elif now - self._alone > _PATIENCE and self._how_to_join is None:
-            if self._roster.reasons:
-                raise RunError(f"no worker takes part: {self._roster.reasons[0]}")
+            if self._members.reasons:
+                raise RunError(f"no worker takes part: {self._members.reasons[0]}")
         elif now - self._alone > _PATIENCE:
             log.warning("no workers; start some with: %s", self._how_to_join)
             self._alone = float("inf")

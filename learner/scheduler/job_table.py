@@ -17,7 +17,7 @@ _LATE: Final = 7  # a worker that never answers in time is tried once a minute
 
 
 @dataclass
-class Worker:
+class WorkerState:
     """The learner's view of a worker, which may be out of date."""
 
     credits: int
@@ -55,9 +55,9 @@ class JobTable:
         self.copies = copies
         self.given: defaultdict[str, set[int]] = defaultdict(set)
         """Every job of this round sent to a worker, connected or not."""
-        self.known: dict[str, Worker] = {}
+        self.known: dict[str, WorkerState] = {}
         """All that are connected."""
-        self.workers: dict[str, Worker] = {}
+        self.workers: dict[str, WorkerState] = {}
         """Those that take part. The others have answered nothing yet, while some have: they are tried first, which
         keeps nobody waiting."""
         self.asking: dict[str, None] = {}
@@ -97,10 +97,10 @@ class JobTable:
         self.asking = self._again | self.asking
         self.trials.clear()
 
-    def came(self, worker: str, credits: int) -> Worker:
+    def came(self, worker: str, credits: int) -> WorkerState:
         """The state of a worker; a new one is to be tried, unless no worker has answered yet."""
         if worker not in self.known:
-            self.known[worker] = Worker(credits)
+            self.known[worker] = WorkerState(credits)
             if not self._any_proven():
                 self.workers[worker] = self.known[worker]
         return self.known[worker]

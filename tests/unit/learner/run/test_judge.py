@@ -9,7 +9,7 @@ from farm import fingerprint
 from farm.net.work import Jobs
 from farm.rollouts import NOT_NORMALISED
 from learner.run.config import RunConfig
-from learner.run.judge import Judge
+from learner.run.judge import LocalJudge
 from learner.run.setup import problem
 from learner.scheduler.round import bits
 
@@ -34,7 +34,7 @@ def asked(tmp_path: Path, request: pytest.FixtureRequest) -> tuple[object, float
     file.write_text(SLIDE % request.param)
     found = problem(RunConfig(task=f"{file}:Slide", policy="constant"))
     job, mu = Jobs.mean("none", [(1, 2, 3, 4)]), np.full(1, 0.5)
-    judge, runner = Judge(found), found.runner()
+    judge, runner = LocalJudge(found), found.runner()
     try:
         return judge(fingerprint.digest(), mu, job, NOT_NORMALISED), runner.run(mu, job).returns[0]
     finally:
@@ -51,7 +51,7 @@ def test_it_says_what_a_rollout_returns(asked) -> None:
 def test_its_answer_has_the_terms_that_the_hosts_send(tmp_path: Path) -> None:
     (tmp_path / "slide.py").write_text(SLIDE % "0.0")
     found = problem(RunConfig(task=f"{tmp_path / 'slide.py'}:Slide", policy="constant"))
-    job, mu, runner, judge = Jobs.mean("none", [None]), np.full(1, 0.5), found.runner(), Judge(found)
+    job, mu, runner, judge = Jobs.mean("none", [None]), np.full(1, 0.5), found.runner(), LocalJudge(found)
     given = judge(fingerprint.digest(), mu, job, NOT_NORMALISED, terms=True)
     sent = runner.run(mu, job, "none", NOT_NORMALISED, terms=True)
     assert given is not None
