@@ -16,8 +16,8 @@ except ImportError:
 
 if __name__ == "__main__":
     with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
-        found = differential_evolution(
+        result = differential_evolution(
             lambda x: -pool.map(x.T), [(0.0, 3.0)] * pool.size, vectorized=True, updating="deferred",
             maxiter=5, popsize=1, polish=False, rng=0,
         )  # fmt: skip
-    print(f"return {-found.fun:.3f} after {found.nfev} calls of the pool")
+    print(f"return {-result.fun:.3f} after {result.nfev} calls of the pool")

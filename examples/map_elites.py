@@ -27,14 +27,14 @@ GENERATIONS, BATCH = 40, 40
 if __name__ == "__main__":
     with farm.Farm(TASK, policy="constant", workers=2) as pool:
         ranges = [(each.low, each.high) for each in pool.spec.measures]
-        own = {"solution_dim": pool.size, "ranges": ranges, "learning_rate": 1.0, "threshold_min": -1e3}
-        archive = GridArchive(dims=(12, 12), seed=0, extra_fields={"seed": ((), np.int64)}, **own)
+        options = {"solution_dim": pool.size, "ranges": ranges, "learning_rate": 1.0, "threshold_min": -1e3}
+        archive = GridArchive(dims=(12, 12), seed=0, extra_fields={"seed": ((), np.int64)}, **options)
         kind = {"x0": np.zeros(pool.size), "sigma0": 0.15, "batch_size": BATCH, "seed": 0}
         search = Scheduler(archive, [EvolutionStrategyEmitter(archive, **kind)])
         for generation in range(GENERATIONS):
             thetas, seeds = search.ask(), np.arange(BATCH) + BATCH * generation
-            found = pool.evaluate(thetas, seeds)
-            search.tell(found.returns, found.measures, seed=seeds)
+            results = pool.evaluate(thetas, seeds)
+            search.tell(results.returns, results.measures, seed=seeds)
             if generation % 10 == 9:
                 best = archive.stats.obj_max
                 print(f"generation {generation + 1}: {len(archive)} grips, the best returns {best:.3f}")

@@ -40,9 +40,9 @@ class Grip(Problem):
 
 if __name__ == "__main__":
     with farm.Farm(TASK, policy="constant", workers=2) as pool:
-        found = minimize(Grip(pool), NSGA2(pop_size=40), ("n_gen", 20), seed=0)
-    if found.F is None:
+        result = minimize(Grip(pool), NSGA2(pop_size=40), ("n_gen", 20), seed=0)
+    if result.F is None:
         sys.exit("no grip fulfils the constraint")
-    for shift, offset in found.F[np.argsort(found.F[:, 0])]:
+    for shift, offset in result.F[np.argsort(result.F[:, 0])]:
         print(f"shift {shift:.2f} mm, largest offset {offset:.3f} rad")
-    print(f"{len(found.F)} grips, none better than another in both; the middle finger carries {LEAST:.0%} or more")
+    print(f"{len(result.F)} grips, none better than another in both; the middle finger carries {LEAST:.0%} or more")

@@ -25,7 +25,7 @@ LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}  # array dtype -> for
 
 def rollout(theta: list[float], clock: float) -> float:
     """The return of 50 steps of 50 ms by the rig's clock; raises RuntimeError if it fails. Put your robot here."""
-    angle, speed, value, begun = 0.3 + random.uniform(-0.1, 0.1), 0.0, 0.0, time.monotonic()
+    angle, speed, value, start = 0.3 + random.uniform(-0.1, 0.1), 0.0, 0.0, time.monotonic()
     for step in range(1, 51):
         action = theta[0] * math.sin(angle) + theta[1] * math.cos(angle) + theta[2] * 0.1 * speed + theta[3]
         for _ in range(10):
@@ -34,7 +34,7 @@ def rollout(theta: list[float], clock: float) -> float:
         if abs(speed) > 7.0:
             raise RuntimeError(f"the rig's guard stopped it in step {step}: faster than 7 rad/s")
         value += math.cos(angle)
-        time.sleep(max(0.0, clock and begun + 0.05 * step / clock - time.monotonic()))
+        time.sleep(max(0.0, clock and start + 0.05 * step / clock - time.monotonic()))
     return value
 
 
@@ -77,8 +77,8 @@ class Worker:
 
     def want(self, idle: tuple[str, ...] = ()) -> None:
         """Ask for one job at a time. The canary is empty, because these numbers cannot be repeated."""
-        own = {"version": "robot_worker", "canary": "", "host": os.uname().nodename, "cores": 1, "ignored": {}}
-        self.say(f"want/{self.id}", "WorkRequest", worker=self.id, credits=1, idle=list(idle), **own)
+        machine = {"version": "robot_worker", "canary": "", "host": os.uname().nodename, "cores": 1, "ignored": {}}
+        self.say(f"want/{self.id}", "WorkRequest", worker=self.id, credits=1, idle=list(idle), **machine)
 
     def say(self, key: str, kind: str, **fields: object) -> None:
         """Publish a message; wait while the send queue is full."""
@@ -87,17 +87,17 @@ class Worker:
 
     def ask(self, run: str, what: str) -> bytes:
         """The answer of the run's learner to a query; empty if there is none."""
-        said = self.session.get(f"farm/run/{run}/{what}", timeout=1.0)
-        return next((reply.ok.payload.to_bytes() for reply in said if reply.ok), b"")
+        replies = self.session.get(f"farm/run/{run}/{what}", timeout=1.0)
+        return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok), b"")
 
     def round(self, run: str) -> dict:
         """The current round's header, and whether the rig can serve its run."""
-        header, said = msgpack.unpackb(self.ask(run, "generation"), ext_hook=numbers), self.ask(run, "spec")
-        if hashlib.sha256(said).hexdigest() != header["spec"]:
+        header, content = msgpack.unpackb(self.ask(run, "generation"), ext_hook=numbers), self.ask(run, "spec")
+        if hashlib.sha256(content).hexdigest() != header["spec"]:
             raise ValueError("a specification that is not the round's")
-        spec = msgpack.unpackb(said, ext_hook=numbers)
-        own = spec["task"], spec["policy"], spec["task_config"]["steps"] or 50, spec["task_config"]["gamma"]
-        return header | {"fits": own == ("rig.py:Rig", "linear", 50, 1.0) and not header["normaliser"]}
+        spec = msgpack.unpackb(content, ext_hook=numbers)
+        run_settings = spec["task"], spec["policy"], spec["task_config"]["steps"] or 50, spec["task_config"]["gamma"]
+        return header | {"fits": run_settings == ("rig.py:Rig", "linear", 50, 1.0) and not header["normaliser"]}
 
     def chunk(self, chunk: dict) -> None:
         """Do the jobs of a message, if they belong to the current round."""
@@ -122,9 +122,9 @@ class Worker:
                 self.say(key, "Failure", **head, index=index, error=str(error))
                 self.want()  # a worker that failed gets no jobs until it asks again
                 continue
-            n, own = len(values), {"trajectories": [], "traces": array("<f4", [0, 0, 0], [])}
-            own |= {"returns": array("<f8", [n], values), "flags": array("|b1", [n, 4], [False] * 4 * n)}
-            self.say(key, "Results", **head, **own, jobs=array("<i8", [1], [index]), steps=array("<i8", [n], [50] * n))
+            n, body = len(values), {"trajectories": [], "traces": array("<f4", [0, 0, 0], [])}
+            body |= {"returns": array("<f8", [n], values), "flags": array("|b1", [n, 4], [False] * 4 * n)}
+            self.say(key, "Results", **head, **body, jobs=array("<i8", [1], [index]), steps=array("<i8", [n], [50] * n))
             print(f"job {index} of round {head['round']}:", *(f"{value:.2f}" for value in values), flush=True)
 
 
@@ -133,18 +133,18 @@ if __name__ == "__main__":
     parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="where a learner or a router listens")
     parser.add_argument("--tls", type=Path, help="a folder worker-NAME of farm certificates")
     parser.add_argument("--clock", type=float, default=10.0, help="the rig's speed, times real time; 0 does not wait")
-    given, config, name = parser.parse_args(), zenoh.Config(), "rig"
-    settings = {"mode": "client", "connect/endpoints": [given.connect], "connect/timeout_ms": -1}
-    settings |= {"connect/retry": {"period_max_ms": 1000}, "transport/link/tls/enable_mtls": bool(given.tls)}
+    flags, config, name = parser.parse_args(), zenoh.Config(), "rig"
+    settings = {"mode": "client", "connect/endpoints": [flags.connect], "connect/timeout_ms": -1}
+    settings |= {"connect/retry": {"period_max_ms": 1000}, "transport/link/tls/enable_mtls": bool(flags.tls)}
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C also stops a pending query
     try:
-        if given.tls:
-            name = json.loads((given.tls / "identity.json").read_text())["name"]
+        if flags.tls:
+            name = json.loads((flags.tls / "identity.json").read_text())["name"]
             for key in ("root_ca_certificate ca", "connect_certificate cert", "connect_private_key key"):
-                settings[f"transport/link/tls/{key.split()[0]}"] = str(given.tls / f"{key.split()[1]}.pem")
+                settings[f"transport/link/tls/{key.split()[0]}"] = str(flags.tls / f"{key.split()[1]}.pem")
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         with zenoh.open(config) as session:
-            Worker(session, name, given.clock).serve()
+            Worker(session, name, flags.clock).serve()
     except (OSError, ValueError, KeyError, zenoh.ZError) as error:
         parser.error(f"it cannot start with these settings: {error}")

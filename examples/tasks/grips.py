@@ -19,5 +19,5 @@ class Grips(FingerGait):
         force = record.frames["force"][rows, last].sum(axis=-1)  # of index, middle and thumb [N], (B, 3)
         place = slice(8, 11)  # the object's position in qpos, after eight joints
         way = record.frames["qpos"][rows, last, place] - record.start["qpos"][:, place]
-        given = {"middle": force[:, 1] / np.maximum(force.sum(axis=1), 1e-9), "shift": np.sqrt((way**2).sum(axis=1))}
-        return {each.name: np.clip(given[each.name], each.low, each.high) for each in self.measures}
+        values = {"middle": force[:, 1] / np.maximum(force.sum(axis=1), 1e-9), "shift": np.sqrt((way**2).sum(axis=1))}
+        return {each.name: np.clip(values[each.name], each.low, each.high) for each in self.measures}
