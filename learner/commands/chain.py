@@ -64,23 +64,23 @@ def main(words: Sequence[str]) -> int:
     check_lengths(policies, command)
     if command.video is not None:
         video.check(command.video)
-    drawn = [seeds.trial(command.seed, i) for i in range(command.starts)]
+    starts = [seeds.trial(command.seed, i) for i in range(command.starts)]
     if command.json:
-        say(json.dumps(figures(chain(policies, drawn, command.steps), len(policies)), indent=2))
+        say(json.dumps(figures(chain(policies, starts, command.steps), len(policies)), indent=2))
         return 0
     from learner.run.launch import check_rerun
 
     check_rerun()
     recordings.target(command.to)
-    found = figures(chain(policies, drawn, command.steps), len(policies))
+    results = figures(chain(policies, starts, command.steps), len(policies))
     table = Table(title=f"{len(policies)} policies in turn, {command.starts} perturbed starts")
     table.add_column("cycles, at least")
     table.add_column("starts", justify="right")
-    for cycles, part in found["cycles_at_least"].items():
+    for cycles, part in results["cycles_at_least"].items():
         table.add_row(cycles, f"{part:.0%}")
     Console().print(table)
-    said = f"changes: median {found['changes_median']:g}, {found['changes_min']} to {found['changes_max']}"
-    say(f"{said}; {found['lost']} of {command.starts} lost within {command.steps} control steps")
+    changes = f"changes: median {results['changes_median']:g}, {results['changes_min']} to {results['changes_max']}"
+    say(f"{changes}; {results['lost']} of {command.starts} lost within {command.steps} control steps")
     _record(policies, command)
     return 0
 
@@ -115,13 +115,13 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     from learner.again.chain import chain
 
     first = policies[0].problem
-    shown = chain(policies, [None], command.shown, every=1)
-    found = loop.trajectory(shown.task, first.spec, first.scene, shown.rollouts, 0)
+    chained = chain(policies, [None], command.shown, every=1)
+    trajectory = loop.trajectory(chained.task, first.spec, first.scene, chained.rollouts, 0)
     # Its reward would be the first policy's throughout.
-    trajectory = replace(found, terms=np.zeros_like(found.terms), value=float("nan"), success=None)
-    name = f"{len(policies)} policies in turn: the goal is reached {shown.changes[0]} times"
+    trajectory = replace(trajectory, terms=np.zeros_like(trajectory.terms), value=float("nan"), success=None)
+    name = f"{len(policies)} policies in turn: the goal is reached {chained.changes[0]} times"
     recordings.record(command.to, "chain", first, name, trajectory)
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.video is not None:
-        frames = loop.whole(shown.rollouts, 0)
-        recordings.film(shown.task, [(trajectory, frames)], command.video, command.speed)
+        frames = loop.whole(chained.rollouts, 0)
+        recordings.film(chained.task, [(trajectory, frames)], command.video, command.speed)

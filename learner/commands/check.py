@@ -73,24 +73,24 @@ def main(words: Sequence[str]) -> int:
 def _parsed(words: Sequence[str]) -> tuple[CheckCommand, RunConfig]:
     """The command, and a run of its task."""
     name = _name(words)
-    own = None if name is None else configs.configure(plugins.find("tasks", name).name)
-    default = CheckCommand(name=name, task=own.task_config) if name and own else None
+    config = None if name is None else configs.configure(plugins.find("tasks", name).name)
+    default = CheckCommand(name=name, task=config.task_config) if name and config else None
     command = settings.parse(CheckCommand, words, "farm check", default)
-    assert own is not None
+    assert config is not None
     from learner.commands.run import RunCommand  # imports MuJoCo
 
-    settings.distinct(RunCommand(run=own), "farm run")
-    settings.distinct(ReplayCommand(run=Path(), task=own.task_config), "farm replay")
+    settings.distinct(RunCommand(run=config), "farm run")
+    settings.distinct(ReplayCommand(run=Path(), task=config.task_config), "farm replay")
     if command.policy:
-        own = configs.configure(own.task, policy=command.policy)
-    return command, replace(own, task_config=command.task)
+        config = configs.configure(config.task, policy=command.policy)
+    return command, replace(config, task_config=command.task)
 
 
 def _name(words: Sequence[str]) -> str | None:
     """The task among the words: the first that looks like one, else the first that is no flag or value of one."""
     loose = [word for flag, word in pairwise(("", *words)) if word[:1] != "-" and flag not in _VALUED]
-    named = [word for word in loose if ":" in word or word in plugins.names("tasks")]
-    return next(iter(named or loose), None)
+    tasks = [word for word in loose if ":" in word or word in plugins.names("tasks")]
+    return next(iter(tasks or loose), None)
 
 
 def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequence[str]) -> Iterator[str]:
@@ -103,115 +103,115 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
       words: of the command, from which a second process makes the same run.
     """
     from farm import rollouts
-    from learner.run.setup import problem
+    from learner.run import setup
 
     other = None if backend == "cpu" else rollouts.backend(backend)
-    found = problem(config)
-    spec = found.spec
-    low, high = found.task.limits
+    problem = setup.problem(config)
+    spec = problem.spec
+    low, high = problem.task.limits
     yield f"observation {spec.observation}, actions {spec.action}, controls {len(low)} from {low} to {high}"
     yield f"{spec.steps} control steps of {spec.period:g} s; reward of {', '.join(spec.terms)}"
     channels = ", ".join(channel.name for channel in spec.channels)
     yield f"success: {'yes' if spec.success else 'none'}; channels: {channels or 'none'}"
-    yield f"policy {config.policy} with {found.policy.size} parameters"
-    runner = found.runner()
-    theta, drawn = _tried(found)
-    together = runner.rollouts(theta, drawn)
+    yield f"policy {config.policy} with {problem.policy.size} parameters"
+    runner = problem.runner()
+    theta, starts = _batch(problem)
+    together = runner.rollouts(theta, starts)
     least, most = together.returns.min(), together.returns.max()
     yield f"returns {least:.4g} to {most:.4g}, {int(together.ended.sum())} ended early"
-    odd = (*_odd(together), *_still(found, runner), *_unread(type(found.task)))
+    odd = (*_odd(together), *_still(problem, runner), *_unread(type(problem.task)))
     yield from (f"warning: {each}" for each in odd)
     order = np.random.default_rng(1).permutation(ROWS)
-    permuted = runner.rollouts(theta[order], [drawn[i] for i in order])
+    permuted = runner.rollouts(theta[order], [starts[i] for i in order])
     _same(_arrays(together), {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()}, "in another order")
     for row in range(ROWS):
-        alone = runner.rollouts(theta[row : row + 1], [drawn[row]])
+        alone = runner.rollouts(theta[row : row + 1], [starts[row]])
         _same({k: v[row] for k, v in _arrays(together).items()}, {k: v[0] for k, v in _arrays(alone).items()}, "alone")
     runner.trajectory(together, 0)
-    own, others = _digests(together), _elsewhere(words)
-    for name in (name for name, digest in own.items() if others.get(name) != digest):
+    digests, others = _digests(together), _elsewhere(words)
+    for name in (name for name, digest in digests.items() if others.get(name) != digest):
         raise TaskError(
             f"{name} differs when the same rollouts run in another process: numbers must not depend on what a process "
             "draws or reads for itself, such as random.random(), hash() or the time"
         )
     yield "same bits together, in another order, one by one, and in another process"
-    yield f"{_speed(runner, theta, drawn):.0f} rollouts/s on one core"
+    yield f"{_speed(runner, theta, starts):.0f} rollouts/s on one core"
     if other is not None:
-        compared = rollouts.Runner(found.task, found.policy, other.engine, exact=rollouts.exact(other))
-        most = np.abs(compared.rollouts(theta, drawn).returns - together.returns).max()
+        compared = rollouts.Runner(problem.task, problem.policy, other.engine, exact=rollouts.exact(other))
+        most = np.abs(compared.rollouts(theta, starts).returns - together.returns).max()
         if most and rollouts.exact(other):
             raise TaskError(f"returns on backend {backend} differ by up to {most:.3g}: its class needs exact = False")
-        speed = _speed(compared, theta, drawn)
+        speed = _speed(compared, theta, starts)
         yield f"backend {backend}: returns differ by at most {most:.3g}; {speed:.0f} rollouts/s"
-    yield _picture(found, {name: values[:1] for name, values in together.start.items()}, picture)
+    yield _picture(problem, {name: values[:1] for name, values in together.start.items()}, picture)
 
 
 def again(words: Sequence[str]) -> None:
     """Print digests of the rollouts that `farm check` with these words simulates, as JSON, for `_elsewhere`."""
     with redirect_stdout(sys.stderr):  # the task's file may print
-        from learner.run.setup import problem
+        from learner.run import setup
 
-        found = problem(_parsed(words)[1])
-        said = json.dumps(_digests(found.runner().rollouts(*_tried(found))))
-    say(said)
+        problem = setup.problem(_parsed(words)[1])
+        text = json.dumps(_digests(problem.runner().rollouts(*_batch(problem))))
+    say(text)
 
 
 def _elsewhere(words: Sequence[str]) -> dict[str, str]:
     """Those digests from a new process, with its own random numbers and hashes."""
     command = [sys.executable, "-P", "-c", _AGAIN, *words]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONHASHSEED"}
-    ended = subprocess.run(command, capture_output=True, env=environment, text=True, check=False)
-    if ended.returncode:
-        why = ended.stderr.strip().splitlines()[-1:]
+    process = subprocess.run(command, capture_output=True, env=environment, text=True, check=False)
+    if process.returncode:
+        why = process.stderr.strip().splitlines()[-1:]
         raise TaskError(f"the same rollouts cannot be simulated in another process: {''.join(why)}")
-    digests: dict[str, str] = json.loads(ended.stdout.splitlines()[0])
+    digests: dict[str, str] = json.loads(process.stdout.splitlines()[0])
     return digests
 
 
-def _tried(found: "Problem") -> tuple[FloatArray, list[tuple[int, ...] | None]]:
+def _batch(problem: "Problem") -> tuple[FloatArray, list[tuple[int, ...] | None]]:
     """Parameters (ROWS, P) and seeds of the rollouts that are compared."""
-    theta = np.random.default_rng(0).normal(0.0, 0.5, (ROWS, found.policy.size))
+    theta = np.random.default_rng(0).normal(0.0, 0.5, (ROWS, problem.policy.size))
     return theta, [None if i == 0 else seeds.trial(0, i // 2) for i in range(ROWS)]
 
 
-def _odd(tried: "Rollouts") -> Iterator[str]:
+def _odd(rollouts: "Rollouts") -> Iterator[str]:
     """What rollouts of a finished task hardly ever do."""
-    count = int(tried.failed.sum())
+    count = int(rollouts.failed.sum())
     if count:
         yield f"the simulation of {count} of {ROWS} rollouts became unstable"
-    if (tried.ended & (tried.steps == 1)).all():
+    if (rollouts.ended & (rollouts.steps == 1)).all():
         yield "every rollout ends in its first control step; is `ended` what you mean?"
-    elif not count and len(set(tried.returns.tolist())) == 1:
+    elif not count and len(set(rollouts.returns.tolist())) == 1:
         yield f"all {ROWS} rollouts have the same return, so that there is nothing to learn"
 
 
-def _still(found: "Problem", runner: "Runner") -> Iterator[str]:
+def _still(problem: "Problem", runner: "Runner") -> Iterator[str]:
     """Whether none of the first perturbations that a run draws changes an action of its first mean policy."""
     from farm.policies.fourier import Kernel, Projected
 
-    state, algorithm = found.begin(), found.config.algorithm_config
-    eps = algorithms.ask(algorithm, state, seeds.exploration(found.config.seed, 0))[:ROWS]
+    state, algorithm = problem.begin(), problem.config.algorithm_config
+    eps = algorithms.ask(algorithm, state, seeds.exploration(problem.config.seed, 0))[:ROWS]
     starts: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(len(eps))]
     mean = runner.rollouts(np.repeat(state.mu[None], len(eps), axis=0), starts).actions
     with np.errstate(invalid="ignore"):
-        moved = np.abs(runner.rollouts(state.mu + eps, starts).actions - mean)
-    if (moved <= _STILL).all():
-        fits = isinstance(found.policy, Kernel | Projected)
+        changes = np.abs(runner.rollouts(state.mu + eps, starts).actions - mean)
+    if (changes <= _STILL).all():
+        fits = isinstance(problem.policy, Kernel | Projected)
         advice = "--start fitted" if fits else "a larger --initial-sigma, or another --policy, such as linear"
         yield (
             f"no perturbation changes any action: {len(eps)} of sigma {state.sigma.mean():.3g} change those of policy "
-            f"{found.config.policy} by at most {moved.max():.1g}, so that a run learns nothing; try {advice}"
+            f"{problem.config.policy} by at most {changes.max():.1g}, so that a run learns nothing; try {advice}"
         )
 
 
 def _unread(task: type[Task]) -> Iterator[str]:
     """Attributes of a task's own classes that nothing reads, with names like those that a task has."""
-    known = [name for name in dir(Task) if not name.startswith("_")]
-    own = task.__mro__[: task.__mro__.index(Task)]
-    source = "\n".join(map(_source, own))  # a class may read what a subclass says
-    for kind in own:
+    names = [name for name in dir(Task) if not name.startswith("_")]
+    classes = task.__mro__[: task.__mro__.index(Task)]
+    source = "\n".join(map(_source, classes))  # a class may read what a subclass says
+    for kind in classes:
         for name in vars(kind):
-            like = [] if name in known else difflib.get_close_matches(name, known, 1, _LIKE)
+            like = [] if name in names else difflib.get_close_matches(name, names, 1, _LIKE)
             if like and not re.search(rf"(?<!\bsim)\.{name}\b", source):
                 yield f"{kind.__name__}.{name} is not read by anything; is {like[0]} meant?"
 
@@ -223,11 +223,11 @@ def _source(kind: type) -> str:
         return ""
 
 
-def _speed(runner: "Runner", theta: FloatArray, drawn: list[tuple[int, ...] | None]) -> float:
+def _speed(runner: "Runner", theta: FloatArray, starts: list[tuple[int, ...] | None]) -> float:
     """Rollouts per second of a batch four times as large."""
-    begun, many = time.perf_counter(), np.tile(theta, (4, 1))
-    runner.rollouts(many, drawn * 4)
-    return len(many) / (time.perf_counter() - begun)
+    start, many = time.perf_counter(), np.tile(theta, (4, 1))
+    runner.rollouts(many, starts * 4)
+    return len(many) / (time.perf_counter() - start)
 
 
 def _arrays(of: "Rollouts") -> dict[str, FloatArray]:
@@ -254,11 +254,11 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
             )
 
 
-def _picture(found: "Problem", start: Mapping[str, FloatArray], path: Path | None) -> str:
+def _picture(problem: "Problem", start: Mapping[str, FloatArray], path: Path | None) -> str:
     """Draw the start; returns a line with the file's name."""
     from farm.sim import rendering
 
-    target = path or Path(f"{type(found.task).__name__.lower()}.png")
+    target = path or Path(f"{type(problem.task).__name__.lower()}.png")
     if target.suffix != ".png":
         raise ConfigError(f"--picture {target}: expected a name that ends in .png")
     try:
@@ -266,10 +266,10 @@ def _picture(found: "Problem", start: Mapping[str, FloatArray], path: Path | Non
     except ImportError:
         return "no picture: it needs pillow (pip install pillow)"
     try:
-        task, shown = found.task, {"channels": found.task.channels, "values": found.task.show(start)}
+        task, options = problem.task, {"channels": problem.task.channels, "values": problem.task.show(start)}
         qpos, mocap = start["qpos"], start.get("mocap")
-        [drawn] = rendering.pictures(task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **shown)
-        Image.fromarray(drawn).save(target)
+        [pixels] = rendering.pictures(task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **options)
+        Image.fromarray(pixels).save(target)
     except (RunError, OSError) as error:
         return f"no picture: {error}"
     return f"the start: {target}"

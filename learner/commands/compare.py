@@ -44,12 +44,12 @@ def main(words: Sequence[str]) -> int:
     recordings.target(command.to)
     folders = [RunFolder.open(path) for path in command.runs]
     runs = read(folders)
-    shown = []
+    replays = []
     for folder, run in zip(folders, runs, strict=True):
         policy = loaded(folder)
-        shown.append(Shown(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
+        replays.append(Shown(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
     with writing(command.to):
-        record_comparison(command.to, shown, table(runs))
+        record_comparison(command.to, replays, table(runs))
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.view:
         view.check_display(str(command.to))
@@ -83,9 +83,9 @@ def read(folders: Sequence[RunFolder]) -> list[Compared]:
 def names(paths: Sequence[Path]) -> list[str]:
     """A unique name for each folder: its own, preceded by those of parent folders as long as two are equal."""
     whole = [path.resolve() for path in paths]
-    for path, given in zip(whole, paths, strict=True):
+    for path, folder in zip(whole, paths, strict=True):
         if whole.count(path) > 1:
-            raise ConfigError(f"{given} is there twice; each run once")
+            raise ConfigError(f"{folder} is there twice; each run once")
     depth = 1
     while len({path.parts[-depth:] for path in whole}) < len(whole):
         depth += 1
@@ -109,15 +109,15 @@ def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
 
 
 def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
-    def said(key: str, form: str) -> tuple[str, ...]:
+    def cells(key: str, form: str) -> tuple[str, ...]:
         values = [run.summary.get(key) for run in runs]
         return tuple("-" if value is None else format(value, form) for value in values)
 
     yield "generations done", *(str(run.progress[-1].generation) for run in runs)
     yield "rollouts", *(str(run.progress[-1].rollouts) for run in runs)
-    yield "return of the final policy", *said("mean_policy_return", ".3f")
+    yield "return of the final policy", *cells("mean_policy_return", ".3f")
     yield "it succeeds", *(_succeeds(run.summary) for run in runs)
-    yield "robust success", *said("robust_success_rate", ".0%")
+    yield "robust success", *cells("robust_success_rate", ".0%")
     firsts = (next((p.generation - 1 for p in run.progress if p.mean_policy_success), None) for run in runs)
     yield "first success, generation", *("-" if first is None else str(first) for first in firsts)
     yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)

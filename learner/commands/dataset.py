@@ -84,16 +84,16 @@ def main(words: Sequence[str]) -> int:
         data, run = DataSet(command.out, command.episodes or 1000, seed), command.run
     if data.begin(RunFolder.open(run)):
         say(f"{command.out} is complete")
-    elif not _made(data, command.place):
+    elif not _make(data, command.place):
         return INTERRUPTED
     if command.manifest is not None:
-        if said := difference(command.manifest, data.manifest):
-            raise RunError(f"{command.out} differs from {command.manifest}: {said}")
+        if text := difference(command.manifest, data.manifest):
+            raise RunError(f"{command.out} differs from {command.manifest}: {text}")
         say(f"the same bytes as {command.manifest} says")
     return 0
 
 
-def _made(data: DataSet, place: Placement) -> bool:
+def _make(data: DataSet, place: Placement) -> bool:
     """Make a data set, with a bar on a terminal; return whether it is complete."""
     console = Console()
     with Progress(console=console, disable=not console.is_terminal) as bar, stop_flag("ending") as stop:
@@ -104,6 +104,7 @@ def _made(data: DataSet, place: Placement) -> bool:
         except Stopped:
             say("stopped; the same command continues")
             return False
-    made = read(data.manifest)
-    say(f"{data.episodes} episodes in {data.path}: {len(made['files'])} files, numbers {made['numbers_sha256'][:16]}")
+    manifest = read(data.manifest)
+    files, numbers = manifest["files"], manifest["numbers_sha256"]
+    say(f"{data.episodes} episodes in {data.path}: {len(files)} files, numbers {numbers[:16]}")
     return True

@@ -71,14 +71,14 @@ class PlainDisplay(Display):
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
             f"  return {p.return_mean:8.3f}  mean policy {p.mean_policy_return:8.3f}"
-            f"{success}{_measured(p)}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
+            f"{success}{_measures(p)}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
         )
 
 
-def _measured(p: GenerationStats) -> str:
+def _measures(p: GenerationStats) -> str:
     """The mean policy's measures."""
-    known = ((name, value) for name, value in p.mean_policy_measures.items() if value is not None)
-    return "".join(f"  {plain(name)} {value:.3g}" for name, value in known)
+    measures = ((name, value) for name, value in p.mean_policy_measures.items() if value is not None)
+    return "".join(f"  {plain(name)} {value:.3g}" for name, value in measures)
 
 
 class JsonDisplay(Display):
@@ -148,16 +148,16 @@ class LiveDisplay(Display):
         p = report.progress
         table = _grid()
         table.add_row("return", f"{p.return_mean:.3f}", f"{p.return_min:.3f} to {p.return_max:.3f}, best {p.best:.3f}")
-        said = {True: Text("succeeds", "green"), False: Text("does not succeed", "yellow"), None: Text()}
-        table.add_row("mean policy", f"{p.mean_policy_return:.3f}", said[p.mean_policy_success])
+        verdicts = {True: Text("succeeds", "green"), False: Text("does not succeed", "yellow"), None: Text()}
+        table.add_row("mean policy", f"{p.mean_policy_return:.3f}", verdicts[p.mean_policy_success])
         first, now = self._returns[0], self._returns[-1]
         width = max(_SPARK_LEAST, min(_SPARK, self._console.width - _BESIDE_SPARK))
         table.add_row("  so far", f"{first:.3f}", Text.assemble((spark(self._returns, width), "cyan"), f" {now:.3f}"))
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:
-            lost = f"{p.ended} rollouts ended early, {p.failed} failed"
-            table.add_row("success", f"{p.success_rate:.0%}", lost)
+            failures = f"{p.ended} rollouts ended early, {p.failed} failed"
+            table.add_row("success", f"{p.success_rate:.0%}", failures)
         for name, value in p.mean_policy_measures.items():
             both = ["-" if each is None else f"{each:.3g}" for each in (value, p.measures[name])]
             table.add_row(plain(name), both[0], f"the mean policy's; {both[1]} of the exploring ones on average")
@@ -193,10 +193,10 @@ def name(worker: WorkerStatus) -> str:
 def spark(values: Sequence[float], width: int) -> str:
     """A curve of at most this number of characters: the last value of each part."""
     count = min(width, len(values))
-    chosen = [values[(i + 1) * len(values) // count - 1] for i in range(count)]
+    points = [values[(i + 1) * len(values) // count - 1] for i in range(count)]
     low = min(values)
     span = (max(values) - low) or 1.0
-    return "".join(_BLOCKS[int((v - low) / span * (len(_BLOCKS) - 1))] for v in chosen)
+    return "".join(_BLOCKS[int((v - low) / span * (len(_BLOCKS) - 1))] for v in points)
 
 
 def _grid() -> Table:

@@ -58,8 +58,8 @@ def main(words: Sequence[str]) -> int:
     for name, row in ({name: figures[name] for name in ("nominal", "perturbed")} | of).items():
         success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
         returns = [f"{row[key]:.3f}" for key in ("return_mean", "return_min", "return_max")]
-        own = ["-" if value is None else f"{value:.3g}" for value in row.get("measures", {}).values()]
-        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["ended"]), *own)
+        cells = ["-" if value is None else f"{value:.3g}" for value in row.get("measures", {}).values()]
+        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["ended"]), *cells)
     Console().print(table)
     return 0
 
@@ -68,35 +68,35 @@ def evaluate(folder: RunFolder, rollouts: int, seed: int, average: int | None = 
     """The figures in the JSON's form."""
     policy = loaded(folder, average=average)
     spec = policy.problem.spec
-    given = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
+    results = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
     figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}
-    figures["nominal"] = _figures(spec, given, np.array([rollouts]))
-    figures["perturbed"] = _figures(spec, given, np.arange(rollouts))
+    figures["nominal"] = _figures(spec, results, np.array([rollouts]))
+    figures["perturbed"] = _figures(spec, results, np.arange(rollouts))
     task = policy.problem.task
     if len(task.simulated) > 1:
         which = drawn(task, [np.random.default_rng(trial(seed, i)) for i in range(rollouts)])
         rows = {name: np.flatnonzero(which == i) for i, name in enumerate(names(task.simulated))}
-        figures["models"] = {name: _figures(spec, given, its) for name, its in rows.items() if len(its)}
+        figures["models"] = {name: _figures(spec, results, part) for name, part in rows.items() if len(part)}
     return figures
 
 
-def _figures(spec: TaskSpec, given: Simulated, rows: IntArray) -> dict[str, Any]:
+def _figures(spec: TaskSpec, results: Simulated, rows: IntArray) -> dict[str, Any]:
     """Figures of some rollouts, at least one."""
-    returns, flags = given.returns[rows], given.flags[rows]
+    returns, flags = results.returns[rows], results.flags[rows]
     return {
         "rollouts": len(returns),
         "success_rate": float(flags[:, 0].mean()) if spec.success else None,
         "return_mean": float(returns.mean()),
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
-        **({"measures": _measures(spec, given, rows)} if spec.measures else {}),
+        **({"measures": _measures(spec, results, rows)} if spec.measures else {}),
         "ended": int(flags[:, 1].sum()),
         "failed": int(flags[:, 2].sum()),
     }
 
 
-def _measures(spec: TaskSpec, given: Simulated, rows: IntArray) -> dict[str, float | None]:
+def _measures(spec: TaskSpec, results: Simulated, rows: IntArray) -> dict[str, float | None]:
     """Means of the task's measures over rollouts that did not fail, by name."""
-    sound = ~given.flags[rows, 2]
-    values = given.measures[rows][sound]
+    sound = ~results.flags[rows, 2]
+    values = results.measures[rows][sound]
     return {each.name: float(values[:, at].mean()) if sound.any() else None for at, each in enumerate(spec.measures)}

@@ -32,57 +32,57 @@ class LearnerCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command, resumed, begin = parse(LearnerCommand, words, "farm learner")
-    return learn(command.learner, command.run, Placement(listen=command.learner.usual), resumed, begin)
+    command, resumed, base = parse(LearnerCommand, words, "farm learner")
+    return learn(command.learner, command.run, Placement(listen=command.learner.usual), resumed, base)
 
 
 def learn(
-    chosen: LearnerOptions, config: RunConfig, place: Placement, resumed: RunFolder | None, begin: RunConfig
+    flags: LearnerOptions, config: RunConfig, place: Placement, resumed: RunFolder | None, base: RunConfig
 ) -> int:
     """Learn until the end, an interruption or a failure; exit status."""
-    logs.set_up("WARNING" if chosen.quiet and chosen.log_level == "INFO" else chosen.log_level)
+    logs.set_up("WARNING" if flags.quiet and flags.log_level == "INFO" else flags.log_level)
     place = replace(
-        place, connect=chosen.connect, farm=chosen.farm, record=chosen.record, log=chosen.log,
-        listen=chosen.listen or place.listen, trusted=chosen.trust_network, mixed=chosen.mixed,
-        numbers=chosen.numbers,
+        place, connect=flags.connect, farm=flags.farm, record=flags.record, log=flags.log,
+        listen=flags.listen or place.listen, trusted=flags.trust_network, mixed=flags.mixed,
+        numbers=flags.numbers,
         scheduler=SchedulerConfig(
-            audit=chosen.audit, straggler_seconds=chosen.patience, instances=chosen.instances
+            audit=flags.audit, straggler_seconds=flags.patience, instances=flags.instances
         ),
-        tls=chosen.bundle,
-        serve=None if chosen.serve is None else options.address(chosen.serve),
+        tls=flags.bundle,
+        serve=None if flags.serve is None else options.address(flags.serve),
     )  # fmt: skip
-    if resumed is not None and chosen.name:
+    if resumed is not None and flags.name:
         raise ConfigError("--name is for a new run; a resumed one keeps its name")
-    path = chosen.out / options.run_name(chosen, config) if resumed is None else resumed.path
-    if chosen.resume_existing and path.exists():
+    path = flags.out / options.run_name(flags, config) if resumed is None else resumed.path
+    if flags.resume_existing and path.exists():
         resumed, config = RunFolder.open(path), fitted(config)
-        begin = resumed.read_config()
+        base = resumed.read_config()
     if resumed is not None:
-        options.check_resume(begin, config, resumed)
+        options.check_resume(base, config, resumed)
     with stop_flag("saving and ending") as stop:
         first, numbers, resume = path.name, itertools.count(2), resumed is not None
         while True:
             try:
-                run = _learnt(open_run(config, path, place, resume=resume, stopped=stop.is_set), place, chosen.style)
+                run = _learn(open_run(config, path, place, resume=resume, stopped=stop.is_set), place, flags.style)
                 break
             except RolledBack:
                 resume = True
             except NameTakenError:  # of a run of the same second
-                if chosen.name or resume:
+                if flags.name or resume:
                     raise
                 path = path.with_name(f"{first}-{next(numbers)}")
     return INTERRUPTED if run.summary["state"] == "interrupted" else 0
 
 
-def _learnt(opened: AbstractContextManager[Run], place: Placement, style: display.Style) -> Run:
+def _learn(context: AbstractContextManager[Run], place: Placement, style: display.Style) -> Run:
     """Learn until the end or an interruption, and say how it ended."""
-    with opened as run:
-        shown = display.display(run, _announcement(run, place), style)
+    with context as run:
+        screen = display.display(run, _announcement(run, place), style)
         gc.freeze()  # existing objects stay: collecting garbage among them took 20 ms each time
-        with shown:
+        with screen:
             for report in run.learn():
-                shown.show(report)
-    shown.conclude(_conclusion(run, place))
+                screen.show(report)
+    screen.conclude(_conclusion(run, place))
     return run
 
 
@@ -98,10 +98,10 @@ def _announcement(run: Run, place: Placement) -> list[str]:
     if (config := run.learner.config).start == "fitted":
         width, sigma = config.policy_config.bandwidth, config.algorithm_config.initial_sigma  # type: ignore[attr-defined]
         lines.append(f"fitted to the observation: bandwidth {width:.4g}, initial sigma {sigma:.4g}")
-    seen = run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
-    kept = folder.parameters.every(run.learner.state.mu.size, run.learner.config.generations, seen)
-    if kept > 1:
-        lines.append(f"parameters: one generation in {kept} is kept, to stay below 100 MB")
+    observations = run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
+    every = folder.parameters.every(run.learner.state.mu.size, run.learner.config.generations, observations)
+    if every > 1:
+        lines.append(f"parameters: one generation in {every} is kept, to stay below 100 MB")
     return lines
 
 
@@ -110,11 +110,11 @@ def _conclusion(run: Run, place: Placement) -> list[str]:
     lines = []
     if summary["mean_policy_return"] is not None:
         if summary["mean_policy_success"] is None:
-            said = f"; from other starts {summary['robust_return']:.3f} on average"
+            verdict = f"; from other starts {summary['robust_return']:.3f} on average"
         else:
             success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
-            said = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
-        lines.append(f"the mean policy returns {summary['mean_policy_return']:.3f}{said}")
+            verdict = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
+        lines.append(f"the mean policy returns {summary['mean_policy_return']:.3f}{verdict}")
     lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
     if not run.learner.folder.there:
         lines.append(run.learner.folder.gone)

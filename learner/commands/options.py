@@ -99,40 +99,40 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     Raises:
       ConfigError: two of --preset, --config and --resume, or one that cannot be used.
     """
-    chosen = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
-    named = {part: _value(words, f"--{part}") for part in configs.PARTS}
-    parts = {part: plugins.find(configs.PARTS[part], name).name for part, name in named.items() if name is not None}
-    given = [f"--{name}" for name, value in chosen.items() if value is not None]
-    if len(given) > 1:
-        raise ConfigError(f"{' and '.join(given)} exclude each other: each defines where to start from")
-    if chosen["resume"] is not None:
-        folder = RunFolder.open(Path(chosen["resume"]))
+    sources = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
+    names = {part: _value(words, f"--{part}") for part in configs.PARTS}
+    parts = {part: plugins.find(configs.PARTS[part], name).name for part, name in names.items() if name is not None}
+    flags = [f"--{name}" for name, value in sources.items() if value is not None]
+    if len(flags) > 1:
+        raise ConfigError(f"{' and '.join(flags)} exclude each other: each defines where to start from")
+    if sources["resume"] is not None:
+        folder = RunFolder.open(Path(sources["resume"]))
         return folder.read_config(), folder
-    if chosen["config"] is not None:
-        return configs.changed_by(configs.read(Path(chosen["config"])), parts), None
-    begin = configs.configure(parts.pop("task", RunConfig.task), chosen["preset"])
-    return configs.changed_by(begin, parts), None
+    if sources["config"] is not None:
+        return configs.changed_by(configs.read(Path(sources["config"])), parts), None
+    base = configs.configure(parts.pop("task", RunConfig.task), sources["preset"])
+    return configs.changed_by(base, parts), None
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
     """The last value given for a flag, in either form; a missing one is left to the parser."""
-    found = None
+    value = None
     for i, word in enumerate(words):
         if word == flag and i + 1 < len(words):
-            found = words[i + 1]
+            value = words[i + 1]
         elif word.startswith(flag + "="):
-            found = word.partition("=")[2]
-    return found
+            value = word.partition("=")[2]
+    return value
 
 
-def check_resume(saved: RunConfig, wanted: RunConfig, folder: RunFolder) -> None:
+def check_resume(saved: RunConfig, config: RunConfig, folder: RunFolder) -> None:
     """Check that a run can continue with this configuration: only its end may change."""
-    if changed := list(configs.other(saved, wanted)):
+    if changed := list(configs.other(saved, config)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
         raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations and --average may change")
     done = max((stats.generation for stats in folder.progress()), default=0)
-    if wanted.generations < done:
-        raise ConfigError(f"--generations {wanted.generations}: the run has already done {done}")
+    if config.generations < done:
+        raise ConfigError(f"--generations {config.generations}: the run has already done {done}")
 
 
 def run_name(options: LearnerOptions, config: RunConfig) -> str:
@@ -150,14 +150,14 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
 
 def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[settings.C, RunFolder | None, RunConfig]:
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
-    begin, resumed = origin(words)
-    default = replace(kind(), run=begin)  # type: ignore[type-var]
-    return settings.parse(kind, words, program, default), resumed, begin
+    base, resumed = origin(words)
+    default = replace(kind(), run=base)  # type: ignore[type-var]
+    return settings.parse(kind, words, program, default), resumed, base
 
 
 def flag(name: str, value: str) -> str:
     """NAME and VALUE as one word of a command line, where the underscores of a setting's name may be kept."""
-    own = name.replace("_", "-")
+    name = name.replace("_", "-")
     if value.lower() in ("true", "false"):
-        return f"--{own}" if value.lower() == "true" else f"--no-{own}"
-    return f"--{own}={value}"
+        return f"--{name}" if value.lower() == "true" else f"--no-{name}"
+    return f"--{name}={value}"

@@ -104,7 +104,7 @@ def _record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRe
     from learner.run.setup import problem
     from learner.telemetry.subscriber import Subscriber, find_run
 
-    with ExitStack() as kept:
+    with ExitStack() as stack:
         # The session closes first: the learner waits for that at the end, while the file is still being merged.
         with session.connect(command.endpoints, command.timeout, stopped, command.bundle) as link:
             run = command.run or find_run(link, command.farm, stopped)
@@ -113,8 +113,8 @@ def _record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRe
             label = f"{run}-undone{subscriber.undone}" if subscriber.undone else run
             folder = _folder(command.out / label, config) if command.file else None
             if folder is not None:
-                kept.enter_context(folder.held())
-            recording = kept.enter_context(
+                stack.enter_context(folder.held())
+            recording = stack.enter_context(
                 open_recording(
                     folder.recording if folder else None, run=name, config=config, serve=command.address,
                     drawing=Drawing.of(problem(config, files=files)),

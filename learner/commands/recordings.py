@@ -43,10 +43,10 @@ def sources(what: str) -> list[str]:
         return [str(file) for file in files]
     try:
         with path.open("rb") as file:
-            begin = file.read(len(_MAGIC))
+            head = file.read(len(_MAGIC))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    if begin != _MAGIC:
+    if head != _MAGIC:
         raise ConfigError(f"{path} is not a recording: give a run's folder or a .rrd file")
     return [what]
 
@@ -56,12 +56,12 @@ def target(path: Path) -> Path:
     own recording. Raises ConfigError otherwise, before any work is done."""  # noqa: D205, D209
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
-    there = next((each for each in path.absolute().parents if each.exists()), None)
-    if path.is_dir() or (there is not None and not there.is_dir()):
-        what = "it is a folder" if path.is_dir() else f"{there} is a file"
+    parent = next((each for each in path.absolute().parents if each.exists()), None)
+    if path.is_dir() or (parent is not None and not parent.is_dir()):
+        what = "it is a folder" if path.is_dir() else f"{parent} is a file"
         raise ConfigError(f"--to {path}: {what}; give another name")
-    own = path.name == "replay.rrd" or path.name.startswith("run.")
-    if own and (path.parent / "config.json").exists():
+    of_run = path.name == "replay.rrd" or path.name.startswith("run.")
+    if of_run and (path.parent / "config.json").exists():
         raise ConfigError(f"--to {path} would replace the run's own recording: take another name")
     return path
 
@@ -79,15 +79,15 @@ def record(path: Path, run: str, problem: "Problem", name: str, rollout: "Trajec
 
 
 def film(
-    task: "Task", shown: "Sequence[tuple[Trajectory, Mapping[str, FloatArray]]]", path: Path, speed: float
+    task: "Task", rollouts: "Sequence[tuple[Trajectory, Mapping[str, FloatArray]]]", path: Path, speed: float
 ) -> None:
     """Write a video of rollouts side by side, each with its measured frames; one that ended early stands still."""
     from farm.sim import video
 
-    longest = max((rollout for rollout, _ in shown), key=lambda each: len(each.times))
-    chosen = video.moments(longest.times.tolist(), speed, rest=1.0)
-    drawn = [_pictures(task, rollout, frames, chosen) for rollout, frames in shown]
-    video.write(path, [video.tiled(together) for together in zip(*drawn, strict=True)])
+    longest = max((rollout for rollout, _ in rollouts), key=lambda each: len(each.times))
+    moments = video.moments(longest.times.tolist(), speed, rest=1.0)
+    films = [_pictures(task, rollout, frames, moments) for rollout, frames in rollouts]
+    video.write(path, [video.tiled(together) for together in zip(*films, strict=True)])
     say(f"video: {path}")
 
 
@@ -105,5 +105,5 @@ def _pictures(
         mocap=frames["mocap"][unique] if "mocap" in frames else None,
         values={name: each[unique] for name, each in rollout.channels.items()},
     )  # fmt: skip
-    drawn = dict(zip(unique, pictures, strict=True))
-    return [drawn[min(moment, last)] for moment in moments]
+    by_moment = dict(zip(unique, pictures, strict=True))
+    return [by_moment[min(moment, last)] for moment in moments]

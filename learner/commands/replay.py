@@ -56,9 +56,9 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
     config = config_of(words)
-    own, kind = (config.task_config, plugins.find("tasks", config.task).target) if config else (TaskConfig(), Task)
+    task, kind = (config.task_config, plugins.find("tasks", config.task).target) if config else (TaskConfig(), Task)
     settings_class = _command(kind.ending)
-    default = settings_class(run=tyro.MISSING, task=own)
+    default = settings_class(run=tyro.MISSING, task=task)
     command = settings.parse(settings_class, words, "farm replay", default)
     logs.set_up("WARNING")
     from farm.sim import video
@@ -69,15 +69,15 @@ def main(words: Sequence[str]) -> int:
         video.check(command.video)
     folder = RunFolder.open(command.run)
     path = recordings.target(command.to or folder.path / "rollout.rrd")
-    names = [each.name for each in fields(own) if getattr(own, each.name) != getattr(command.task, each.name)]
+    names = [each.name for each in fields(task) if getattr(task, each.name) != getattr(command.task, each.name)]
     changed = ", ".join(f"{name.replace('_', ' ')} {getattr(command.task, name)}" for name in names)
     if any((command.rollout, command.best, command.worst, command.ended)):
-        policy, shown = _rollouts(command, folder, path, kind.ending, changed)
+        policy, replays = _rollouts(command, folder, path, kind.ending, changed)
     else:
-        policy, shown = _mean(command, folder, path, changed)
+        policy, replays = _mean(command, folder, path, changed)
     say(f"written to {path}; look at it with: farm view {path}")
     if command.video is not None:
-        frames = [(each.trajectory, each.frames) for each in shown]
+        frames = [(each.trajectory, each.frames) for each in replays]
         recordings.film(policy.problem.task, frames, command.video, command.speed)
     return 0
 
@@ -85,9 +85,9 @@ def main(words: Sequence[str]) -> int:
 def _command(ending: str) -> type[ReplayCommand]:
     """The command with its flag for ended rollouts renamed to the task's word."""
     about = f"Show this number of the generation's exploring rollouts that {_were(ending)}, the first ones."
-    named = Annotated[int | None, tyro.conf.arg(name=ending, help=about)]
+    flag = Annotated[int | None, tyro.conf.arg(name=ending, help=about)]
     return make_dataclass(
-        "ReplayCommand", [("ended", named, setting(None, least=1, most=MOST))], bases=(ReplayCommand,), frozen=True,
+        "ReplayCommand", [("ended", flag, setting(None, least=1, most=MOST))], bases=(ReplayCommand,), frozen=True,
         kw_only=True, namespace={"__doc__": ReplayCommand.__doc__},
     )  # fmt: skip
 
@@ -101,15 +101,15 @@ def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -
     from learner.again.replay import loaded
 
     policy = loaded(folder, command.generation, command.task)
-    shown = policy.rollout()
+    replay = policy.rollout()
     name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
-    recordings.record(path, folder.name, policy.problem, name, shown.trajectory)
-    say(f"return {shown.trajectory.value:.3f}{_succeeds(shown)}")
-    return policy, [shown]
+    recordings.record(path, folder.name, policy.problem, name, replay.trajectory)
+    say(f"return {replay.trajectory.value:.3f}{_succeeds(replay)}")
+    return policy, [replay]
 
 
-def _succeeds(shown: "Replay") -> str:
-    return {True: ", it succeeds", False: ", it does not succeed", None: ""}[shown.trajectory.success]
+def _succeeds(replay: "Replay") -> str:
+    return {True: ", it succeeds", False: ", it does not succeed", None: ""}[replay.trajectory.success]
 
 
 def _rollouts(
@@ -120,46 +120,46 @@ def _rollouts(
     from learner.recording.comparison import Shown, record_comparison
     from learner.recording.drawing import Drawing
 
-    found = rewind(folder.path, command.generation)
-    policy = under(folder, found, command.task) if changed else found.policy  # chosen by the run's own results
-    chosen = _chosen(command, found, ending)
-    shown = found.again(chosen, policy)
-    names = [f"rollout {index}" for index in chosen]
-    lines = [f"return {each.trajectory.value:.3f}{_succeeds(each)}" for each in shown]
-    title = f"generation {found.generation}" + (f", {changed}" if changed else "")
-    if len(shown) == 1:
-        recordings.record(path, folder.name, policy.problem, f"{names[0]} of {title}", shown[0].trajectory)
+    batch = rewind(folder.path, command.generation)
+    policy = under(folder, batch, command.task) if changed else batch.policy  # chosen by the run's own results
+    indices = _indices(command, batch, ending)
+    replays = batch.again(indices, policy)
+    names = [f"rollout {index}" for index in indices]
+    lines = [f"return {each.trajectory.value:.3f}{_succeeds(each)}" for each in replays]
+    title = f"generation {batch.generation}" + (f", {changed}" if changed else "")
+    if len(replays) == 1:
+        recordings.record(path, folder.name, policy.problem, f"{names[0]} of {title}", replays[0].trajectory)
     else:
         drawing = Drawing.of(policy.problem)
         rows = [f"| {name} | {line} |" for name, line in zip(names, lines, strict=True)]
-        again = f"`farm replay {command.run} --generation {found.generation} --rollout I`"
+        again = f"`farm replay {command.run} --generation {batch.generation} --rollout I`"
         table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
-        side = [Shown(name, drawing, (), each.trajectory) for name, each in zip(names, shown, strict=True)]
+        side = [Shown(name, drawing, (), each.trajectory) for name, each in zip(names, replays, strict=True)]
         with writing(path):
             record_comparison(path, side, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
-    return policy, shown
+    return policy, replays
 
 
-def _chosen(command: ReplayCommand, found: "Rewound", ending: str) -> list[int]:
+def _indices(command: ReplayCommand, batch: "Rewound", ending: str) -> list[int]:
     """Indices of the rollouts: given ones, the best, the worst, those that ended; each once, at most MOST.
 
     Raises:
       ConfigError: too many are requested.
       RunError: none ended.
     """
-    ended = found.ended(command.ended or 0)
-    if command.ended and not ended:
+    ends = batch.ended(command.ended or 0)
+    if command.ended and not ends:
         raise RunError(
-            f"no rollout of generation {found.generation} {ending if ending != Task.ending else 'was ended'}"
+            f"no rollout of generation {batch.generation} {ending if ending != Task.ending else 'was ended'}"
         )
-    if command.ended and len(ended) < command.ended:
-        say(f"{len(ended)} of the {len(found.returns)} rollouts of generation {found.generation} {_were(ending)}")
-    wanted = [*command.rollout, *found.best(command.best or 0), *found.worst(command.worst or 0), *ended]
-    chosen = list(dict.fromkeys(wanted))
-    if len(chosen) > MOST:
-        raise ConfigError(f"{len(chosen)} rollouts are requested; at most {MOST} are shown side by side")
-    return chosen
+    if command.ended and len(ends) < command.ended:
+        say(f"{len(ends)} of the {len(batch.returns)} rollouts of generation {batch.generation} {_were(ending)}")
+    requests = [*command.rollout, *batch.best(command.best or 0), *batch.worst(command.worst or 0), *ends]
+    indices = list(dict.fromkeys(requests))
+    if len(indices) > MOST:
+        raise ConfigError(f"{len(indices)} rollouts are requested; at most {MOST} are shown side by side")
+    return indices
 
 
 def config_of(words: Sequence[str]) -> RunConfig | None:

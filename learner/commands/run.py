@@ -33,8 +33,8 @@ class RunCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command, resumed, begin = parse(RunCommand, words, "farm run")
+    command, resumed, base = parse(RunCommand, words, "farm run")
     if command.learner.tls is not None:
         raise ConfigError("farm run is for one machine; with --tls start farm learner and farm worker")
     place = Placement(workers=command.workers, backend=command.backend, listen=free_endpoint())
-    return learn(command.learner, command.run, place, resumed, begin)
+    return learn(command.learner, command.run, place, resumed, base)

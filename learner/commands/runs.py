@@ -91,11 +91,11 @@ def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:
     from learner.recording.files import parts
     from learner.recording.viewing import catalog
 
-    found = [files[0] for folder in folders if (files := parts(folder.path / "run.rrd"))]
-    if not found:
+    recordings = [files[0] for folder in folders if (files := parts(folder.path / "run.rrd"))]
+    if not recordings:
         raise ConfigError("none of these runs has a recording: learn without --no-record")
-    with stop_flag("closing the catalog") as stop, catalog(name, found, int(port)) as address:
-        count = "1 recording" if len(found) == 1 else f"{len(found)} recordings"
+    with stop_flag("closing the catalog") as stop, catalog(name, recordings, int(port)) as address:
+        count = "1 recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
         say(f"{count} at {address}: farm view {address}, or rerun.catalog.CatalogClient in Python")
         stop.wait()
     raise Interrupted("the catalog is closed")

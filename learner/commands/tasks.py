@@ -91,15 +91,15 @@ def _kind(name: str) -> str:
     for kind in _KINDS:
         if name.partition(":")[0] in plugins.names(kind):
             return kind
-    known = ", ".join(each for kind in _KINDS for each in plugins.names(kind))
-    raise ConfigError(f"nothing is called {name!r}; there are {known}, and FILE.py:CLASS")
+    names = ", ".join(each for kind in _KINDS for each in plugins.names(kind))
+    raise ConfigError(f"nothing is called {name!r}; there are {names}, and FILE.py:CLASS")
 
 
 def _settings(kind: type[Any], name: str) -> str:
     """The settings as --help shows them."""
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output), contextlib.suppress(SystemExit):
         settings.parse(kind, ["--help"], name)
-    lines = said.getvalue().splitlines(keepends=True)
+    lines = output.getvalue().splitlines(keepends=True)
     first = next((i for i, line in enumerate(lines) if line.strip("╭╮─ \n") == "options"), 0)
     return "".join(lines[first:])

@@ -19,7 +19,8 @@ from learner.commands.sweep import check_sharing
 from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.run.files import replace_text
-from learner.sweep import figure, race, result
+from learner.sweep import figure, result
+from learner.sweep import race as races
 from learner.sweep.portfolio import portfolio
 from learner.sweep.race import Entry, Race
 from learner.sweep.runs import Sharing, site
@@ -32,7 +33,7 @@ class TuneCommand(Settings):
     The worse half is dropped again and again; the best one learns to the end.
     """
 
-    rollouts: int | None = setting(None, least=1, most=race.MOST_ROLLOUTS)
+    rollouts: int | None = setting(None, least=1, most=races.MOST_ROLLOUTS)
     """Exploring rollouts of all entries together; half of them are the winner's last ones."""
     minutes: float | None = setting(None, above=0.0, most=1e5)
     """Instead of --rollouts: so many rollouts as the local workers do in about this time, measured once."""
@@ -66,8 +67,8 @@ class TuneCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     words = _task_as_flag(words)
-    command, _, begin = parse(TuneCommand, words, "farm tune")
-    _check_common(command, begin)
+    command, _, base = parse(TuneCommand, words, "farm tune")
+    _check_common(command, base)
     entries = _entries(command, words)
     if command.list:
         _list(entries)
@@ -75,34 +76,33 @@ def main(words: Sequence[str]) -> int:
     if command.rollouts is None and command.minutes is None:
         raise ConfigError("farm tune needs --rollouts or --minutes: how much to try, for example --rollouts 60000")
     path = command.out or Path("tunes") / f"{result.plain(command.run.task)}-s{command.run.seed}"
-    chosen = Race(path, tuple(entries), _rollouts(command, entries, path))
-    race.check(chosen)
+    race = Race(path, tuple(entries), _rollouts(command, entries, path))
+    races.check(race)
     check_sharing(command.sharing)
     logs.set_up("WARNING")
-    chosen.prepare()
+    race.prepare()
     with stop_flag("saving and ending") as stop:
-        with Standing(chosen) as shown, site(command.sharing, [entry.config for entry in entries]) as place:
-            over = chosen.run(place, shown, stop.is_set, record=command.sharing.record)
+        with Standing(race) as display, site(command.sharing, [entry.config for entry in entries]) as place:
+            over = race.run(place, display, stop.is_set, record=command.sharing.record)
         if not over:
             say("the same command continues")
             return INTERRUPTED
-    _conclude(chosen, recorded=command.sharing.record)
+    _conclude(race, recorded=command.sharing.record)
     return 0
 
 
 def _task_as_flag(words: Sequence[str]) -> list[str]:
     """The words, with the task of `farm tune TASK` as a flag."""
-    own = list(words)
-    return ["--task", *own] if own and not own[0].startswith("-") else own
+    return ["--task", *words] if words and not words[0].startswith("-") else list(words)
 
 
-def _check_common(command: TuneCommand, begin: RunConfig) -> None:
+def _check_common(command: TuneCommand, base: RunConfig) -> None:
     """Check that flags for all entries are settings of all entries."""
-    if command.run.generations != begin.generations:
+    if command.run.generations != base.generations:
         raise ConfigError("--generations follows from --rollouts: leave it out")
     for part in ("policy", "algorithm"):
-        if getattr(command.run, f"{part}_config") != getattr(begin, f"{part}_config"):
-            changed = next(name for name, *_ in configs.changes(begin, command.run))
+        if getattr(command.run, f"{part}_config") != getattr(base, f"{part}_config"):
+            changed = next(name for name, *_ in configs.changes(base, command.run))
             raise ConfigError(
                 f"--{changed} is a setting of one {part}, but entries differ in theirs: put it into an --entry"
             )
@@ -113,13 +113,13 @@ def _entries(command: TuneCommand, words: Sequence[str]) -> list[Entry]:
     table = portfolio(command.portfolio)
     if unknown := [name for name in command.only if name not in table]:
         raise ConfigError(f"--only {unknown[0]}: no such entry; known are {', '.join(table)}")
-    found = race.entries_of(command.run, {k: v for k, v in table.items() if not command.only or k in command.only})
+    entries = races.entries_of(command.run, {k: v for k, v in table.items() if not command.only or k in command.only})
     for text in command.entry:
         name = result.plain(text)
-        with race.described(text):
-            own = [flag(*pair) for pair in _pairs(text)]
-            found.append(race.entry_of(name, parse(TuneCommand, [*words, *own], "farm tune")[0].run))
-    return found
+        with races.described(text):
+            flags = [flag(*pair) for pair in _pairs(text)]
+            entries.append(races.entry_of(name, parse(TuneCommand, [*words, *flags], "farm tune")[0].run))
+    return entries
 
 
 def _pairs(text: str) -> list[tuple[str, str]]:
@@ -144,37 +144,37 @@ def _rollouts(command: TuneCommand, entries: Sequence[Entry], path: Path) -> int
         assert command.rollouts is not None
         return command.rollouts
     if (path / "race.json").exists():
-        return int(race.read(path / "race.json")["rollouts"])
-    found = race.affordable(entries, command.minutes, command.sharing.processes)
+        return int(races.read(path / "race.json")["rollouts"])
+    count = races.affordable(entries, command.minutes, command.sharing.processes)
     workers = command.sharing.processes
     say(
-        f"{command.minutes:g} minutes are some {found} rollouts on {workers} workers: as --rollouts {found} from now on"
+        f"{command.minutes:g} minutes are some {count} rollouts on {workers} workers: as --rollouts {count} from now on"
     )
-    return found
+    return count
 
 
-def _conclude(done: Race, *, recorded: bool) -> None:
+def _conclude(race: Race, *, recorded: bool) -> None:
     """Write the page and the figure, and say who has won."""
-    drawn = figure.available()
-    with writing(f"to {done.path}"):
-        if drawn:
-            figure.draw(result.curves(done), done.path / "figure.svg", [rung.rollouts for rung in done.rungs])
-        replace_text(done.path / "result.md", result.page(done, figure=drawn))
-    wide().print(_table(done))
-    folder = done.folder(done.winner)
-    say(f"{done.winner.name} wins; the numbers are mean returns from perturbed starts: {done.path}/result.md")
-    say(f"without the race: {result.command(done)}")
+    picture = figure.available()
+    with writing(f"to {race.path}"):
+        if picture:
+            figure.draw(result.curves(race), race.path / "figure.svg", [rung.rollouts for rung in race.rungs])
+        replace_text(race.path / "result.md", result.page(race, figure=picture))
+    wide().print(_table(race))
+    folder = race.folder(race.winner)
+    say(f"{race.winner.name} wins; the numbers are mean returns from perturbed starts: {race.path}/result.md")
+    say(f"without the race: {result.command(race)}")
     say(f"look at it with: farm {'view' if recorded else 'replay'} {folder}")
-    if not drawn:
+    if not picture:
         say(f"no figure: {figure.INSTALL}")
 
 
-def _table(shown: Race, now: Mapping[str, str] | None = None) -> Table:
+def _table(race: Race, now: Mapping[str, str] | None = None) -> Table:
     """One line per entry, best first; `now` has the state of those that run."""
     table = compact()
-    for head in (*result.heads(shown), *([] if now is None else ["now"])):
+    for head in (*result.heads(race), *([] if now is None else ["now"])):
         table.add_column(head, justify="left" if head in ("entry", "now") else "right", no_wrap=True)
-    for name, *scores in result.rows(shown):
+    for name, *scores in result.rows(race):
         table.add_row(name, *scores, *([] if now is None else [now.get(name, "")]))
     return table
 
@@ -182,9 +182,9 @@ def _table(shown: Race, now: Mapping[str, str] | None = None) -> Table:
 class Standing:
     """Shows a race: a live table on a terminal, else a line per rung and per entry that ends one."""
 
-    def __init__(self, shown: Race) -> None:
-        self._race, self._now = shown, dict[str, str]()
-        self._names = {shown.folder(entry).name: entry.name for entry in shown.entries}
+    def __init__(self, race: Race) -> None:
+        self._race, self._now = race, dict[str, str]()
+        self._names = {race.folder(entry).name: entry.name for entry in race.entries}
         self._console = wide()
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._heard: set[str] = set()
@@ -216,11 +216,11 @@ class Standing:
             self._heard.add(line)
             self._console.print(plain(f"{run}: {line}"), highlight=False)
 
-    def ended(self, run: str, state: str, said: str) -> None:
+    def ended(self, run: str, state: str, detail: str) -> None:
         """Show that an entry has ended its rung."""
         self._now[self._names[run]] = state
         if not self._draw() or state == "failed":
-            self._console.print(plain(f"{run} {state}" + (f": {said}" if said else "")), highlight=False)
+            self._console.print(plain(f"{run} {state}" + (f": {detail}" if detail else "")), highlight=False)
 
     def _draw(self) -> bool:
         """Draw the live table; return whether there is one."""

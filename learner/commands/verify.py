@@ -112,41 +112,41 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
     receipt |= {"chain": run.chain, "parameters_sha256": run.sha256}
     whole, rng = range(1, run.last + 1), np.random.default_rng(secrets.randbits(64))
     receipt["chosen"] = [*whole] if command.all else chosen(run, command.share, rng)
-    if command.receipt is not None and (begun := _interrupted(command.receipt, receipt)):
-        receipt |= begun
-    some, done = receipt["chosen"], receipt["generations"]
-    kept = command.receipt.with_name(command.receipt.name + ".run") if command.receipt is not None else None
+    if command.receipt is not None and (progress := _interrupted(command.receipt, receipt)):
+        receipt |= progress
+    generations, done = receipt["chosen"], receipt["generations"]
+    workspace = command.receipt.with_name(command.receipt.name + ".run") if command.receipt is not None else None
     with stop_flag("ending") as stop, suppress(Stopped), ExitStack() as stack:
         if command.all:
             place = command.place
             assert place is not None
-            repeated = verify_all(run, place, stop.is_set, kept)
+            repeated = verify_all(run, place, stop.is_set, workspace)
         else:
             simulate = stack.enter_context(workers(run, command.place, stop.is_set))
-            repeated = verify_some(run, [each for each in some if each not in done], simulate)
-        for generation, rollouts in _shown(repeated, len(some) - len(done)):
+            repeated = verify_some(run, [each for each in generations if each not in done], simulate)
+        for generation, rollouts in _shown(repeated, len(generations) - len(done)):
             done.append(generation)
             receipt["rollouts"] += rollouts
             if stop.is_set():
                 break
-    said = f"{len(done)} of {run.last} generations of {folder.path}, {receipt['rollouts']} rollouts"
-    if len(done) < len(some):
+    extent = f"{len(done)} of {run.last} generations of {folder.path}, {receipt['rollouts']} rollouts"
+    if len(done) < len(generations):
         more = "" if command.receipt is None else "; the same command continues"
-        say(f"stopped; no difference in {said}{more}")
+        say(f"stopped; no difference in {extent}{more}")
         return INTERRUPTED
     receipt["verdict"] = "the same"
-    say(f"verified to the bit: {said}" + (", and the results" if command.all else "; --all also repeats the updates"))
+    say(f"verified to the bit: {extent}" + (", and the results" if command.all else "; --all also repeats the updates"))
     return 0
 
 
-def _interrupted(path: Path, wanted: dict[str, Any]) -> dict[str, Any] | None:
+def _interrupted(path: Path, receipt: dict[str, Any]) -> dict[str, Any] | None:
     """What an interrupted verification of the same run has done, as its receipt says."""
     try:
-        found = json.loads(path.read_text("utf-8"))
-        same = all(found[name] == wanted[name] for name in ("chain", "code", "numbers", "all", "release", "verdict"))
-        of_run = {*wanted["chosen"]} if wanted["all"] else {*found["chosen"]}
-        sound = same and {*found["generations"]} <= of_run and type(found["rollouts"]) is int
-        return {name: found[name] for name in ("chosen", "generations", "rollouts")} if sound else None
+        old = json.loads(path.read_text("utf-8"))
+        same = all(old[name] == receipt[name] for name in ("chain", "code", "numbers", "all", "release", "verdict"))
+        of_run = {*receipt["chosen"]} if receipt["all"] else {*old["chosen"]}
+        sound = same and {*old["generations"]} <= of_run and type(old["rollouts"]) is int
+        return {name: old[name] for name in ("chosen", "generations", "rollouts")} if sound else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 

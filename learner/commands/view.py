@@ -46,10 +46,10 @@ def main(words: Sequence[str]) -> int:
     check_rerun()
     if not command.runs:
         raise ConfigError("nothing to open: give a run's folder or a .rrd file")
-    found = [recordings.sources(what) for what in command.runs]
+    sources = [recordings.sources(what) for what in command.runs]
     if not command.web:
         check_display(command.runs[0])
-    return show([source for some in found for source in some], web=command.web, table=len(found) > 1)
+    return show([source for group in sources for source in group], web=command.web, table=len(sources) > 1)
 
 
 def check_display(what: str) -> None:
@@ -108,5 +108,5 @@ def _address(page: int, streams: Sequence[str]) -> tuple[str, str]:
     """The viewer's address with these streams for a browser, and how to reach it from another machine."""
     ports = [page, *(urlsplit(stream).port for stream in streams)]
     tunnels = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
-    asked = "&".join(f"url={quote(stream, safe='')}" for stream in streams)
-    return f"http://127.0.0.1:{page}/?{asked}", f"(from elsewhere: ssh {tunnels} {socket.gethostname()} first)"
+    query = "&".join(f"url={quote(stream, safe='')}" for stream in streams)
+    return f"http://127.0.0.1:{page}/?{query}", f"(from elsewhere: ssh {tunnels} {socket.gethostname()} first)"

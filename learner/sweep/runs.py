@@ -50,8 +50,8 @@ class Shown(Protocol):
     def said(self, run: str, line: str) -> None:
         """A learner has written a line."""
 
-    def ended(self, run: str, state: str, said: str) -> None:
-        """A run is finished, diverged, failed or interrupted; `said` is its reason or its result."""
+    def ended(self, run: str, state: str, detail: str) -> None:
+        """A run is finished, diverged, failed or interrupted; `detail` is its reason or its result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,11 +242,11 @@ def _conclude(learner: _Learner, shown: Shown) -> None:
     state = summary.get("state", "interrupted" if stopped else "failed")
     if status != 0 and not stopped and state != "diverged":
         state = "failed"
-    said = " ".join(learner.said)
+    detail = " ".join(learner.said)
     if state == "finished":
         judged = {True: " and succeeds", False: " and does not succeed", None: ""}[summary["mean_policy_success"]]
-        said = f"mean policy returns {summary['mean_policy_return']:.3f}{judged}"
-    shown.ended(learner.run, state, said)
+        detail = f"mean policy returns {summary['mean_policy_return']:.3f}{judged}"
+    shown.ended(learner.run, state, detail)
 
 
 def _learn(words: Sequence[str]) -> int:

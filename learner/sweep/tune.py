@@ -81,5 +81,5 @@ class _Logged:
     def said(self, run: str, line: str) -> None:
         log.warning("%s: %s", run, line)
 
-    def ended(self, run: str, state: str, said: str) -> None:
-        log.log(logging.INFO if state == "finished" else logging.WARNING, "%s %s: %s", run, state, said)
+    def ended(self, run: str, state: str, detail: str) -> None:
+        log.log(logging.INFO if state == "finished" else logging.WARNING, "%s %s: %s", run, state, detail)

@@ -125,7 +125,7 @@ def checks(folder: Path, capsys: pytest.CaptureFixture[str], members: str = "", 
 
 def warnings(name: str) -> list[str]:
     found = problem(configure(name))
-    return [*check._odd(found.runner().rollouts(*check._tried(found))), *check._unread(type(found.task))]
+    return [*check._odd(found.runner().rollouts(*check._batch(found))), *check._unread(type(found.task))]
 
 
 @pytest.mark.usefixtures("no_picture")

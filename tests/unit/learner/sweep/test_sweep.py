@@ -120,7 +120,7 @@ def test_mistakes_are_one_line_and_nothing_is_begun(tmp_path, monkeypatch, words
 
 
 def test_nothing_need_be_varied(tmp_path, monkeypatch):
-    monkeypatch.setattr(command.sweep, "run", lambda runs, *_: len(runs) == 5)
+    monkeypatch.setattr(command.sweeps, "run", lambda runs, *_: len(runs) == 5)
     monkeypatch.chdir(tmp_path)
     assert command.main([]) == 0
 
