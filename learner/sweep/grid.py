@@ -96,30 +96,28 @@ class Sweep:
             elif self.path.exists() and any(self.path.iterdir()):
                 raise ConfigError(f"{self.path} holds something else and no sweep.json: give a different --out")
             self.path.mkdir(parents=True, exist_ok=True)
-            made = [configs.to_dict(setting.config) for setting in self.settings]
-            told = {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": made}
-            replace_text(file, json.dumps(told, indent=2) + "\n")
+            settings = [configs.to_dict(setting.config) for setting in self.settings]
+            data = {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": settings}
+            replace_text(file, json.dumps(data, indent=2) + "\n")
 
     def _check_same(self, file: Path) -> None:
         """Check that an existing sweep is this one, perhaps with fewer seeds."""
         try:
-            told = json.loads(file.read_text("utf-8"))
+            data = json.loads(file.read_text("utf-8"))
         except ValueError as error:
             raise ConfigError(f"{file} is not JSON: {error}") from None
-        lists = isinstance(told, dict) and all(isinstance(told.get(name), list) for name in ("seeds", "settings"))
-        if not lists or told.get("version") != _VERSION:
+        lists = isinstance(data, dict) and all(isinstance(data.get(name), list) for name in ("seeds", "settings"))
+        if not lists or data.get("version") != _VERSION:
             raise ConfigError(f"{file} is not of version {_VERSION}")
-        if told.get("vary") != self.vary:
-            there, here = _words(told.get("vary")), _words(self.vary)
-            raise ConfigError(
-                f"{self.path} varies {there}; here it is {here}: use the same values, or a different --out"
-            )
-        if missing := [str(seed) for seed in told["seeds"] if seed not in self.seeds]:
+        if data.get("vary") != self.vary:
+            old, new = _words(data.get("vary")), _words(self.vary)
+            raise ConfigError(f"{self.path} varies {old}; here it is {new}: use the same values, or a different --out")
+        if missing := [str(seed) for seed in data["seeds"] if seed not in self.seeds]:
             raise ConfigError(
                 f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different --out"
             )
-        for setting, kept in zip(self.settings, told["settings"], strict=False):
-            for name, old, new in configs.changes(configs.from_dict(kept, str(file)), setting.config):
+        for setting, values in zip(self.settings, data["settings"], strict=False):
+            for name, old, new in configs.changes(configs.from_dict(values, str(file)), setting.config):
                 raise ConfigError(
                     f"{self.path} was started with --{name} {old}; here it is {new}: use that, or a different --out"
                 )
@@ -137,10 +135,10 @@ def _words(vary: object) -> str:
     return " and ".join(f"{name}={','.join(map(str, values))}" for name, values in vary.items())
 
 
-def parse_vary(given: Sequence[str]) -> dict[str, list[str]]:
+def parse_vary(words: Sequence[str]) -> dict[str, list[str]]:
     """The values of each NAME=V1,V2,..., by name with underscores; a ConfigError if a word is malformed or repeated."""
     out: dict[str, list[str]] = {}
-    for word in given:
+    for word in words:
         name, equals, listed = word.partition("=")
         name, values = name.strip().lstrip("-").replace("-", "_"), [value.strip() for value in listed.split(",")]
         if not equals or not name or "" in values:
@@ -159,8 +157,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """A-B or A,B,C, or both, as seeds in that order; a ConfigError if one is malformed, too large or repeated."""
     out: list[int] = []
     for part in text.split(","):
-        found = _RANGE.fullmatch(part.strip())
-        first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+        match = _RANGE.fullmatch(part.strip())
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if first > last:
             raise ConfigError(f"--seeds {text!r} is not of the form A-B or A,B,C, for example 0-4")
         if last >= SEEDS or last - first >= MOST:
@@ -173,17 +171,18 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str, str]]:
     """Every combination of values; the last name changes fastest. A ConfigError if there are too many runs."""
-    found = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
-    if len(found) * seeds > MOST:
-        raise ConfigError(f"{len(found)} settings x {seeds} seeds are {len(found) * seeds} runs; expected up to {MOST}")
-    return found
+    settings = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
+    total = len(settings) * seeds
+    if total > MOST:
+        raise ConfigError(f"{len(settings)} settings x {seeds} seeds are {total} runs; expected up to {MOST}")
+    return settings
 
 
 def check(sweep: Sweep) -> None:
     """Check that no two settings give the same runs, and that run names are valid; else a ConfigError."""
-    seen: dict[str, Setting] = {}
+    unique: dict[str, Setting] = {}
     for setting in sweep.settings:
-        other = seen.setdefault(json.dumps(configs.to_dict(setting.config)), setting)
+        other = unique.setdefault(json.dumps(configs.to_dict(setting.config)), setting)
         if other is not setting:
             raise ConfigError(f"--vary: {other.label} and {setting.label} are the same configuration")
     for path in sweep.runs:

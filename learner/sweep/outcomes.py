@@ -42,8 +42,8 @@ def _row(path: Path, seed: int) -> dict[str, Any]:
     folder = RunFolder(path)
     summary, progress = folder.read_summary() or {}, folder.progress()
     row: dict[str, Any] = {name: summary.get(name) for name in COLUMNS} | {"seed": seed}
-    found = summary.get("robust_measures") or summary.get("mean_policy_measures") or {}
-    row |= {f"{MEASURE}{name}": found[name] for name in found}
+    values = summary.get("robust_measures") or summary.get("mean_policy_measures") or {}
+    row |= {f"{MEASURE}{name}": values[name] for name in values}
     if progress:
         last = progress[-1]
         row |= {"generations": last.generation, "rollouts": last.rollouts, "seconds": last.seconds}
@@ -75,8 +75,8 @@ def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:
     """Mean and standard deviation of a column over the runs that have a value; None if none has."""
-    known = [float(row[column]) for row in table if row.get(column) is not None]
-    return (float(np.mean(known)), float(np.std(known))) if known else None
+    values = [float(row[column]) for row in table if row.get(column) is not None]
+    return (float(np.mean(values)), float(np.std(values))) if values else None
 
 
 @dataclass(frozen=True)
@@ -92,11 +92,11 @@ class Curve:
 
 def curves(sweep: Sweep) -> list[Curve]:
     """One curve per setting that has a started run."""
-    found = (
+    out = (
         curve(setting.label, [sweep.folder(i, seed) for seed in sweep.seeds])
         for i, setting in enumerate(sweep.settings)
     )
-    return [each for each in found if each.rollouts.size]
+    return [each for each in out if each.rollouts.size]
 
 
 def curve(label: str, folders: Sequence[Path]) -> Curve:
@@ -122,5 +122,5 @@ def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
     returns = np.full((len(runs), len(longest)), np.nan)
     for row, (_, values) in zip(returns, runs, strict=True):
         row[: len(values)] = values
-    known = ~np.isnan(returns).all(axis=0)
-    return Curve(label, longest[known], returns[:, known])
+    mask = ~np.isnan(returns).all(axis=0)
+    return Curve(label, longest[mask], returns[:, mask])

@@ -31,11 +31,11 @@ from farm.errors import ConfigError, RunError, writing
 from farm.net import keys
 from farm.tasks.loop import Seed
 from learner.run import config as configs
+from learner.run import setup
 from learner.run.config import RunConfig
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
 from learner.run.learner import explored
-from learner.run.setup import problem
 from learner.sweep.runs import Shown, Site
 
 MOST: Final = 256
@@ -113,20 +113,20 @@ class Race:
     def _prospects(self, number: int) -> dict[str, float]:
         """Where the entries of a rung that is over seem to go: its scores, and their gains once more."""
         scores, before = self.scores[number], self.scores[number - 1] if number else self.scores[number]
-        found = {}
+        prospects = {}
         for name, score in scores.items():
             last = before[name]
-            known = score is not None and last is not None and math.isfinite(score) and math.isfinite(last)
-            found[name] = score + (score - last) if known else -math.inf
-        return found
+            finite = score is not None and last is not None and math.isfinite(score) and math.isfinite(last)
+            prospects[name] = score + (score - last) if finite else -math.inf
+        return prospects
 
     @property
     def standing(self) -> list[Entry]:
         """All entries, best first: those still running, then those dropped last, ..., then those dropped first."""
-        found = self.running(len(self.scores))
+        order = self.running(len(self.scores))
         for number in reversed(range(len(self.scores))):
-            found += [entry for entry in ordered(self.running(number), self._prospects(number)) if entry not in found]
-        return found
+            order += [entry for entry in ordered(self.running(number), self._prospects(number)) if entry not in order]
+        return order
 
     @property
     def winner(self) -> Entry:
@@ -146,16 +146,16 @@ class Race:
             runs[self.folder(entry)] = replace(entry.config, generations=generations, average=average)
         return runs
 
-    def run(self, site: Site, shown: Watching, stopped: Callable[[], bool], *, record: bool) -> bool:
+    def run(self, site: Site, watcher: Watching, stopped: Callable[[], bool], *, record: bool) -> bool:
         """Do what is left of the race; the winner's last rung may be recorded. Return whether the race is over.
 
         Raises:
           RunError: an entry failed, or the folder cannot be written.
         """
         for number in range(len(self.scores), len(self.rungs)):
-            shown.rung(number)
+            watcher.rung(number)
             runs = self.runs(number)
-            if not site.run(runs, shown, stopped, record=record and number == len(self.rungs) - 1):
+            if not site.run(runs, watcher, stopped, record=record and number == len(self.rungs) - 1):
                 if stopped():
                     return False
                 raise RunError(f"rung {number + 1} is not complete: an entry failed, see above")
@@ -188,16 +188,16 @@ class Race:
 
     def _continued(self, file: Path) -> list[dict[str, float | None]]:
         """The scores in an existing race's file, if it is this race."""
-        saved, mine = read(file), self._settings()
+        saved, settings = read(file), self._settings()
         if saved["rollouts"] != self.rollouts:
             raise ConfigError(
                 f"{self.path} was started with --rollouts {saved['rollouts']}; here it is {self.rollouts}: use that, "
                 "or a different --out"
             )
-        if list(saved["entries"]) != list(mine["entries"]):
+        if list(saved["entries"]) != list(settings["entries"]):
             raise ConfigError(f"{self.path} has the entries {', '.join(saved['entries'])}: use a different --out")
         for name, values in saved["entries"].items():
-            if values != mine["entries"][name]:
+            if values != settings["entries"][name]:
                 raise ConfigError(f"{self.path} was started with different settings of {name}: use a different --out")
         return list(saved["scores"])
 
@@ -249,9 +249,9 @@ def kept(entries: Sequence[Entry], prospects: Mapping[str, float], count: int) -
     for entry in best:
         if prospects[entry.name] > -math.inf:
             kinds.setdefault(entry.kind, entry)
-    chosen = [*kinds.values()][:count]
-    chosen += [entry for entry in best if entry not in chosen][: count - len(chosen)]
-    return [entry for entry in best if entry in chosen]
+    choice = [*kinds.values()][:count]
+    choice += [entry for entry in best if entry not in choice][: count - len(choice)]
+    return [entry for entry in best if entry in choice]
 
 
 def ordered(entries: Sequence[Entry], prospects: Mapping[str, float]) -> list[Entry]:
@@ -269,9 +269,9 @@ def check(race: Race) -> None:
         raise ConfigError(f"rollouts is {race.rollouts}; expected at most {MOST_ROLLOUTS}")
     if not 1 <= len(race.entries) <= MOST:
         raise ConfigError(f"there are {len(race.entries)} entries; expected 1 to {MOST}")
-    seen: dict[str, Entry] = {}
+    unique: dict[str, Entry] = {}
     for entry in race.entries:
-        other = seen.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
+        other = unique.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
         if other is not entry:
             raise ConfigError(f"the entries {other.name} and {entry.name} are the same settings: leave one out")
     first = race.rungs[0].rollouts
@@ -292,18 +292,18 @@ def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> l
     Raises:
       ConfigError: a setting is unknown or invalid, or the task cannot be learnt with it.
     """
-    made: dict[str, Entry] = {}
+    entries: dict[str, Entry] = {}
     for name, settings in portfolio.items():
         with described(name):
             entry = entry_of(name, configs.changed_by(base, settings))
-        made.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
-    return list(made.values())
+        entries.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
+    return list(entries.values())
 
 
 def entry_of(name: str, config: RunConfig) -> Entry:
     """An entry with this name; raises ConfigError if the task cannot be learnt with its settings."""
     keys.checked("run", f"{name}-s{config.seed}")
-    state = problem(config).begin()
+    state = setup.problem(config).begin()
     rows = len(explored(config, state)[0])
     return Entry(name, config, rows * len(config.algorithm_config.signs()) * config.episodes)
 
@@ -328,15 +328,15 @@ def affordable(entries: Sequence[Entry], minutes: float, processes: int) -> int:
 
 def _seconds(config: RunConfig) -> float:
     """Time of one rollout in this process, in batches like those of a worker [s]."""
-    found = problem(config)
-    runner, state = found.runner(), found.begin()
+    problem = setup.problem(config)
+    runner, state = problem.runner(), problem.begin()
     theta = np.tile(state.mu, (_BATCH, 1))
-    drawn: list[Seed] = [seeds.trial(0, i) for i in range(_BATCH)]
+    starts: list[Seed] = [seeds.trial(0, i) for i in range(_BATCH)]
     try:
-        runner.rollouts(theta, drawn)  # the first batch prepares the simulator
-        begun = time.perf_counter()
-        runner.rollouts(theta, drawn)
-        return (time.perf_counter() - begun) / _BATCH
+        runner.rollouts(theta, starts)  # the first batch prepares the simulator
+        start = time.perf_counter()
+        runner.rollouts(theta, starts)
+        return (time.perf_counter() - start) / _BATCH
     finally:
         runner.close()
 

@@ -45,11 +45,11 @@ def rows(race: Race) -> list[list[str]]:
 
 
 def _scores(race: Race, entry: Entry) -> list[str]:
-    found = [scores[entry.name] for scores in race.scores if entry.name in scores]
-    shown = ["diverged" if score is None else f"{score:.4g}" for score in found]
-    dropped = len(found) < len(race.rungs) and entry not in race.running(len(race.scores))
-    empty = [""] * (len(race.rungs) - len(shown))
-    return [*shown, "dropped", *empty[1:]] if dropped else [*shown, *empty]
+    values = [scores[entry.name] for scores in race.scores if entry.name in scores]
+    cells = ["diverged" if score is None else f"{score:.4g}" for score in values]
+    dropped = len(values) < len(race.rungs) and entry not in race.running(len(race.scores))
+    empty = [""] * (len(race.rungs) - len(cells))
+    return [*cells, "dropped", *empty[1:]] if dropped else [*cells, *empty]
 
 
 def command(race: Race) -> str:

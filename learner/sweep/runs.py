@@ -90,7 +90,7 @@ class _Learner:
     path: Path
     process: "subprocess.Popen[str]"
     reader: threading.Thread = field(init=False)
-    said: deque[str] = field(default_factory=lambda: deque(maxlen=5))
+    messages: deque[str] = field(default_factory=lambda: deque(maxlen=5))
 
     @property
     def run(self) -> str:
@@ -125,7 +125,7 @@ class Site:
     """Number of simultaneous learners."""
 
     def run(
-        self, runs: Mapping[Path, RunConfig], shown: Shown, stopped: Callable[[], bool], *, record: bool = False
+        self, runs: Mapping[Path, RunConfig], watcher: Shown, stopped: Callable[[], bool], *, record: bool = False
     ) -> bool:
         """Do the runs that are not over, in order, each in its folder; return whether all are over then.
 
@@ -141,16 +141,16 @@ class Site:
             while (waiting or running) and not stopped():
                 while waiting and len(running) < self.parallel:
                     path = waiting.popleft()
-                    running.append(_start(path, runs[path], plans, flags, shown))
+                    running.append(_start(path, runs[path], plans, flags, watcher))
                 for learner in [one for one in running if one.process.poll() is not None]:
                     running.remove(learner)
-                    _conclude(learner, shown)
+                    _conclude(learner, watcher)
                 if self.workers and self.workers.tend() and not self.workers.pids:
                     raise RunError("no local worker keeps running; see their messages above")
                 time.sleep(_LOOK)
             end([learner.process for learner in running], _GRACE)
             for learner in running:
-                _conclude(learner, shown)
+                _conclude(learner, watcher)
             running.clear()
         return not todo(runs)
 
@@ -163,12 +163,12 @@ def site(sharing: Sharing, runs: Iterable[RunConfig]) -> Iterator[Site]:
         yield Site(flags, _workers(sharing, flags, runs, stack), sharing.parallel)
 
 
-def run(runs: Mapping[Path, RunConfig], sharing: Sharing, shown: Shown, stopped: Callable[[], bool]) -> bool:
+def run(runs: Mapping[Path, RunConfig], sharing: Sharing, watcher: Shown, stopped: Callable[[], bool]) -> bool:
     """Do the runs that are not over on a site of their own; return whether all are over then. See `Site.run`."""
     if not todo(runs):
         return True
-    with site(sharing, runs.values()) as own:
-        return own.run(runs, shown, stopped, record=sharing.record)
+    with site(sharing, runs.values()) as place:
+        return place.run(runs, watcher, stopped, record=sharing.record)
 
 
 def _router(sharing: Sharing, stack: ExitStack) -> list[str]:
@@ -187,14 +187,14 @@ def _workers(
     """Local workers, which may serve the files of these runs."""
     if not sharing.processes:
         return None
-    chosen = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
-    files = sorted({str(file) for kind, name in chosen if (file := plugins.find(kind, name).file)})
-    own = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
-    own += [word for file in files for word in ("--allow-file", file)]
-    return stack.enter_context(LocalWorkers(sharing.processes, own))
+    parts = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
+    files = sorted({str(file) for kind, name in parts if (file := plugins.find(kind, name).file)})
+    options = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
+    options += [word for file in files for word in ("--allow-file", file)]
+    return stack.enter_context(LocalWorkers(sharing.processes, options))
 
 
-def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], shown: Shown) -> _Learner:
+def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], watcher: Shown) -> _Learner:
     plan = plans / f"{path.name}.json"
     plan.write_text(json.dumps(configs.to_dict(config)), "utf-8")
     command = [
@@ -209,30 +209,30 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], sho
         encoding="utf-8", errors="replace",
     )  # fmt: skip
     learner = _Learner(path, process)
-    learner.reader = threading.Thread(target=_listen, args=(learner, shown), daemon=True)
+    learner.reader = threading.Thread(target=_listen, args=(learner, watcher), daemon=True)
     learner.reader.start()
     return learner
 
 
-def _listen(learner: _Learner, shown: Shown) -> None:
+def _listen(learner: _Learner, watcher: Shown) -> None:
     """Forward a learner's output; if this thread ended, the learner would block on a full pipe."""
     assert learner.process.stdout
     generations = 0
     for line in learner.process.stdout:
         try:
-            told = json.loads(line)
+            message = json.loads(line)
         except ValueError:
-            told = None
-        if not isinstance(told, dict) or "event" not in told:
-            learner.said.append(line.strip())
-            shown.said(learner.run, line.strip())
-        elif told["event"] == "run":
-            generations = told["config"]["generations"]
-        elif told["event"] == "generation":
-            shown.progress(learner.run, told["generation"], generations, told["mean_policy_return"])
+            message = None
+        if not isinstance(message, dict) or "event" not in message:
+            learner.messages.append(line.strip())
+            watcher.said(learner.run, line.strip())
+        elif message["event"] == "run":
+            generations = message["config"]["generations"]
+        elif message["event"] == "generation":
+            watcher.progress(learner.run, message["generation"], generations, message["mean_policy_return"])
 
 
-def _conclude(learner: _Learner, shown: Shown) -> None:
+def _conclude(learner: _Learner, watcher: Shown) -> None:
     learner.reader.join()
     for pipe in (learner.process.stdin, learner.process.stdout):
         assert pipe
@@ -242,11 +242,11 @@ def _conclude(learner: _Learner, shown: Shown) -> None:
     state = summary.get("state", "interrupted" if stopped else "failed")
     if status != 0 and not stopped and state != "diverged":
         state = "failed"
-    detail = " ".join(learner.said)
+    detail = " ".join(learner.messages)
     if state == "finished":
         judged = {True: " and succeeds", False: " and does not succeed", None: ""}[summary["mean_policy_success"]]
         detail = f"mean policy returns {summary['mean_policy_return']:.3f}{judged}"
-    shown.ended(learner.run, state, detail)
+    watcher.ended(learner.run, state, detail)
 
 
 def _learn(words: Sequence[str]) -> int:

@@ -60,11 +60,11 @@ def tune(
         raise ConfigError(f"rollouts is {rollouts!r}; expected a positive whole number")
     if record:
         check_rerun()
-    found = race.entries_of(config, portfolio("general") if entries is None else entries)
-    done = Race(Path(folder), tuple(found), rollouts)
+    entrants = race.entries_of(config, portfolio("general") if entries is None else entries)
+    done = Race(Path(folder), tuple(entrants), rollouts)
     race.check(done)
     done.prepare()
-    with site(Sharing(workers=workers), [entry.config for entry in found]) as place:
+    with site(Sharing(workers=workers), [entry.config for entry in entrants]) as place:
         done.run(place, _Logged(), lambda: False, record=record)
     return done
 
