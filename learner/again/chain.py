@@ -55,14 +55,14 @@ class _Link:
         return cls(task, learnt)
 
     def controls(
-        self, sim: Sim, acting: Acting, going: IntArray, its: BoolArray
+        self, sim: Sim, acting: Acting, going: IntArray, turn: BoolArray
     ) -> tuple[FloatArray, Mapping[str, AnyArray]]:
         """Controls (n, nu) and written states (n, ...) of the rollouts `going` (n,); right for those whose turn is this
-        policy's, `its` (n,)."""  # noqa: D205, D209
+        policy's, `turn` (n,)."""  # noqa: D205, D209
         x = self.task.observe(sim)
         action = np.zeros((len(sim), self.policy.problem.spec.action))
-        if its.any():
-            action[its] = acting.act(x[its], going[its])
+        if turn.any():
+            action[turn] = acting.act(x[turn], going[turn])
         with sim.writing() as states:
             return self.task.act(sim, action), states
 
@@ -81,8 +81,8 @@ def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *
     """
     check(policies)
     first = policies[0]
-    own = {"act": lambda _, __, action: action, "ended": lambda self, sim: self.lost(sim)}
-    upper: Any = type("Upper", (type(first.problem.task),), own)
+    methods = {"act": lambda _, __, action: action, "ended": lambda self, sim: self.lost(sim)}
+    upper: Any = type("Upper", (type(first.problem.task),), methods)
     task: Any = _longer(upper, first, steps)
     sim = Sim(task.engine(BatchEngine))
     again(lambda: task.setup(sim))
@@ -118,8 +118,8 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
 
 
 def _longer(kind: type[Task], learnt: LoadedPolicy, steps: int) -> Task:
-    known = learnt.problem.task
-    return kind(replace(known.config, steps=steps), known.variant, known.sources)
+    task = learnt.problem.task
+    return kind(replace(task.config, steps=steps), task.variant, task.sources)
 
 
 def _run(
@@ -136,12 +136,12 @@ def _run(
         going = batch.active
         reached = np.stack([link.task.reached(sim) for link in links])[turn[going], np.arange(len(going))]
         felt[going] = np.where(reached, felt[going] + 1, 0)
-        there = going[felt[going] >= FELT]
-        changes[there] += 1
-        turn[there] = (turn[there] + 1) % len(links)
-        felt[there] = 0
+        arrivals = going[felt[going] >= FELT]
+        changes[arrivals] += 1
+        turn[arrivals] = (turn[arrivals] + 1) % len(links)
+        felt[arrivals] = 0
         for agent in agents:
-            agent.forget(there)
+            agent.forget(arrivals)
     return changes, acting, batch.rollouts()
 
 
@@ -150,19 +150,19 @@ def _controls(
 ) -> FloatArray:
     """Controls (n, nu) of the rollouts `going` (n,), each by the policy whose turn it is, (n,)."""
     before: Mapping[str, Any] = {name: np.array(values) for name, values in sim.own.items()}
-    given, own, written = [], [], []
+    controls, memories, states = [], [], []
     for i, link in enumerate(links):  # all tasks for all rollouts: a row's result does not depend on the others
         sim.own.clear()
         sim.own.update({name: values.copy() for name, values in before.items()})
-        controls, states = link.controls(sim, agents[i], going, turn == i)
-        given.append(controls)
-        own.append(dict(sim.own))
-        written.append(states)
+        values, writes = link.controls(sim, agents[i], going, turn == i)
+        controls.append(values)
+        memories.append(dict(sim.own))
+        states.append(writes)
     rows = np.arange(len(turn))
     sim.own.clear()
-    for name in dict.fromkeys(name for each in own for name in each):
-        known = next(each[name] for each in own if name in each)  # memory of one task only
-        sim.own[name] = np.stack([each.get(name, known) for each in own])[turn, rows]
-    for name in dict.fromkeys(name for each in written for name in each):
-        sim.write({name: np.stack([each.get(name, getattr(sim, name)) for each in written])[turn, rows]})
-    return np.stack(given)[turn, rows]
+    for name in dict.fromkeys(name for each in memories for name in each):
+        default = next(each[name] for each in memories if name in each)  # memory of one task only
+        sim.own[name] = np.stack([each.get(name, default) for each in memories])[turn, rows]
+    for name in dict.fromkeys(name for each in states for name in each):
+        sim.write({name: np.stack([each.get(name, getattr(sim, name)) for each in states])[turn, rows]})
+    return np.stack(controls)[turn, rows]

@@ -75,17 +75,17 @@ class DataSet:
                 raise ConfigError(f"{self.path} is not empty, and has no manifest.json: choose another --out")
             with writing(self.path):
                 _copy(run, self.run.path)
-                replace_text(self.manifest, json.dumps(self._wanted(self.run), indent=2) + "\n")
-        there = read(self.manifest)
-        wanted = self._wanted(run)
-        for name in (name for name in wanted if there.get(name) != wanted[name]):
+                replace_text(self.manifest, json.dumps(self._head(self.run), indent=2) + "\n")
+        manifest = read(self.manifest)
+        head = self._head(run)
+        for name in (name for name in head if manifest.get(name) != head[name]):
             raise ConfigError(
-                f"{self.path} has another data set: its {name} is {str(there.get(name))[:100]}, not "
-                f"{str(wanted[name])[:100]}: choose another --out"
+                f"{self.path} has another data set: its {name} is {str(manifest.get(name))[:100]}, not "
+                f"{str(head[name])[:100]}: choose another --out"
             )
-        return "files" in there
+        return "files" in manifest
 
-    def _wanted(self, run: RunFolder) -> dict[str, Any]:
+    def _head(self, run: RunFolder) -> dict[str, Any]:
         """What the manifest says from its beginning."""
         config, at = run.read_config(), checkpoints.load(run.checkpoint)
         return {
@@ -133,7 +133,7 @@ class Work:
         self.problem, self._of, self._judged = problem, of, judged
         config, last = of.run.read_config(), int(at.state["generation"])
         self._mu = of.run.parameters.average(last, at.state["mu"], config.average)
-        self._seen = np.stack([normaliser(at.moments)] * 2)
+        self._normaliser = np.stack([normaliser(at.moments)] * 2)
         self.format = Format(of.path, problem.spec, _wire("tasks", config.task))
         self.file = of.path / "unfinished.json"
         size = int(np.prod(whole(problem.spec))) * 4
@@ -170,7 +170,7 @@ class Work:
         part = self.next + ahead
         rows = range(part * self._each, min(self._of.episodes, (part + 1) * self._each))
         jobs = Jobs.mean("none", [seeds.trial(self._of.seed, row) for row in rows])
-        dispatcher.begin(part, self._mu, jobs, "steps", self._seen, terms=True)
+        dispatcher.begin(part, self._mu, jobs, "steps", self._normaliser, terms=True)
         return jobs
 
     def _late(self, dispatcher: Dispatcher) -> bool:
@@ -183,8 +183,8 @@ class Work:
         if not new:
             return False
         self.expelled.update(dispatcher.admission.expelled)
-        kept = next((i for i, part in enumerate(self.done) if new & {*part["hosts"]}), len(self.done))
-        del self.done[kept:]
+        first = next((i for i, part in enumerate(self.done) if new & {*part["hosts"]}), len(self.done))
+        del self.done[first:]
         self._save()
         return True
 
@@ -197,11 +197,11 @@ class Work:
         if not self._judged:
             return
         count = -(-len(jobs) // _REPEATED)
-        chosen = sorted(np.random.default_rng(secrets.randbits(64)).choice(len(jobs), count, replace=False).tolist())
-        found = self._runner.run(self._mu, jobs.take(chosen), "steps", self._seen, terms=True)
-        for at, row in enumerate(chosen):
-            alike = bits(found, slice(at, at + 1)) == results.answer(row)
-            if not alike or found.traces[at].tobytes() != results.traces[row].tobytes():
+        rows = sorted(np.random.default_rng(secrets.randbits(64)).choice(len(jobs), count, replace=False).tolist())
+        repetition = self._runner.run(self._mu, jobs.take(rows), "steps", self._normaliser, terms=True)
+        for at, row in enumerate(rows):
+            alike = bits(repetition, slice(at, at + 1)) == results.answer(row)
+            if not alike or repetition.traces[at].tobytes() != results.traces[row].tobytes():
                 raise RunError(
                     f"episode {first + row} has other numbers here than a worker sent: of {', '.join(hosts)} one "
                     "lies, or is broken; without it the same command continues"

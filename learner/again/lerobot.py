@@ -115,18 +115,18 @@ class Format:
         total: dict[str, dict[str, FloatArray]] = {}
         episodes = 0
         for part in range(parts):
-            read = parquet.read(
+            columns = parquet.read(
                 self.episodes(part), ["length", *(f"stats/{n}/{s}" for n in self.features for s in _STATISTICS)]
             )
-            episodes += len(read["length"])
+            episodes += len(columns["length"])
             for name in self.features:
-                own = {each: np.array(read[f"stats/{name}/{each}"], dtype=float) for each in _STATISTICS}
+                rows = {each: np.array(columns[f"stats/{name}/{each}"], dtype=float) for each in _STATISTICS}
                 table = {each: values[None] for each, values in total[name].items()} if name in total else None
-                total[name] = _joined(own if table is None else {k: np.concatenate([table[k], own[k]]) for k in own})
+                total[name] = _joined(rows if table is None else {k: np.concatenate([table[k], rows[k]]) for k in rows})
         frames = int(total["index"]["count"][0])
-        stats = {name: {each: values.tolist() for each, values in own.items()} for name, own in total.items()}
-        for own in stats.values():
-            own["count"] = [frames]
+        stats = {name: {each: values.tolist() for each, values in table.items()} for name, table in total.items()}
+        for column in stats.values():
+            column["count"] = [frames]
         tasks = {"task_index": np.zeros(1, dtype=np.int64), "task": ("text", [self.task])}
         parquet.write(self.path / "meta/tasks.parquet", tasks, index="task")
         info = {
@@ -144,19 +144,19 @@ class Format:
     def features(self) -> dict[str, dict[str, Any]]:
         """Type, shape and names of each column of the steps."""
         spec, shapes = self.spec, step_shapes(self.spec)
-        found: dict[str, dict[str, Any]] = {
+        columns: dict[str, dict[str, Any]] = {
             "observation.state": _feature("float32", shapes["observation"]),
             "action": _feature("float32", shapes["action"]),
             "next.reward": _feature("float32", (1,)), "next.done": _feature("bool", (1,)),
         }  # fmt: skip
         if spec.success:
-            found["next.success"] = _feature("bool", (1,))
+            columns["next.success"] = _feature("bool", (1,))
         if len(spec.terms) > 1:
-            found["next.reward_terms"] = _feature("float32", shapes["terms"], spec.terms)
+            columns["next.reward_terms"] = _feature("float32", shapes["terms"], spec.terms)
         for channel in spec.channels:
             names = channel.names if len(channel.shape) == 1 else None
-            found[_column(channel.name)] = _feature("float32", channel.shape, names)
-        return found | {name: _feature(kind, (1,)) for name, kind in _COUNTERS.items()}
+            columns[_column(channel.name)] = _feature("float32", channel.shape, names)
+        return columns | {name: _feature(kind, (1,)) for name, kind in _COUNTERS.items()}
 
     def _steps(self, number: int, start: int, episode: Episode) -> dict[str, AnyArray]:
         """An episode's rows by column, (T,) or (T, ...)."""
@@ -170,7 +170,7 @@ class Format:
         last = np.arange(count) == count - 1
         terms = parts["terms"].reshape(count, -1)
         frames = np.arange(count)
-        given: dict[str, AnyArray] = {
+        columns: dict[str, AnyArray] = {
             "observation.state": parts["observation"], "action": parts["action"],
             "next.reward": terms.sum(axis=1, dtype=float).astype("<f4"), "next.done": last,
             "next.success": last & episode.success, "next.reward_terms": terms,
@@ -178,7 +178,7 @@ class Format:
             "timestamp": (frames / self.rate).astype("<f4"), "frame_index": frames,
             "episode_index": np.full(count, number), "index": start + frames, "task_index": np.zeros(count, np.int64),
         }  # fmt: skip
-        return {name: given[name] for name in self.features}
+        return {name: columns[name] for name in self.features}
 
 
 def _column(channel: str) -> str:
@@ -192,16 +192,16 @@ def _feature(kind: str, shape: Sequence[int], names: Sequence[str] | None = None
 
 def _statistics(table: Mapping[str, AnyArray]) -> dict[str, dict[str, AnyArray]]:
     """Statistics of each column over an episode, (1,) or of the shape of its rows."""
-    found = {}
+    statistics = {}
     for name, column in table.items():
         values = column.astype(float)
         values = values[:, None] if values.ndim == 1 else values
-        found[name] = {
+        statistics[name] = {
             "min": values.min(axis=0), "max": values.max(axis=0),
             "mean": values.mean(axis=0), "std": values.std(axis=0),
             "count": np.array([len(values)]),
         }  # fmt: skip
-    return found
+    return statistics
 
 
 def _joined(rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -210,5 +210,7 @@ def _joined(rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     total = count.sum(axis=0)
     mean = (count * rows["mean"]).sum(axis=0) / total
     square = (count * (rows["std"] ** 2 + (rows["mean"] - mean) ** 2)).sum(axis=0) / total
-    own = {"min": rows["min"].min(axis=0), "max": rows["max"].max(axis=0), "mean": mean, "std": np.sqrt(square)}
-    return own | {"count": rows["count"].sum(axis=0)}
+    return {
+        "min": rows["min"].min(axis=0), "max": rows["max"].max(axis=0), "mean": mean, "std": np.sqrt(square),
+        "count": rows["count"].sum(axis=0),
+    }  # fmt: skip

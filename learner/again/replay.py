@@ -26,10 +26,11 @@ from farm.sim.trajectory import Trajectory
 from farm.tasks.acting import Acting
 from farm.tasks.loop import Rollouts, Seed, whole
 from learner.run import checkpoint as checkpoints
+from learner.run import setup
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
-from learner.run.setup import Problem, problem, start
+from learner.run.setup import Problem
 
 log = logging.getLogger(__name__)
 
@@ -72,14 +73,14 @@ class LoadedPolicy:
 
     def rollout(self, theta: FloatArray | None = None, seed: Seed = None) -> Replay:
         """One rollout of it, or of other parameters (P,), from the start for a seed (None: nominal)."""
-        chosen = self.mu if theta is None else theta
-        return self.rollouts(chosen[None], [seed])[0]
+        theta = self.mu if theta is None else theta
+        return self.rollouts(theta[None], [seed])[0]
 
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
         """Rollouts of parameters (B, P), from the starts for their seeds."""
-        found = self.runner.rollouts(theta, list(seeds), physics=True)
+        batch = self.runner.rollouts(theta, list(seeds), physics=True)
         rows = range(len(theta))
-        return [Replay(self.runner.trajectory(found, i), whole(found, i), found.at(slice(i, i + 1))) for i in rows]
+        return [Replay(self.runner.trajectory(batch, i), whole(batch, i), batch.at(slice(i, i + 1))) for i in rows]
 
 
 def load(path: str | Path, generation: int | None = None, **changed: Any) -> LoadedPolicy:  # noqa: ANN401
@@ -123,12 +124,12 @@ def loaded(
     config = folder.read_config()
     at = checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
-    chosen = last if generation is None else generation
-    seen = normaliser(at.moments)
-    mu, seen = (at.state["mu"], seen) if chosen == last else _earlier(folder, at, chosen, seen)
-    own = config.average if generation is None else 1
-    mu = folder.parameters.average(chosen, mu, own if average is None else average)
-    return LoadedPolicy(seeing(restored(folder, at, task), seen), chosen, mu)
+    number = last if generation is None else generation
+    scaling = normaliser(at.moments)
+    mu, scaling = (at.state["mu"], scaling) if number == last else _earlier(folder, at, number, scaling)
+    default = config.average if generation is None else 1
+    mu = folder.parameters.average(number, mu, default if average is None else average)
+    return LoadedPolicy(seeing(restored(folder, at, task), scaling), number, mu)
 
 
 def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
@@ -141,25 +142,25 @@ def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  #
     if task is not None and task != config.task_config:
         files = _files(config, replace(config, task_config=task), files)
         config = replace(config, task_config=task)
-    found = problem(replace(config, stop_when_solved=None), at.constants, files)
-    if changed := [name for name in ("task", "policy") if at.code.get(name) != found.code[name]]:
+    problem = setup.problem(replace(config, stop_when_solved=None), at.constants, files)
+    if changed := [name for name in ("task", "policy") if at.code.get(name) != problem.code[name]]:
         log.warning(
             "%s: the code of its %s has changed since the run began; these are the numbers of the present code",
             folder.path, " and ".join(changed),
         )  # fmt: skip
-    return found
+    return problem
 
 
-def seeing(found: Problem, seen: FloatArray) -> Problem:
+def seeing(problem: Problem, scaling: FloatArray) -> Problem:
     """The problem with the policy's observations normalised by (2, d); unchanged if d is 0."""
-    return replace(found, policy=Normalised(found.policy, seen)) if seen.size else found
+    return replace(problem, policy=Normalised(problem.policy, scaling)) if scaling.size else problem
 
 
-def _files(old: RunConfig, new: RunConfig, kept: Files) -> dict[str, Content]:
+def _files(old: RunConfig, new: RunConfig, files: Files) -> dict[str, Content]:
     """Files of a task with other settings: the run's own, except those that depend on the settings."""
     plugin = plugins.find("tasks", old.task)
     before, after = (dict(build_task(plugin, settings.to_dict(c.task_config), None).sources) for c in (old, new))
-    return {name: kept[name] if name in kept and text == before.get(name) else text for name, text in after.items()}
+    return {name: files[name] if name in files and text == before.get(name) else text for name, text in after.items()}
 
 
 def _earlier(folder: RunFolder, at: Checkpoint, generation: int, last: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -169,4 +170,4 @@ def _earlier(folder: RunFolder, at: Checkpoint, generation: int, last: FloatArra
     config = folder.read_config()
     if config.init_from is not None:
         raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
-    return start(config, folder.name, folder.files(at))[1].state["mu"], normaliser(np.zeros(1 + last.size))
+    return setup.start(config, folder.name, folder.files(at))[1].state["mu"], normaliser(np.zeros(1 + last.size))

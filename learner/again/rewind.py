@@ -65,17 +65,17 @@ class Rewound:
         """Indices of the first rollouts that the task ended before their last step, for example after a drop."""
         return np.flatnonzero(self.rollouts.ended)[:count].tolist()
 
-    def again(self, chosen: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
+    def again(self, indices: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
         """Simulate some of them at physics rate, with the task's settings of `policy` if it is given.
 
         Raises:
           ConfigError: there is no such rollout.
         """
-        for index in chosen:
+        for index in indices:
             if not 0 <= index < len(self.theta):
                 last = len(self.theta) - 1
                 raise ConfigError(f"generation {self.generation} has no rollout {index}: there are 0 to {last}")
-        rows = list(chosen)
+        rows = list(indices)
         return (policy or self.policy).rollouts(self.theta[rows], [self.seeds[i] for i in rows])
 
     def rollout(self, index: int) -> Replay:
@@ -104,24 +104,24 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
     folder = RunFolder.open(Path(path))
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
-    chosen = last if generation is None else generation
-    if not 1 <= chosen <= last:
+    number = last if generation is None else generation
+    if not 1 <= number <= last:
         behind = f"it has done generations 1 to {last}" if last else "it has done no generation"
-        raise ConfigError(f"generation {chosen} of the run in {folder.path} has no rollouts: {behind}")
+        raise ConfigError(f"generation {number} of the run in {folder.path} has no rollouts: {behind}")
     problem = restored(folder, at)
-    state, seen = before(folder, at, problem, chosen)
-    policy = LoadedPolicy(seeing(problem, seen), chosen - 1, state.mu)
-    jobs = explored(config, state, pairs_of(folder, chosen))[1]
+    state, scaling = before(folder, at, problem, number)
+    policy = LoadedPolicy(seeing(problem, scaling), number - 1, state.mu)
+    jobs = explored(config, state, pairs_of(folder, number))[1]
     theta, seeds = jobs.theta(state.mu), jobs.seeds()
-    found = Rewound(policy, seen, chosen, theta, seeds, policy.runner.rollouts(theta, seeds))
-    _compare(folder, found)
-    return found
+    batch = Rewound(policy, scaling, number, theta, seeds, policy.runner.rollouts(theta, seeds))
+    _compare(folder, batch)
+    return batch
 
 
-def under(folder: RunFolder, found: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
+def under(folder: RunFolder, batch: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
     """The policy of a repeated generation with other settings of its task; a ConfigError if that is impossible."""
     problem = restored(folder, checkpoints.load(folder.checkpoint), task)
-    return LoadedPolicy(seeing(problem, found.seen), found.policy.generation, found.policy.mu)
+    return LoadedPolicy(seeing(problem, batch.seen), batch.policy.generation, batch.policy.mu)
 
 
 def before(folder: RunFolder, at: Checkpoint, problem: Problem, generation: int) -> tuple[SearchState, FloatArray]:
@@ -134,10 +134,10 @@ def before(folder: RunFolder, at: Checkpoint, problem: Problem, generation: int)
     if done and _draws_alike(algorithm, fresh, algorithm.restore(at.state)):
         rows = folder.parameters.rows()
         if done in rows["generation"]:
-            mu, seen = folder.parameters.mean(done)
+            mu, scaling = folder.parameters.mean(done)
             sigma = rows["sigma"][rows["generation"] == done][0]
-            return replace(fresh, mu=mu, sigma=sigma, generation=done), seen
-    return _learnt_again(folder, problem, done)
+            return replace(fresh, mu=mu, sigma=sigma, generation=done), scaling
+    return _learn_again(folder, problem, done)
 
 
 def pairs_of(folder: RunFolder, generation: int) -> int:
@@ -163,7 +163,7 @@ def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:
     return with_all.tobytes() == without.tobytes()
 
 
-def _learnt_again(folder: RunFolder, problem: Problem, until: int) -> tuple[SearchState, FloatArray]:
+def _learn_again(folder: RunFolder, problem: Problem, until: int) -> tuple[SearchState, FloatArray]:
     """Learn the run again in this process up to this update: slow, but works for any algorithm, with the same bits."""
     config = folder.read_config()
     algorithm: Any = config.algorithm_config
@@ -171,28 +171,29 @@ def _learnt_again(folder: RunFolder, problem: Problem, until: int) -> tuple[Sear
     state, moments = algorithm.restore(first.state), first.moments
     pairs = 0
     if until:
-        said = "the state of %s before generation %d is not stored: learning the run again up to there"
-        log.warning(said, config.algorithm, until + 1)
+        message = "the state of %s before generation %d is not stored: learning the run again up to there"
+        log.warning(message, config.algorithm, until + 1)
     runner = problem.runner()
     while state.generation < until:
         eps, jobs = explored(config, state, pairs)
-        found = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
-        told = learnt_from(config, problem.task, found.returns, found.steps)
-        state, moments = algorithms.tell(config.algorithm_of(pairs), state, eps, told), merged(moments, found.moments)
-        pairs = config.pairs_after(pairs, int(found.steps.sum()))
+        results = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
+        returns = learnt_from(config, problem.task, results.returns, results.steps)
+        state = algorithms.tell(config.algorithm_of(pairs), state, eps, returns)
+        moments = merged(moments, results.moments)
+        pairs = config.pairs_after(pairs, int(results.steps.sum()))
     runner.close()
     return state, normaliser(moments)
 
 
-def _compare(folder: RunFolder, found: Rewound) -> None:
+def _compare(folder: RunFolder, batch: Rewound) -> None:
     """Warn if the returns differ from the run's mean, extremes and spread in progress.jsonl."""
-    values = found.returns
+    values = batch.returns
     for line in folder.progress():
-        if line.generation == found.generation:
+        if line.generation == batch.generation:
             stored = (line.return_mean, line.return_min, line.return_max, line.return_std)
             if stored != (float(values.mean()), float(values.min()), float(values.max()), float(values.std())):
                 log.warning(
                     "%s: these are not the rollouts of generation %d to the last bit: their mean return was %.6g and "
                     "is %.6g here; code or --init-from run have changed, or this processor rounds differently",
-                    folder.path, found.generation, line.return_mean, values.mean(),
+                    folder.path, batch.generation, line.return_mean, values.mean(),
                 )  # fmt: skip

@@ -97,10 +97,10 @@ def stored(folder: RunFolder) -> Stored:
     if at.code.get("simulation") != problem.code["simulation"]:
         log.warning("%s: the simulation's code (farm/) is of another release than when the run began", folder.path)
     lines = {line.generation: line for line in folder.progress() if line.generation <= last}
-    kept = folder.parameters.rows() if folder.parameters.path.exists() else np.empty(0, [("generation", "<i8")])
-    rows = {int(row["generation"]): row for row in kept if row["generation"] <= last}
-    seen = problem.spec.observation if config.policy_config.normalise else 0
-    every = folder.parameters.every(len(at.state["mu"]), config.generations, seen)
+    table = folder.parameters.rows() if folder.parameters.path.exists() else np.empty(0, [("generation", "<i8")])
+    rows = {int(row["generation"]): row for row in table if row["generation"] <= last}
+    observations = problem.spec.observation if config.policy_config.normalise else 0
+    every = folder.parameters.every(len(at.state["mu"]), config.generations, observations)
     links, before = folder.chain.read(), chain.first(config, at.config)
     for generation in range(1, last + 1):
         if generation not in lines:
@@ -115,8 +115,8 @@ def stored(folder: RunFolder) -> Stored:
     if last and (before, links[last].state) != (at.chain, chain.state_of(at)):
         raise Differs(f"{folder.path}: generation {last} differs: checkpoint is not the one that chain says")
     run = Stored(folder, config, at, problem, lines, rows, links, folder.read_summary())
-    if run.summary and (said := run.summary.get("parameters_sha256")) != run.sha256:
-        raise Differs(f"{folder.path}: summary.json says that the parameters are {said}, they are {run.sha256}")
+    if run.summary and (digest := run.summary.get("parameters_sha256")) != run.sha256:
+        raise Differs(f"{folder.path}: summary.json says that the parameters are {digest}, they are {run.sha256}")
     return run
 
 
@@ -136,14 +136,14 @@ def workers(run: Stored, place: Placement | None, stopped: Callable[[], bool]) -
     with ExitStack() as stack:
         if place is None:
             runner = stack.enter_context(closing(run.problem.runner()))
-            yield lambda mu, jobs, seen: runner.run(mu, jobs, "none", seen)
+            yield lambda mu, jobs, normaliser: runner.run(mu, jobs, "none", normaliser)
             return
         link, name = stack.enter_context(connected(place, run.problem, stopped)), f"verify-{secrets.token_hex(4)}"
         admission, count = Admission(fingerprint.digest()), itertools.count()
         dispatcher, _ = dispatch(stack, link, place, run.problem, name, admission, run.last, stopped)
 
-        def simulate(mu: FloatArray, jobs: Jobs, seen: FloatArray) -> RoundResults:
-            dispatcher.begin(next(count), mu, jobs, normaliser=seen)
+        def simulate(mu: FloatArray, jobs: Jobs, normaliser: FloatArray) -> RoundResults:
+            dispatcher.begin(next(count), mu, jobs, normaliser=normaliser)
             return dispatcher.collect()
 
         yield simulate
@@ -159,17 +159,17 @@ def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> 
       Stopped: it was asked to stop.
     """
     for generation in generations:
-        state, seen = before(run.folder, run.at, run.problem, generation)
+        state, normaliser = before(run.folder, run.at, run.problem, generation)
         jobs = explored(run.config, state, pairs_of(run.folder, generation))[1]
         jobs = Jobs.joined([jobs, Jobs.mean("none", [None])])
-        found = simulate(state.mu, jobs, np.stack([seen, seen]))
-        rollouts = len(found.returns) - 1
-        _agree(run.folder, generation, run.lines[generation], outcome(run.problem.spec, found, rollouts), "repeated")
+        results = simulate(state.mu, jobs, np.stack([normaliser, normaliser]))
+        rollouts = len(results.returns) - 1
+        _agree(run.folder, generation, run.lines[generation], outcome(run.problem.spec, results, rollouts), "repeated")
         yield generation, rollouts
 
 
 def verify_all(
-    run: Stored, place: Placement, stopped: Callable[[], bool], kept: Path | None
+    run: Stored, place: Placement, stopped: Callable[[], bool], workspace: Path | None
 ) -> Iterator[tuple[int, int]]:
     """Learn the run again on workers; yield each generation and its number of rollouts.
 
@@ -177,7 +177,7 @@ def verify_all(
       run: to repeat.
       place: where the workers are.
       stopped: whether to end before the last generation.
-      kept: folder in which an interrupted repetition is continued; it is removed at the end.
+      workspace: folder in which an interrupted repetition is continued; it is removed at the end.
 
     Raises:
       Differs: a generation has other numbers, or the results have.
@@ -185,12 +185,12 @@ def verify_all(
     config = replace(run.config, generations=run.last)
     finished = run.summary is not None and run.summary.get("state") == "finished"
     with ExitStack() as stack:
-        path = (kept or Path(stack.enter_context(tempfile.TemporaryDirectory()))) / run.folder.name
+        path = (workspace or Path(stack.enter_context(tempfile.TemporaryDirectory()))) / run.folder.name
         again = stack.enter_context(open_run(config, path, place, resume=path.exists(), stopped=stopped))
         done = again.learner.at.rollouts
         for report in again.learn():
-            given = {name: value for name, value in vars(report.progress).items() if name not in chain.OF_MACHINES}
-            _agree(run.folder, report.generation, run.lines[report.generation], given, "repeated")
+            values = {name: value for name, value in vars(report.progress).items() if name not in chain.OF_MACHINES}
+            _agree(run.folder, report.generation, run.lines[report.generation], values, "repeated")
             if report.generation in run.rows:
                 state = again.learner.state
                 _agree_bits(
@@ -209,8 +209,8 @@ def verify_all(
                         f"{run.folder.path}: {name} is {run.summary[name]!r} in summary.json, and "
                         f"{again.summary.get(name)!r} when it is repeated"
                     )
-        if kept is not None and not stopped():
-            shutil.rmtree(kept)
+        if workspace is not None and not stopped():
+            shutil.rmtree(workspace)
 
 
 def _linked(
@@ -227,8 +227,8 @@ def _linked(
         raise Differs(f"{where}: chain has no line of it")
     link = links[generation]
     if row is not None:  # of others there is only what chain says
-        seen = row["normaliser"] if "normaliser" in row.dtype.names else NONE
-        if chain.following(before, line, row["mu"], row["sigma"], seen, link.state) != link.digest:
+        normaliser = row["normaliser"] if "normaliser" in row.dtype.names else NONE
+        if chain.following(before, line, row["mu"], row["sigma"], normaliser, link.state) != link.digest:
             raise Differs(f"{where}: progress.jsonl or parameters, or what is before it, have another digest in chain")
     return link.digest
 
@@ -243,8 +243,8 @@ def _of_parameters(row: Any) -> dict[str, float]:  # noqa: ANN401  an array's ro
     }
 
 
-def _agree(folder: RunFolder, generation: int, line: GenerationStats, given: Mapping[str, Any], where: str) -> None:
-    for name, value in given.items():
+def _agree(folder: RunFolder, generation: int, line: GenerationStats, values: Mapping[str, Any], where: str) -> None:
+    for name, value in values.items():
         if getattr(line, name) != value:
             raise Differs(
                 f"{folder.path}: generation {generation} differs: {name} is {getattr(line, name)!r} in "
