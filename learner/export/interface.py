@@ -49,12 +49,12 @@ def _actions(task: Task, count: int) -> tuple[Quantity, ...]:
     return tuple(Quantity(name, "", *bounds) for name in names)
 
 
-def _rows(given: Sequence[Quantity]) -> list[dict[str, Any]]:
+def _rows(values: Sequence[Quantity]) -> list[dict[str, Any]]:
     """Quantities as data."""
-    bounds = [[value if math.isfinite(value) else None for value in (each.low, each.high)] for each in given]
+    bounds = [[value if math.isfinite(value) else None for value in (each.low, each.high)] for each in values]
     return [
         {"name": each.name, "unit": each.unit, "low": low, "high": high}
-        for each, (low, high) in zip(given, bounds, strict=True)
+        for each, (low, high) in zip(values, bounds, strict=True)
     ]
 
 
@@ -70,17 +70,17 @@ def lines(path: Path, of: Mapping[str, Any]) -> Iterator[str]:
     """
     if not all(name in of for name in (*_NAMES, "interface")):
         raise ConfigError(f"{path} does not name its numbers: it is no file of this release's farm export")
-    known = json.loads(str(of["interface"]))
+    data = json.loads(str(of["interface"]))
     period = f"{float(of['control_period']):g} s"
     yield f"{of['policy']} for {of['task']} after generation {of['generation']}; a control step takes {period}"
     for what in ("observations", "actions", "controls", "joints"):
-        rows = [_row(i, each) for i, each in enumerate(known[what])]
+        rows = [_row(i, each) for i, each in enumerate(data[what])]
         widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
         yield f"{what}: {len(rows)}"
         for row in rows:
             yield "  ".join(["", *(f"{text:<{width}}" for text, width in zip(row, widths, strict=True))]).rstrip()
-    yield "normaliser: " + ("none" if known["normaliser"] is None else "mean and deviation of each observation")
-    yield "code: " + ", ".join(f"{name} {digest[:16]}" for name, digest in known["code"].items())
+    yield "normaliser: " + ("none" if data["normaliser"] is None else "mean and deviation of each observation")
+    yield "code: " + ", ".join(f"{name} {digest[:16]}" for name, digest in data["code"].items())
 
 
 def _row(i: int, of: Mapping[str, Any]) -> tuple[str, str, str, str]:

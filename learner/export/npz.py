@@ -25,8 +25,8 @@ VERSION: Final = 3
 
 def contents(policy: LoadedPolicy) -> dict[str, Any]:
     """The contents of the file by name."""
-    found = policy.problem
-    task, config = found.task, found.config
+    problem = policy.problem
+    task, config = problem.task, problem.config
     engine = DataEngine(task.model)
     sim = Sim(engine)
     task.setup(sim)
@@ -52,18 +52,18 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
         "interface": json.dumps(interface(policy)),
         "gamma": task.config.gamma,
         "return_scale": task.return_scale,
-        **found.policy.constants,
-        **({} if found.policy.memory is None else {"memory": found.policy.memory}),
+        **problem.policy.constants,
+        **({} if problem.policy.memory is None else {"memory": problem.policy.memory}),
         **task.exported(),
     }
 
 
 def _files(task: Task) -> dict[str, Any]:
     """What the model reads, as bytes by path, and the model's own path; nothing if it reads nothing."""
-    read = needed(task.mjcf(), task.sources, task.main)
-    if len(read) == 1:
+    files = needed(task.mjcf(), task.sources, task.main)
+    if len(files) == 1:
         return {}
-    contents = {name: each.encode() if isinstance(each, str) else each for name, each in read.items()}
+    contents = {name: each.encode() if isinstance(each, str) else each for name, each in files.items()}
     return {"model": task.main} | {f"file/{name}": np.frombuffer(each, np.uint8) for name, each in contents.items()}
 
 

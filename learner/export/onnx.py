@@ -25,7 +25,7 @@ IR: Final = 8
 """Version of the file's format for these operators."""
 
 _STATES: Final = 1000  # on which both are compared
-_SEEN: Final = 200  # observations around which these are drawn, about
+_OBSERVATIONS: Final = 200  # observations around which these are drawn, about
 _TURNS: Final = 3  # in which a policy with memory acts on each of them
 _NOISE: Final = 0.1  # added to observations, in their standard deviations
 _DOUBLE, _SINGLE = 1e-9, 1e-4  # largest difference, relative where actions are above 1; by the policy's own precision
@@ -128,8 +128,8 @@ def listed(path: Path) -> tuple[dict[str, Any], list[str]]:
         word: [f"{each.name} (N, {each.type.tensor_type.shape.dim[1].dim_value})" for each in ends[word]]
         for word in ends
     }
-    said = {each.key: each.value for each in model.metadata_props}
-    return said, [f"{word} {', '.join(each)}" for word, each in sizes.items()]
+    properties = {each.key: each.value for each in model.metadata_props}
+    return properties, [f"{word} {', '.join(each)}" for word, each in sizes.items()]
 
 
 def write(path: Path, policy: LoadedPolicy) -> None:
@@ -147,17 +147,17 @@ def write(path: Path, policy: LoadedPolicy) -> None:
 @plugins.no_exit
 def _graph(policy: LoadedPolicy) -> Graph:
     """What the policy puts."""
-    own, graph, name = policy.problem.policy, Graph(), policy.problem.config.policy
+    actor, graph, name = policy.problem.policy, Graph(), policy.problem.config.policy
     try:
-        given: object = own.onnx(graph, policy.parameters, "observation", "" if own.memory is None else "memory")
+        result: object = actor.onnx(graph, policy.parameters, "observation", "" if actor.memory is None else "memory")
     except NotImplementedError:
         raise ConfigError(
             f"policy {name} has no form in ONNX: give it a method onnx(self, graph, theta, x, memory)"
         ) from None
-    names = (given,) if own.memory is None else given
-    ends = ("action",) if own.memory is None else ("action", "next_memory")
+    names = (result,) if actor.memory is None else result
+    ends = ("action",) if actor.memory is None else ("action", "next_memory")
     if not isinstance(names, tuple) or len(names) != len(ends) or not all(isinstance(each, str) for each in names):
-        raise ConfigError(f"onnx of {name} gave {given!r:.60}; expected the name of {' and that of '.join(ends)}")
+        raise ConfigError(f"onnx of {name} gave {result!r:.60}; expected the name of {' and that of '.join(ends)}")
     for each, end in zip(names, ends, strict=True):
         graph.put("Identity", str(each), to=end)
     return graph
@@ -169,36 +169,37 @@ def _compare(policy: LoadedPolicy, content: bytes) -> None:
     Raises:
       ConfigError: an action or memory differs.
     """
-    own, name, rng = policy.problem.policy, policy.problem.config.policy, np.random.default_rng(0)
+    actor, name, rng = policy.problem.policy, policy.problem.config.policy, np.random.default_rng(0)
     session = library().reference.ReferenceEvaluator(content)
-    seen = observed(policy.problem.task, _SEEN)
-    first, turns = (np.zeros(0), 1) if own.memory is None else (own.memory, _TURNS)
-    allowed = _SINGLE if own.prepare(policy.parameters[None]).dtype == np.float32 else _DOUBLE
-    at_once = max(1, min(_STATES, _NUMBERS // own.size))
-    for begin in range(0, _STATES, at_once):
-        count = min(at_once, _STATES - begin)
+    observations = observed(policy.problem.task, _OBSERVATIONS)
+    first, turns = (np.zeros(0), 1) if actor.memory is None else (actor.memory, _TURNS)
+    allowed = _SINGLE if actor.prepare(policy.parameters[None]).dtype == np.float32 else _DOUBLE
+    at_once = max(1, min(_STATES, _NUMBERS // actor.size))
+    for start in range(0, _STATES, at_once):
+        count = min(at_once, _STATES - start)
         acting, memory = policy.acting(count), np.tile(first, (count, 1))
         for _ in range(turns):
-            x = seen[rng.integers(len(seen), size=count)]
-            x = x + _NOISE * seen.std(axis=0) * rng.standard_normal(x.shape)
-            given: list[FloatArray] = session.run(
+            x = observations[rng.integers(len(observations), size=count)]
+            x = x + _NOISE * observations.std(axis=0) * rng.standard_normal(x.shape)
+            outputs: list[FloatArray] = session.run(
                 None, {"observation": x, **({"memory": memory} if first.size else {})}
             )
-            wanted = np.asarray(acting.act(x), dtype=float)
-            _same(name, given[0], wanted, begin, allowed)
+            reference = np.asarray(acting.act(x), dtype=float)
+            _same(name, outputs[0], reference, start, allowed)
             if first.size:
-                memory = given[1]
+                memory = outputs[1]
 
 
-def _same(name: str, given: FloatArray, wanted: FloatArray, begin: int, allowed: float) -> None:
-    if given.shape != wanted.shape:
-        raise ConfigError(f"onnx of {name} gives actions of shape {given.shape}; expected {wanted.shape}, as act")
-    most = allowed * np.maximum(1.0, np.abs(wanted))
+def _same(name: str, output: FloatArray, reference: FloatArray, start: int, allowed: float) -> None:
+    if output.shape != reference.shape:
+        raise ConfigError(f"onnx of {name} gives actions of shape {output.shape}; expected {reference.shape}, as act")
+    most = allowed * np.maximum(1.0, np.abs(reference))
     with np.errstate(invalid="ignore"):
-        differs = ~((np.abs(given - wanted) <= most) | (given == wanted) | (np.isnan(given) & np.isnan(wanted)))
+        alike = (np.abs(output - reference) <= most) | (output == reference)
+    differs = ~(alike | (np.isnan(output) & np.isnan(reference)))
     if differs.any():
         row, column = np.argwhere(differs)[0].tolist()
         raise ConfigError(
-            f"onnx of {name} gives action {column} as {given[row, column]:.9g} in state {begin + row} of {_STATES}; "
-            f"act gives {wanted[row, column]:.9g}"
+            f"onnx of {name} gives action {column} as {output[row, column]:.9g} in state {start + row} of {_STATES}; "
+            f"act gives {reference[row, column]:.9g}"
         )
