@@ -171,7 +171,7 @@ class Runs:
         self._bars = Progress(*columns, TextColumn("{task.fields[said]}"), console=console, expand=True)
         self._live = console.is_terminal
         self._tasks: dict[str, TaskID] = {}
-        self._heard: set[str] = set()
+        self._messages: set[str] = set()
         self._total = self._bars.add_task("runs", total=self._all, completed=self._all - self._left, said="")
         say(f"{self._left} of {self._all} runs to do, into {where}")
 
@@ -192,8 +192,8 @@ class Runs:
 
     def said(self, run: str, line: str) -> None:
         """Show a learner's message, for example that no worker answers; equal messages are shown once."""
-        if line not in self._heard:
-            self._heard.add(line)
+        if line not in self._messages:
+            self._messages.add(line)
             self._print(f"{run}: {line}")
 
     def ended(self, run: str, state: str, detail: str) -> None:

@@ -187,7 +187,7 @@ class Standing:
         self._names = {race.folder(entry).name: entry.name for entry in race.entries}
         self._console = wide()
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
-        self._heard: set[str] = set()
+        self._messages: set[str] = set()
 
     def __enter__(self) -> "Standing":
         if self._console.is_terminal:
@@ -212,8 +212,8 @@ class Standing:
 
     def said(self, run: str, line: str) -> None:
         """Show a learner's message, for example that no worker answers; equal messages are shown once."""
-        if line not in self._heard:
-            self._heard.add(line)
+        if line not in self._messages:
+            self._messages.add(line)
             self._console.print(plain(f"{run}: {line}"), highlight=False)
 
     def ended(self, run: str, state: str, detail: str) -> None:

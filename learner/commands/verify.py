@@ -124,7 +124,7 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
         else:
             simulate = stack.enter_context(workers(run, command.place, stop.is_set))
             repeated = verify_some(run, [each for each in generations if each not in done], simulate)
-        for generation, rollouts in _shown(repeated, len(generations) - len(done)):
+        for generation, rollouts in _bar(repeated, len(generations) - len(done)):
             done.append(generation)
             receipt["rollouts"] += rollouts
             if stop.is_set():
@@ -151,7 +151,7 @@ def _interrupted(path: Path, receipt: dict[str, Any]) -> dict[str, Any] | None:
         return None
 
 
-def _shown(repeated: Iterator[tuple[int, int]], count: int) -> Iterable[tuple[int, int]]:
+def _bar(repeated: Iterator[tuple[int, int]], count: int) -> Iterable[tuple[int, int]]:
     """Show a bar on a terminal."""
     console = Console()
     return track(repeated, "generations", total=count, console=console) if console.is_terminal else repeated
