@@ -5,12 +5,14 @@ import copy
 import dataclasses
 import functools
 import io
+import json
 import math
 import re
 import sys
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from farm.errors import ConfigError
@@ -184,6 +186,25 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
     if type(value) is list:
         return tuple(value)
     return float(value) if type(value) is int and float in _kinds(hint) and int not in _kinds(hint) else value
+
+
+def read_json(path: Path, version: int | None = None, kinds: Mapping[str, type] = types.MappingProxyType({})) -> Any:  # noqa: ANN401
+    """What is in a JSON file; of a given version only a table of it, whose entries are of some types.
+
+    Raises:
+      ConfigError: it cannot be read, is not JSON, of another version, or lacks an entry.
+    """
+    try:
+        values = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} is not JSON: {error}") from None
+    if version is not None and not (isinstance(values, dict) and values.get("version") == version):
+        raise ConfigError(f"{path} is not of version {version}")
+    if damaged := [name for name, kind in kinds.items() if type(values.get(name)) is not kind]:
+        raise ConfigError(f"{path} is damaged: {', '.join(damaged)}")
+    return values
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:

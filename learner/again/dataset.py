@@ -25,6 +25,7 @@ from farm import fingerprint, plugins, seeds
 from farm.errors import ConfigError, RunError, writing
 from farm.moments import normaliser
 from farm.net.work import Jobs
+from farm.settings import read_json
 from farm.tasks.outcomes import whole
 from learner import parquet
 from learner.again.lerobot import Episode, Format
@@ -236,12 +237,7 @@ def _wire(kind: str, name: str) -> str:
 
 def read(path: Path) -> dict[str, Any]:
     """A JSON table in a file; a ConfigError if there is none."""
-    try:
-        table = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        table = None
+    table = read_json(path)
     if not isinstance(table, dict) or table.get("version", _VERSION) != _VERSION:
         raise ConfigError(f"{path} is damaged, or of another version: expected what farm dataset writes")
     return table

@@ -8,6 +8,7 @@ print(again.returns, again.rollout(again.worst(1)[0]).trajectory.success)
 
 import logging
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -173,15 +174,14 @@ def _learn_again(folder: RunFolder, problem: Problem, until: int) -> tuple[Searc
     if until:
         message = "the state of %s before generation %d is not stored: learning the run again up to there"
         log.warning(message, config.algorithm, until + 1)
-    runner = problem.runner()
-    while state.generation < until:
-        eps, jobs = explored(config, state, pairs)
-        results = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
-        returns = learnt_from(config, problem.task, results.returns, results.steps)
-        state = algorithms.tell(config.algorithm_of(pairs), state, eps, returns)
-        moments = merged(moments, results.moments)
-        pairs = config.pairs_after(pairs, int(results.steps.sum()))
-    runner.close()
+    with closing(problem.runner()) as runner:
+        while state.generation < until:
+            eps, jobs = explored(config, state, pairs)
+            results = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
+            returns = learnt_from(config, problem.task, results.returns, results.steps)
+            state = algorithms.tell(config.algorithm_of(pairs), state, eps, returns)
+            moments = merged(moments, results.moments)
+            pairs = config.pairs_after(pairs, int(results.steps.sum()))
     return state, normaliser(moments)
 
 

@@ -22,15 +22,15 @@ from farm.net.stats import GenerationStats
 from farm.net.work import Jobs, Simulated
 from learner.again.replay import restored
 from learner.again.rewind import before, pairs_of
-from learner.run import chain
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
-from learner.run.chain import Link
+from learner.run import hash_chain
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.evaluation import outcome
 from learner.run.files import NONE
 from learner.run.folder import RunFolder
+from learner.run.hash_chain import Entry
 from learner.run.launch import Placement, connected, dispatch, open_run
 from learner.run.learner import explored
 from learner.run.setup import Problem
@@ -61,7 +61,7 @@ class Stored:
     """Of progress.jsonl, by generation."""
     rows: Mapping[int, Any]
     """Of parameters: mu and sigma after those generations that are kept."""
-    links: Mapping[int, Link]
+    entries: Mapping[int, Entry]
     """Of chain, by generation."""
     summary: Mapping[str, Any] | None
 
@@ -101,7 +101,7 @@ def stored(folder: RunFolder) -> Stored:
     rows = {int(row["generation"]): row for row in table if row["generation"] <= last}
     observations = problem.spec.observation if config.policy_config.normalise else 0
     every = folder.parameters.every(len(at.state["mu"]), config.generations, observations)
-    links, before = folder.chain.read(), chain.first(config, at.config)
+    entries, before = folder.chain.read(), hash_chain.first(config, at.config)
     for generation in range(1, last + 1):
         if generation not in lines:
             raise Differs(f"{folder.path}: generation {generation} differs: progress.jsonl has no line of it")
@@ -109,12 +109,12 @@ def stored(folder: RunFolder) -> Stored:
             raise Differs(f"{folder.path}: generation {generation} differs: parameters has no row of it")
         if generation in rows:
             _agree(folder, generation, lines[generation], _of_parameters(rows[generation]), "parameters")
-        before = _linked(folder, generation, before, lines[generation], rows.get(generation), links)
+        before = _linked(folder, generation, before, lines[generation], rows.get(generation), entries)
     if last in rows:
         _agree_bits(folder, last, rows[last], at.state, "checkpoint")
-    if last and (before, links[last].state) != (at.chain, chain.state_of(at)):
+    if last and (before, entries[last].state) != (at.chain, hash_chain.state_of(at)):
         raise Differs(f"{folder.path}: generation {last} differs: checkpoint is not the one that chain says")
-    run = Stored(folder, config, at, problem, lines, rows, links, folder.read_summary())
+    run = Stored(folder, config, at, problem, lines, rows, entries, folder.read_summary())
     if run.summary and (digest := run.summary.get("parameters_sha256")) != run.sha256:
         raise Differs(f"{folder.path}: summary.json says that the parameters are {digest}, they are {run.sha256}")
     return run
@@ -189,14 +189,16 @@ def verify_all(
         again = stack.enter_context(open_run(config, path, place, resume=path.exists(), stopped=stopped))
         done = again.learner.at.rollouts
         for report in again.learn():
-            values = {name: value for name, value in vars(report.progress).items() if name not in chain.OF_MACHINES}
+            values = {
+                name: value for name, value in vars(report.progress).items() if name not in hash_chain.OF_MACHINES
+            }
             _agree(run.folder, report.generation, run.lines[report.generation], values, "repeated")
             if report.generation in run.rows:
                 state = again.learner.state
                 _agree_bits(
                     run.folder, report.generation, run.rows[report.generation], vars(state), "the repetition"
                 )  # fmt: skip
-            if chain.state_of(again.learner.at) != run.links[report.generation].state:
+            if hash_chain.state_of(again.learner.at) != run.entries[report.generation].state:
                 where = f"{run.folder.path}: generation {report.generation} differs"
                 raise Differs(f"{where}: the state after it has another digest in chain")
             yield report.generation, report.progress.rollouts - done
@@ -219,18 +221,18 @@ def _linked(
     before: str,
     line: GenerationStats,
     row: Any,  # noqa: ANN401  an array's row, or None
-    links: Mapping[int, Link],
+    entries: Mapping[int, Entry],
 ) -> str:
     """The digest of a generation in chain, if it is that of its line, its row and the generation before it."""
     where = f"{folder.path}: generation {generation} differs"
-    if generation not in links:
+    if generation not in entries:
         raise Differs(f"{where}: chain has no line of it")
-    link = links[generation]
+    entry = entries[generation]
     if row is not None:  # of others there is only what chain says
         normaliser = row["normaliser"] if "normaliser" in row.dtype.names else NONE
-        if chain.following(before, line, row["mu"], row["sigma"], normaliser, link.state) != link.digest:
+        if hash_chain.following(before, line, row["mu"], row["sigma"], normaliser, entry.state) != entry.digest:
             raise Differs(f"{where}: progress.jsonl or parameters, or what is before it, have another digest in chain")
-    return link.digest
+    return entry.digest
 
 
 def _of_parameters(row: Any) -> dict[str, float]:  # noqa: ANN401  an array's row

@@ -35,7 +35,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(CompareCommand, words, "farm compare")
     check_rerun()
-    from learner.recording.comparison import Shown, record_comparison
+    from learner.recording.comparison import Side, record_comparison
     from learner.recording.curves import PALETTE
     from learner.recording.drawing import Drawing
 
@@ -47,7 +47,7 @@ def main(words: Sequence[str]) -> int:
     replays = []
     for folder, run in zip(folders, runs, strict=True):
         policy = loaded(folder)
-        replays.append(Shown(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
+        replays.append(Side(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
     with writing(command.to):
         record_comparison(command.to, replays, table(runs))
     say(f"written to {command.to}; look at it with: farm view {command.to}")

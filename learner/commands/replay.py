@@ -117,7 +117,7 @@ def _rollouts(
 ) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show exploring rollouts of a generation: one by itself, several side by side."""
     from learner.again.rewind import rewind, under
-    from learner.recording.comparison import Shown, record_comparison
+    from learner.recording.comparison import Side, record_comparison
     from learner.recording.drawing import Drawing
 
     batch = rewind(folder.path, command.generation)
@@ -134,7 +134,7 @@ def _rollouts(
         rows = [f"| {name} | {line} |" for name, line in zip(names, lines, strict=True)]
         again = f"`farm replay {command.run} --generation {batch.generation} --rollout I`"
         table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
-        side = [Shown(name, drawing, (), each.trajectory) for name, each in zip(names, replays, strict=True)]
+        side = [Side(name, drawing, (), each.trajectory) for name, each in zip(names, replays, strict=True)]
         with writing(path):
             record_comparison(path, side, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))

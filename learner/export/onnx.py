@@ -42,7 +42,7 @@ def library() -> Any:  # noqa: ANN401  a module
     return onnx
 
 
-class Graph:
+class OnnxGraph:
     """Operators one after another; each value is known by its name, and N is the size of a batch."""
 
     def __init__(self) -> None:
@@ -145,9 +145,9 @@ def write(path: Path, policy: LoadedPolicy) -> None:
 
 
 @plugins.no_exit
-def _graph(policy: LoadedPolicy) -> Graph:
+def _graph(policy: LoadedPolicy) -> OnnxGraph:
     """What the policy puts."""
-    actor, graph, name = policy.problem.policy, Graph(), policy.problem.config.policy
+    actor, graph, name = policy.problem.policy, OnnxGraph(), policy.problem.config.policy
     try:
         result: object = actor.onnx(graph, policy.parameters, "observation", "" if actor.memory is None else "memory")
     except NotImplementedError:

@@ -38,8 +38,8 @@ _WIDER: Final = 0.55  # the eye's additional distance per further scene, in spac
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A run and its final policy's rollout; or any rollout with its own name."""
+class Side:
+    """One of those that are compared: a run and its final policy's rollout, or any rollout with its own name."""
 
     name: str
     drawing: Drawing
@@ -47,7 +47,7 @@ class Shown:
     rollout: Trajectory
 
 
-def record_comparison(path: Path, runs: Sequence[Shown], table: str, *, rollouts_of: str = "") -> None:
+def record_comparison(path: Path, runs: Sequence[Side], table: str, *, rollouts_of: str = "") -> None:
     """Write the recording of runs, or of the rollouts of one run with this name, with a table of them (Markdown).
 
     Rollouts of one run have no learning curves.
@@ -77,7 +77,7 @@ def record_comparison(path: Path, runs: Sequence[Shown], table: str, *, rollouts
     stream.disconnect()
 
 
-def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
+def _arrangement(runs: Sequence[Side]) -> tuple[FloatArray, Eye]:
     """The vector from each scene to the next [m] (3,), across the line of sight; and the eye that sees all of them."""
     sizes = [run.drawing.scene.radius for run in runs]
     largest = runs[int(np.argmax(sizes))].drawing
@@ -90,14 +90,14 @@ def _arrangement(runs: Sequence[Shown]) -> tuple[FloatArray, Eye]:
     return step, Eye(eye.target + 0.5 * further * step, eye.away * wider)
 
 
-def _compared(runs: Sequence[Shown]) -> Channel | None:
+def _compared(runs: Sequence[Side]) -> Channel | None:
     """The first channel of scalars, if all runs have one of its name and labels."""
     first = next((channel for channel in runs[0].drawing.spec.channels if channel.kind == "scalars"), None)
     channels = [{(c.name, c.kind, c.names) for c in run.drawing.spec.channels} for run in runs]
     return first if first and all((first.name, first.kind, first.names) in names for names in channels) else None
 
 
-def _names(run: Shown, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:
+def _names(run: Side, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:
     """Static entities besides the scene: names and the run's colour."""
     size = run.drawing.scene.radius
     above = Eye.of(run.drawing.scene, run.drawing.camera).target + (0.0, 0.0, size)
@@ -132,7 +132,7 @@ def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[Gener
     stream.send_columns(f"{root}/band", at, rr.Measurements.columns(values=means, variances=spreads))
 
 
-def _send_rollout(stream: rr.RecordingStream, root: str, run: Shown, compared: Channel | None) -> None:
+def _send_rollout(stream: rr.RecordingStream, root: str, run: Side, compared: Channel | None) -> None:
     """The rollout's frames; on the timelines of the curves all exist from the start."""
     rollout = run.rollout
     before = np.zeros(len(rollout.times), dtype=np.int64)

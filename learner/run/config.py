@@ -1,7 +1,6 @@
 """The configuration of a run: all settings that its numbers depend on."""
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -330,13 +329,7 @@ def read(path: Path) -> RunConfig:
     Raises:
       ConfigError: it cannot be read or is invalid.
     """
-    try:
-        values = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} is not JSON: {error}") from None
-    return from_dict(values, str(path))
+    return from_dict(settings.read_json(path), str(path))
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:

@@ -36,10 +36,10 @@ from farm.sim.model_files import Content, Files, by_digest, joined
 from farm.sim.model_files import digest as digest_of
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
-from learner.run.chain import ChainFile, Link
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.files import NONE, ParametersFile, ProgressFile, replace_text
+from learner.run.hash_chain import ChainFile, Entry
 from learner.run.states import States
 
 log = logging.getLogger(__name__)
@@ -192,11 +192,11 @@ class RunFolder:
         sigma: FloatArray,
         generations: int,
         normaliser: FloatArray = NONE,
-        link: Link | None = None,
+        entry: Entry | None = None,
     ) -> None:
         """Add a generation to progress.jsonl, parameters and chain: mu and sigma (P,), and a normaliser (2, d)."""
-        if link is not None:
-            self.chain.append(progress.generation, link)
+        if entry is not None:
+            self.chain.append(progress.generation, entry)
         self._progress.append(progress)
         self.parameters.append(progress.generation, mu, sigma, generations, normaliser)
 

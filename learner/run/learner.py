@@ -23,8 +23,8 @@ from farm.net.work import Jobs
 from farm.tasks.base import Task
 from learner import algorithms
 from learner.algorithms import Algorithm, SearchState
-from learner.run import chain
 from learner.run import config as configs
+from learner.run import hash_chain
 from learner.run.checkpoint import BestRollout, Checkpoint
 from learner.run.config import RunConfig
 from learner.run.diagnosis import Diagnosis
@@ -354,10 +354,10 @@ class Learner:
         if self._at.first != last.first:
             self.folder.states.keep(last)
         mu, sigma, statistics = self.state.mu, self.state.sigma, normaliser(self._at.moments)
-        state = chain.state_of(self._at)
-        link = chain.Link(chain.following(last.chain, progress, mu, sigma, statistics, state), state)
-        self._at = replace(self._at, chain=link.digest)
-        self.folder.append(progress, mu, sigma, self.config.generations, statistics, link)
+        state = hash_chain.state_of(self._at)
+        entry = hash_chain.Entry(hash_chain.following(last.chain, progress, mu, sigma, statistics, state), state)
+        self._at = replace(self._at, chain=entry.digest)
+        self.folder.append(progress, mu, sigma, self.config.generations, statistics, entry)
         now = time.monotonic()
         durable = now - self._durable > DURABLE_EVERY
         self._durable = now if durable else self._durable

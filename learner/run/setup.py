@@ -23,9 +23,9 @@ from farm.tasks.probe import specification
 from farm.tasks.standard import nominal
 from learner import algorithms
 from learner.algorithms import SearchState
-from learner.run import chain
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
+from learner.run import hash_chain
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
@@ -205,7 +205,7 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
         solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True,
         code=subject.code, files=texts, assets=assets, constants=dict(subject.policy.constants),
-        moments=other.moments if other else moments, chain=chain.first(config),
+        moments=other.moments if other else moments, chain=hash_chain.first(config),
     )  # fmt: skip
     return subject, checkpoint
 

@@ -20,6 +20,7 @@ from typing import Final
 from farm.errors import ConfigError, writing
 from farm.net import keys
 from farm.seeds import SEEDS
+from farm.settings import read_json
 from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.run.files import replace_text
@@ -102,21 +103,17 @@ class Sweep:
 
     def _check_same(self, file: Path) -> None:
         """Check that an existing sweep is this one, perhaps with fewer seeds."""
-        try:
-            data = json.loads(file.read_text("utf-8"))
-        except ValueError as error:
-            raise ConfigError(f"{file} is not JSON: {error}") from None
-        lists = isinstance(data, dict) and all(isinstance(data.get(name), list) for name in ("seeds", "settings"))
-        if not lists or data.get("version") != _VERSION:
-            raise ConfigError(f"{file} is not of version {_VERSION}")
-        if data.get("vary") != self.vary:
-            old, new = _words(data.get("vary")), _words(self.vary)
+        data = read_json(file, _VERSION, {"vary": dict, "seeds": list, "settings": list})
+        if data["vary"] != self.vary:
+            old, new = _words(data["vary"]), _words(self.vary)
             raise ConfigError(f"{self.path} varies {old}; here it is {new}: use the same values, or a different --out")
         if missing := [str(seed) for seed in data["seeds"] if seed not in self.seeds]:
             raise ConfigError(
                 f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different --out"
             )
-        for setting, values in zip(self.settings, data["settings"], strict=False):
+        if len(data["settings"]) != len(self.settings):
+            raise ConfigError(f"{file} is damaged: settings")
+        for setting, values in zip(self.settings, data["settings"], strict=True):
             for name, old, new in configs.changes(configs.from_dict(values, str(file)), setting.config):
                 raise ConfigError(
                     f"{self.path} was started with --{name} {old}; here it is {new}: use that, or a different --out"

@@ -26,7 +26,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from farm import seeds
+from farm import seeds, settings
 from farm.errors import ConfigError, RunError, writing
 from farm.net import keys
 from farm.tasks.loop import Seed
@@ -36,7 +36,7 @@ from learner.run.config import RunConfig
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
 from learner.run.learner import explored
-from learner.sweep.runs import Shown, Site
+from learner.sweep.runs import RunWatcher, Site
 
 MOST: Final = 256
 """Largest number of entries."""
@@ -80,7 +80,7 @@ class Rung:
     """Rollouts of each of them since the beginning, at the end of this rung."""
 
 
-class Watching(Shown, Protocol):
+class RaceWatcher(RunWatcher, Protocol):
     """Who is told how a race goes."""
 
     def rung(self, number: int) -> None:
@@ -146,7 +146,7 @@ class Race:
             runs[self.folder(entry)] = replace(entry.config, generations=generations, average=average)
         return runs
 
-    def run(self, site: Site, watcher: Watching, stopped: Callable[[], bool], *, record: bool) -> bool:
+    def run(self, site: Site, watcher: RaceWatcher, stopped: Callable[[], bool], *, record: bool) -> bool:
         """Do what is left of the race; the winner's last rung may be recorded. Return whether the race is over.
 
         Raises:
@@ -188,38 +188,24 @@ class Race:
 
     def _continued(self, file: Path) -> list[dict[str, float | None]]:
         """The scores in an existing race's file, if it is this race."""
-        saved, settings = read(file), self._settings()
+        saved, wanted = read(file), self._settings()
         if saved["rollouts"] != self.rollouts:
             raise ConfigError(
                 f"{self.path} was started with --rollouts {saved['rollouts']}; here it is {self.rollouts}: use that, "
                 "or a different --out"
             )
-        if list(saved["entries"]) != list(settings["entries"]):
+        if list(saved["entries"]) != list(wanted["entries"]):
             raise ConfigError(f"{self.path} has the entries {', '.join(saved['entries'])}: use a different --out")
         for name, values in saved["entries"].items():
-            if values != settings["entries"][name]:
+            if values != wanted["entries"][name]:
                 raise ConfigError(f"{self.path} was started with different settings of {name}: use a different --out")
         return list(saved["scores"])
 
 
 def read(file: Path) -> dict[str, Any]:
-    """The contents of race.json.
-
-    Raises:
-      ConfigError: it cannot be read, or is none.
-    """
-    try:
-        saved = json.loads(file.read_text("utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot read {file}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{file} is not JSON: {error}") from None
-    if not isinstance(saved, dict) or saved.get("version") != _VERSION:
-        raise ConfigError(f"{file} is not of version {_VERSION}")
-    kinds = {"rollouts": int, "entries": dict, "scores": list}
-    if wrong := [name for name, kind in kinds.items() if type(saved.get(name)) is not kind]:
-        raise ConfigError(f"{file} is damaged: {', '.join(wrong)}")
-    return saved
+    """The contents of race.json; a ConfigError if it cannot be read, or is none."""
+    race: dict[str, Any] = settings.read_json(file, _VERSION, {"rollouts": int, "entries": dict, "scores": list})
+    return race
 
 
 def schedule(entries: int, rollouts: int) -> list[Rung]:
@@ -293,9 +279,9 @@ def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> l
       ConfigError: a setting is unknown or invalid, or the task cannot be learnt with it.
     """
     entries: dict[str, Entry] = {}
-    for name, settings in portfolio.items():
+    for name, values in portfolio.items():
         with described(name):
-            entry = entry_of(name, configs.changed_by(base, settings))
+            entry = entry_of(name, configs.changed_by(base, values))
         entries.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
     return list(entries.values())
 

@@ -41,7 +41,7 @@ _LOOK: Final = 0.1  # [s] between two checks of the learners
 _GRACE: Final = 20.0  # [s] for learners to save and leave
 
 
-class Shown(Protocol):
+class RunWatcher(Protocol):
     """Who is told how the runs go; called on several threads."""
 
     def progress(self, run: str, generation: int, of: int, returned: float) -> None:
@@ -125,7 +125,7 @@ class Site:
     """Number of simultaneous learners."""
 
     def run(
-        self, runs: Mapping[Path, RunConfig], watcher: Shown, stopped: Callable[[], bool], *, record: bool = False
+        self, runs: Mapping[Path, RunConfig], watcher: RunWatcher, stopped: Callable[[], bool], *, record: bool = False
     ) -> bool:
         """Do the runs that are not over, in order, each in its folder; return whether all are over then.
 
@@ -163,7 +163,7 @@ def site(sharing: Sharing, runs: Iterable[RunConfig]) -> Iterator[Site]:
         yield Site(flags, _workers(sharing, flags, runs, stack), sharing.parallel)
 
 
-def run(runs: Mapping[Path, RunConfig], sharing: Sharing, watcher: Shown, stopped: Callable[[], bool]) -> bool:
+def run(runs: Mapping[Path, RunConfig], sharing: Sharing, watcher: RunWatcher, stopped: Callable[[], bool]) -> bool:
     """Do the runs that are not over on a site of their own; return whether all are over then. See `Site.run`."""
     if not todo(runs):
         return True
@@ -194,7 +194,7 @@ def _workers(
     return stack.enter_context(LocalWorkers(sharing.processes, options))
 
 
-def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], watcher: Shown) -> _Learner:
+def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], watcher: RunWatcher) -> _Learner:
     plan = plans / f"{path.name}.json"
     plan.write_text(json.dumps(configs.to_dict(config)), "utf-8")
     command = [
@@ -214,7 +214,7 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], wat
     return learner
 
 
-def _listen(learner: _Learner, watcher: Shown) -> None:
+def _listen(learner: _Learner, watcher: RunWatcher) -> None:
     """Forward a learner's output; if this thread ended, the learner would block on a full pipe."""
     assert learner.process.stdout
     generations = 0
@@ -232,7 +232,7 @@ def _listen(learner: _Learner, watcher: Shown) -> None:
             watcher.progress(learner.run, message["generation"], generations, message["mean_policy_return"])
 
 
-def _conclude(learner: _Learner, watcher: Shown) -> None:
+def _conclude(learner: _Learner, watcher: RunWatcher) -> None:
     learner.reader.join()
     for pipe in (learner.process.stdin, learner.process.stdout):
         assert pipe

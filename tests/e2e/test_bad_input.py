@@ -60,7 +60,7 @@ MISTAKES = [
     (("run", "--pears", "3"), "did you mean --pairs"),
     (("run", "--serve", "here"), "is not of the form [HOST:]PORT"),
     (("run", "--name", "a/b"), "run 'a/b' is not a name"),
-    (("run", "--config", "nowhere.json"), "cannot read the configuration nowhere.json"),
+    (("run", "--config", "nowhere.json"), "cannot read nowhere.json"),
     (("run", "--preset", "thesis", "--resume", "x"), "--preset and --resume exclude each other"),
     (("run", "--resume", "nowhere"), "nowhere is not a run's folder"),
     (("run", "--init-from", "nowhere"), "nowhere is not a run's folder"),

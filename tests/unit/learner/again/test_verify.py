@@ -14,9 +14,9 @@ from alone import POLE, Alone
 from farm.__main__ import main
 from learner.again.verify import Differs, chosen, stored, verify_some, workers
 from learner.commands import verify as command
-from learner.run import chain, setup
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
+from learner.run import hash_chain, setup
 from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.learner import Learner
@@ -50,14 +50,14 @@ def verified(folder: RunFolder, generations: Sequence[int] = range(1, GENERATION
 def forged(folder: RunFolder) -> None:
     """Give the altered files a chain of their own."""
     at, config = checkpoints.load(folder.checkpoint), folder.read_config()
-    links, before = folder.chain.read(), chain.first(config)
+    entries, before = folder.chain.read(), hash_chain.first(config)
     lines = {line.generation: line for line in folder.progress()}
     rows = {int(row["generation"]): row for row in folder.parameters.rows()}
     (folder.path / "chain").unlink()
-    for generation, link in links.items():
-        row, state = rows[generation], chain.state_of(at) if generation == len(links) else link.state
-        before = chain.following(before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state)
-        folder.chain.append(generation, chain.Link(before, state))
+    for generation, entry in entries.items():
+        row, state = rows[generation], hash_chain.state_of(at) if generation == len(entries) else entry.state
+        before = hash_chain.following(before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state)
+        folder.chain.append(generation, hash_chain.Entry(before, state))
     checkpoints.save(folder.checkpoint, replace(at, chain=before, config=configs.to_dict(config)))
 
 

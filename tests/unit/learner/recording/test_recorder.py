@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
 from learner.recording import recorder as recorders
-from learner.recording.comparison import Shown, record_comparison
+from learner.recording.comparison import Side, record_comparison
 from learner.recording.drawing import Drawing
 from learner.recording.files import parts
 from learner.recording.recorder import Recorder
@@ -286,7 +286,7 @@ def test_the_eye_follows_a_body_that_moves_away(scene, spec, rollout, tmp_path, 
 
 def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, rollout, tmp_path, read):
     curves = [stats(g) for g in (1, 2)]
-    both = [Shown(name, Drawing(scene, spec), curves, rollout()) for name in ("one", "other")]
+    both = [Side(name, Drawing(scene, spec), curves, rollout()) for name in ("one", "other")]
     record_comparison(tmp_path / "compare.rrd", both, "| table |")
     rows = read("compare.rrd")
     force = rollout().channels["touch/force"]
@@ -296,7 +296,7 @@ def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, roll
     [where] = rows.fixed("/runs/other", "translation")
     assert np.linalg.norm(where) > scene.mover.radius, "scenes stand apart"
     record_comparison(
-        tmp_path / "mixed.rrd", [both[0], Shown("c", Drawing(scene, plain), curves, rollout(spec=plain))], ""
+        tmp_path / "mixed.rrd", [both[0], Side("c", Drawing(scene, plain), curves, rollout(spec=plain))], ""
     )
     assert not [entity for entity in read("mixed.rrd").batches if "force" in entity]
 

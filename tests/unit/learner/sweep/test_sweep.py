@@ -161,13 +161,17 @@ def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
         '{"version": 1, "vary": 3}',
         '{"version": 1, "vary": {"initial_sigma": ["0.1"]}, "seeds": [], "settings": 3}',
         '{"version": 1, "vary": {"initial_sigma": ["0.1"]}, "seeds": [], "settings": [3]}',
+        '{"version": 1, "vary": {"initial_sigma": ["0.1"]}, "seeds": [], "settings": []}',
+        "[" * 100_000,
     ],
+    ids=range(9),
 )
 def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "sweep.json").write_text(text)
     with pytest.raises(ConfigError) as said:
         made(tmp_path, "0.1").prepare()
     assert "\n" not in str(said.value)
+    assert "cannot write" not in str(said.value)  # the file is at fault, and not the disk
 
 
 def test_other_things_are_not_written_into(tmp_path):

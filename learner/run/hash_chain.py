@@ -25,7 +25,7 @@ OF_MACHINES: Final = ("reissued", "workers", "seconds")
 
 
 @dataclass(frozen=True)
-class Link:
+class Entry:
     """A generation's entry."""
 
     digest: str
@@ -84,26 +84,26 @@ class ChainFile:
 
     path: Path
 
-    def append(self, generation: int, link: Link) -> None:
+    def append(self, generation: int, entry: Entry) -> None:
         """Add a generation."""
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(_line(generation, link))
+            file.write(_line(generation, entry))
 
-    def read(self) -> Mapping[int, Link]:
+    def read(self) -> Mapping[int, Entry]:
         """Every readable line, by generation; the last one of several."""
-        links: dict[int, Link] = {}
+        entries: dict[int, Entry] = {}
         with suppress(OSError):
             for words in map(str.split, self.path.read_text("utf-8", "replace").splitlines()):
                 if len(words) == 3 and words[0].isdecimal() and len(words[0]) < 20:
-                    links[int(words[0])] = Link(*words[1:])
-        return links
+                    entries[int(words[0])] = Entry(*words[1:])
+        return entries
 
     def rewind(self, generation: int) -> None:
         """Remove what is newer than a generation."""
         if self.path.exists():
-            older = ((at, link) for at, link in sorted(self.read().items()) if at <= generation)
-            replace_text(self.path, "".join(_line(at, link) for at, link in older))
+            older = ((at, entry) for at, entry in sorted(self.read().items()) if at <= generation)
+            replace_text(self.path, "".join(_line(at, entry) for at, entry in older))
 
 
-def _line(generation: int, link: Link) -> str:
-    return f"{generation} {link.digest} {link.state}\n"
+def _line(generation: int, entry: Entry) -> str:
+    return f"{generation} {entry.digest} {entry.state}\n"
