@@ -97,6 +97,24 @@ IMPORTS = {name: [found for node in ast.walk(tree) for found in _imports(node)] 
 TOPS = {name: {found.partition(".")[0] for found in imports} for name, imports in IMPORTS.items()}
 
 
+def _run_elsewhere(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    """A module's own functions that are given to a thread, or to Zenoh for its own."""
+    functions = {node.name: node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    for node in ast.walk(tree):
+        name = ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
+        if isinstance(node, ast.Call) and name in ("Thread", "_callback", "answer", "answer_asked"):
+            given = [each.value for each in node.keywords if each.arg == "target"] if name == "Thread" else node.args
+            names = (ast.unparse(each).rpartition(".")[2] for each in given)
+            yield from (functions[each] for each in names if each in functions)
+
+
+def test_a_function_says_on_which_other_thread_it_runs() -> None:
+    found = [(name, node) for name, tree in TREES.items() for node in _run_elsewhere(tree)]
+    assert len(found) >= 8
+    silent = [f"{name}:{node.name}" for name, node in found if "Thread: " not in (ast.get_docstring(node) or "")]
+    assert not silent
+
+
 def test_the_page_names_what_exists() -> None:
     page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
     named = re.findall(r"`([\w/]+\.py):([\w.]+)`", page)

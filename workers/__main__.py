@@ -57,6 +57,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _watch_parent(stop: threading.Event) -> None:
+    """Stop when the other end of standard input is closed. Thread: helper."""
     while os.read(0, 1024):
         pass
     stop.set()

@@ -95,13 +95,14 @@ class Session:
         return Outlet(self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP))
 
     def answer(self, key: str, reply: Callable[[], bytes]) -> None:
-        """Answer every query on the key with the result of `reply` (called on another thread)."""
+        """Answer every query on the key with the result of `reply`, which Zenoh calls on its threads."""
         self.answer_asked(key, lambda _: reply())
 
     def answer_asked(self, key: str, reply: Callable[[str], bytes]) -> None:
         """Like `answer`, where `reply` takes the query's parameters (the text after the key and a question mark)."""
 
         def serve(query: zenoh.Query) -> None:
+            """Answer one. Thread: Zenoh's."""
             with query, suppress(zenoh.ZError):
                 query.reply(key, reply(str(query.parameters)))
 
@@ -132,7 +133,7 @@ class Session:
                     yield reply.ok.payload.to_bytes()
 
     def burden(self, event: Event) -> None:
-        """Count an event against the machine that sent it; with very many, it is cut off.
+        """Count an event against the machine that sent it; with very many, it is cut off. Thread: Zenoh's, or main.
 
         That is an event of the topic FLOOD. Without certificates nobody knows who sent it, and nothing is done.
         """
@@ -151,13 +152,15 @@ class Session:
             return False
         self._cut[name] = time.monotonic() + _CUT
         log.warning("machine %s sends more messages than any worker: it is cut off for %g s", name, _CUT)
-        threading.Thread(target=self._silence, args=(name,), daemon=True).start()  # this may be a callback of Zenoh's
+        threading.Thread(target=self._silence, args=(name,), daemon=True).start()
         return True
 
     def _silence(self, name: str) -> None:
+        """Find a machine's connections, which callbacks of Zenoh's must not. Thread: helper."""
         silence({_address(link) for link in self._session.info.links() if link.auth_identifier == name})
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
+        """A machine has connected. Thread: Zenoh's."""
         if event.kind == zenoh.SampleKind.PUT and self._is_cut(event.link.auth_identifier):
             silence({_address(event.link)})
 
@@ -180,6 +183,7 @@ class Session:
         self._prefixes[topic] = len(key.removesuffix("**"))
 
         def put(sample: zenoh.Sample) -> None:
+            """A message has arrived. Thread: Zenoh's."""
             alive = sample.kind == zenoh.SampleKind.PUT
             event = Event(topic, str(sample.key_expr), sample.payload.to_bytes(), alive)
             if not self.events.put(event, wake=wake, most=most):
@@ -198,6 +202,7 @@ def _as_daemon(declare: Callable[[], _T]) -> _T:
     result: Future[_T] = Future()
 
     def run() -> None:
+        """Thread: helper."""
         try:
             result.set_result(declare())
         except BaseException as error:

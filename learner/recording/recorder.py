@@ -67,7 +67,7 @@ _LEVELS: Final = {"WARNING": "WARN"}  # the standard library's name in Rerun's
 
 
 class Recorder:
-    """Records a run, generation by generation."""
+    """Records a run, generation by generation. Thread: recorder, once a RunRecording has it."""
 
     def __init__(
         self,

@@ -140,6 +140,7 @@ class RunRecording(logging.Handler):
             self._queue.put(call)
 
     def _work(self) -> None:
+        """Do what is queued, until the end. Thread: recorder."""
         try:
             while (call := self._next()) is not None:
                 call()

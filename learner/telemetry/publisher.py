@@ -81,7 +81,7 @@ class Publisher(logging.Handler):
         super().close()
 
     def _page(self, query: str) -> bytes:
-        """Past reports from a generation on: `from=<generation>`; called on another thread."""
+        """Past reports from a generation on: `from=<generation>`. Thread: Zenoh's."""
         digits = query.removeprefix("from=")[:12]
         first = int(digits) if digits.isascii() and digits.isdigit() else 1
         run = self._run  # before the reports, which may grow meanwhile

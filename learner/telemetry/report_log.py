@@ -42,7 +42,10 @@ class ReportLog:
                 self._reports[at] = codec.encode(replace(oldest, traces={}, sample=None, replay=None))
 
     def page(self, generation: int) -> tuple[Report, ...]:
-        """Reports from that generation on, as many as fit into a page; at least one, if there is one."""
+        """Reports from that generation on, as many as fit into a page; at least one, if there is one.
+
+        Thread: Zenoh's.
+        """
         with self._lock:
             reports: list[Report] = []
             size = 0
