@@ -32,6 +32,15 @@ def rows(batches: list[Any], name: str) -> dict[int, Any]:
     return found
 
 
+def texts(path: Path, entity: str) -> list[str]:
+    """Every text of an entity, in order."""
+    found: list[str] = []
+    for batch in read(path)[entity]:
+        (name,) = [n for n in batch.schema.names if n.endswith(":text")]
+        found += [text for row in batch.column(name).to_pylist() for text in row or []]
+    return found
+
+
 def generations(path: Path) -> list[int]:
     """The generations in a recording, each once."""
     return sorted(rows(read(path)["/learning/return"], "scalars"))

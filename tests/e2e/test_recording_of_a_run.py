@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from processes import Farm, children
-from recordings import generations, read, rows
+from recordings import generations, read, rows, texts
 from rerun.chunk import RrdReader
 
 from farm import seeds
@@ -78,14 +78,9 @@ def test_a_recording_and_the_replays(recorded: Farm) -> None:
     (recording,) = RrdReader(folder / "run.rrd").recordings()
     assert recording.recording_id == "r"
     assert sorted(path.name for path in folder.glob("*.rrd")) == ["replay.rrd", "run.rrd"]
-    captions = [text for batch in read(folder / "replay.rrd")["/rollout"] for text in _texts(batch)]
+    captions = texts(folder / "replay.rrd", "/rollout")
     assert any("best rollout, generation" in text for text in captions)
     assert any(f"mean policy after generation {GENERATIONS}" in text for text in captions)
-
-
-def _texts(batch: Any) -> list[str]:
-    (name,) = [n for n in batch.schema.names if n.endswith(":text")]
-    return [text for row in batch.column(name).to_pylist() for text in row or []]
 
 
 def test_figures_are_the_same_everywhere(recorded: Farm) -> None:
@@ -157,7 +152,7 @@ def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
     again = {"reissued": 0, "checks": {}}  # its last answers are checked again
     assert {**after, **again} == {**before, **again}
     folder = recorded.folder / "runs" / "r"
-    captions = [text for batch in read(folder / "replay.rrd")["/rollout"] for text in _texts(batch)]
+    captions = texts(folder / "replay.rrd", "/rollout")
     assert [text.split(",")[0].split(" after")[0] for text in captions] == ["### best rollout", "### mean policy"]
     assert generations(folder / "run.rrd") == list(range(1, GENERATIONS + 1))
 

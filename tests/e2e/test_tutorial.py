@@ -18,7 +18,7 @@ COMMANDS = [
     shlex.split(line, comments=True) for line in re.findall(r"^    ((?:farm|python) [a-z].*)$", TEXT, flags=re.M)
 ]
 APART = [["farm", "learner", "--name", "apart"], ["farm", "worker"]]
-LOOKS = "view"  # opens a window; test_finished_runs looks into what it opens
+LOOKS = "view"  # opens a window; test_compare looks into what it opens
 FEW = ("--generations", "5")
 
 
