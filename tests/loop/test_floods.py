@@ -4,40 +4,25 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hosts import host, placed, tls
 from made import pole
 
 import farm
 from farm import fingerprint
-from farm.commands import certificates
 from farm.net import codec, keys
 from farm.net.messages import WorkRequest
-from farm.net.session import connect, free_endpoint, listen
+from farm.net.session import connect, listen
 from farm.net.tls import find
-from learner.run.launch import Placement, open_run
-from workers.config import WorkerConfig
-from workers.worker import Worker
+from learner.run.launch import open_run
 
 pytestmark = pytest.mark.slow
 ROOT, SILENT = Path(__file__).parents[2], 300
-
-
-@pytest.fixture(scope="module")
-def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("certificates") / "own"
-    certificates.main(
-        ["new", str(folder), "--learner", "127.0.0.1", "--worker", "a", "--worker", "silent", "--worker", "liar"]
-    )
-    return folder
-
-
-def tls() -> str:
-    return free_endpoint().replace("tcp/", "tls/")
 
 
 def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> None:
@@ -69,18 +54,17 @@ def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> Non
 def test_a_machine_that_floods_is_cut_off(
     certs: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str, through: str
 ) -> None:
-    endpoint, token = tls(), keys.worker_token("farm", "liar/0")
-    task, mine = pole(tmp_path / "mine"), find(certs, "learner")
+    task, place, token = pole(tmp_path / "mine"), placed(certs), keys.worker_token("farm", "liar/0")
+    endpoint = place.listen
     config = farm.configure(f"{task}:Pole", generations=10_000, pairs=15)
-    place = Placement(listen=endpoint, tls=mine, record=False)
     with ExitStack() as stack:
         if through == "router":
             stack.enter_context(router(endpoint, certs))
             place = replace(place, connect=(endpoint,))
         run = stack.enter_context(open_run(config, tmp_path / "run", place))
         learning = run.learn()
-        stack.enter_context(honest(endpoint, certs, task))
-        viewer = stack.enter_context(connect((endpoint,), None, lambda: False, mine))
+        stack.enter_context(host(endpoint, certs, "a", task))
+        viewer = stack.enter_context(connect((endpoint,), None, lambda: False, place.tls))
         stack.enter_context(connect((endpoint,), None, lambda: False, find(certs, "worker", "liar"))).token(token)
         while not viewer.present(token, 1.0):
             pass
@@ -90,23 +74,6 @@ def test_a_machine_that_floods_is_cut_off(
             next(learning)
         assert len(run.dispatcher.workers) == 1  # the honest one
     assert "machine liar sends more messages than any worker" in caplog.text
-
-
-@contextmanager
-def endless(act: Callable[[], None]) -> Iterator[None]:
-    stop = threading.Event()
-
-    def repeat() -> None:
-        while not stop.is_set():
-            act()
-
-    thread = threading.Thread(target=repeat)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(20)
 
 
 @contextmanager
@@ -120,13 +87,12 @@ def router(endpoint: str, certs: Path) -> Iterator[None]:
 
 
 def test_results_larger_than_any_of_the_run_are_dropped_unread(certs: Path, tmp_path: Path) -> None:
-    file = pole(tmp_path / "mine")
-    place = Placement(listen=tls(), tls=find(certs, "learner"), record=False)
+    file, place = pole(tmp_path / "mine"), placed(certs)
     with open_run(farm.configure(f"{file}:Pole", generations=5000, pairs=15), tmp_path / "run", place) as run:
         learning, key = run.learn(), keys.result("farm", "run", "silent/1")
         with (
             connect((place.listen,), None, lambda: False, find(certs, "worker", "silent")) as liar,
-            honest(place.listen, certs, file),
+            host(place.listen, certs, "a", file),
         ):
             next(learning)
             liar.publish(key, b"x" * 20_000_000)
@@ -167,22 +133,12 @@ def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
         thread.join(20)
 
 
-@contextmanager
-def honest(endpoint: str, certs: Path, file: Path) -> Iterator[None]:
-    config = WorkerConfig(connect=(endpoint,), tls=certs, name="a", allow_file=(file,))
-    with connect(config.connect, None, lambda: False, config.bundle) as session:
-        worker = Worker(config, session)
-        worker.join()
-        with endless(worker.turn):
-            yield
-
-
 def test_silent_instances_of_one_certificate_delay_no_round(certs: Path, tmp_path: Path) -> None:
     file, hashes, late = pole(tmp_path / "mine"), [], 0
     config = farm.configure(f"{file}:Pole", generations=200, pairs=15)
     for name in ("alone", "flooded"):
-        place = Placement(listen=tls(), tls=find(certs, "learner"), record=False)
-        with open_run(config, tmp_path / name, place) as run, honest(place.listen, certs, file):
+        place = placed(certs)
+        with open_run(config, tmp_path / name, place) as run, host(place.listen, certs, "a", file):
             learning = run.learn()
             next(learning)
             if name == "alone":

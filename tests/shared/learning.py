@@ -2,17 +2,13 @@
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from hosts import LIES, Forging
 
-from farm.errors import MessageError
-from farm.net import codec
-from farm.net.session import Session, connect, free_endpoint
-from farm.net.work import Results
+from farm.net.session import connect, free_endpoint
 from learner.run.config import RunConfig
 from learner.run.launch import Placement, open_run
 from learner.scheduler.scheduler import SchedulerConfig
@@ -20,31 +16,15 @@ from workers.config import WorkerConfig
 from workers.worker import Worker
 
 
-class Lying:
-    """A session through which returns go out too high by their last bit."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._session, name)
-
-    def publish(self, key: str, payload: bytes, **how: bool) -> None:
-        with suppress(MessageError):
-            results = codec.decode(payload, Results)
-            payload = codec.encode(replace(results, returns=np.nextafter(results.returns, np.inf)))
-        self._session.publish(key, payload, **how)
-
-
 @contextmanager
 def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
-    """Workers on threads of this process, some of which lie; all have asked for work when this returns."""
+    """Workers on threads of this process, some lying by the last bit; all have asked for work when this returns."""
     stop, asked = threading.Event(), threading.Semaphore(0)
     configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
 
     def serve(config: WorkerConfig, lies: bool) -> None:
         with connect(config.connect, None, stop.is_set) as session:
-            worker = Worker(config, Lying(session) if lies else session)  # type: ignore[arg-type]
+            worker = Worker(config, Forging(session, LIES["the last bit"]) if lies else session)  # type: ignore[arg-type]
             worker.join()
             while not worker.inbox.runs and not stop.is_set():
                 worker.turn()

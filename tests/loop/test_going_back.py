@@ -1,0 +1,171 @@
+"""A run goes back to before an expelled host's first answer: what a liar costs, and that nothing of it is left."""
+
+import threading
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hosts import LIES, Late, file_of, finished, host, placed, refused, shifted, tls
+from recordings import generations
+
+from farm.net.session import listen
+from farm.net.tls import find
+from farm.net.work import Results
+from learner.commands import learner as learner_command
+from learner.run import checkpoint as checkpoints
+from learner.run import config as configs
+from learner.run.checkpoint import Checkpoint
+from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
+from learner.run.launch import open_run
+from learner.run.states import RolledBack
+
+
+def all_but_the_best(values: np.ndarray) -> np.ndarray:
+    return np.where(values == values.max(), values, values - 0.01 * abs(values))
+
+
+UNDONE = {
+    "the last bit": Late(LIES["the last bit"], 4),
+    "one percent": Late(LIES["one percent"], 4),
+    "one message in three": Late(LIES["the last bit"], 4, lambda sent: sent % 3 == 0),
+    "all but its best": Late(shifted(all_but_the_best), 4),
+}
+
+
+@pytest.mark.parametrize("lie", UNDONE.values(), ids=UNDONE)
+def test_a_liar_costs_time_and_no_number(
+    certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture, lie: Late
+) -> None:
+    """The liar is alone at first, so that its lies are in the state when the second host comes."""
+    config, file = replace(config, generations=12), file_of(config)
+    place = placed(certs, 1.0)
+    with open_run(config, tmp_path / "honest", place) as run, host(place.listen, certs, "a", file):
+        honest = finished(run)
+    place, rows, hosts = placed(certs, 1.0), list[int](), ExitStack()
+    joining, answered = threading.Event(), threading.Event()
+
+    def waiting(said: Any) -> Any:
+        if joining.is_set():  # the second host builds the task first, which takes longer than the run
+            answered.wait(30)
+        return lie(said)
+
+    def answering(said: Any) -> Any:
+        if isinstance(said, Results):
+            answered.set()
+        return said
+
+    with hosts:
+        with open_run(config, tmp_path / "r", place) as run:
+            hosts.enter_context(host(place.listen, certs, "liar", file, waiting))
+            learning = run.learn()
+            rows.extend(next(learning).generation for _ in range(6))  # at least one lie is in them
+            joining.set()
+            hosts.enter_context(host(place.listen, certs, "a", file, answering))
+            with pytest.raises(RolledBack):
+                rows.extend(report.generation for report in learning)
+        assert rows[-1] >= 6
+        with open_run(config, tmp_path / "r", place, resume=True) as run:
+            assert run.learner.state.generation == 0, "the liar answered in the first generation"
+            assert finished(run) == honest
+    lines = run.learner.folder.progress()
+    assert [line.generation for line in lines] == list(range(1, 13)), "none is doubled"
+    assert [line.rollouts for line in lines] == [12 * each for each in range(1, 13)]
+    assert run.summary["undone"] == rows[-1]
+    assert refused(caplog) == {"liar"}
+    assert len(run.learner.folder.parameters.rows()) == 12
+
+
+def test_a_run_goes_back_no_further_than_the_liars_first_answer(
+    certs: Path, config: RunConfig, honest: str, tmp_path: Path
+) -> None:
+    place, file = placed(certs, 1.0), file_of(config)
+    with open_run(replace(config, generations=3), tmp_path / "r", place) as run, host(place.listen, certs, "a", file):
+        finished(run)
+    place = placed(certs, 1.0)
+    with open_run(config, tmp_path / "r", place, resume=True) as run, ExitStack() as hosts:
+        hosts.enter_context(host(place.listen, certs, "liar", file, LIES["the last bit"]))
+        with pytest.raises(RolledBack, match="generation 3,"):
+            finished(run)
+    place = placed(certs, 1.0)
+    with open_run(config, tmp_path / "r", place, resume=True) as run, host(place.listen, certs, "a", file):
+        assert run.learner.state.generation == 3
+        assert finished(run) == honest
+    assert sorted(each.name for each in (tmp_path / "r" / "states").iterdir()) == ["0", "3"]
+
+
+def test_an_expelled_host_is_not_admitted_by_a_resume(
+    certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    place, file, lie = placed(certs, 1.0), file_of(config), LIES["the last bit"]
+    with open_run(replace(config, generations=3), tmp_path / "r", place) as run, ExitStack() as hosts:
+        hosts.enter_context(host(place.listen, certs, "liar", file, lie))
+        hosts.enter_context(host(place.listen, certs, "a", file))
+        finished(run)
+    kept = checkpoints.load(run.learner.folder.checkpoint).expelled
+    assert list(kept) == ["liar"]
+    caplog.clear()
+    place = placed(certs, 0.0)
+    with open_run(config, tmp_path / "r", place, resume=True) as run, ExitStack() as hosts:
+        hosts.enter_context(host(place.listen, certs, "liar", file, lie))
+        hosts.enter_context(host(place.listen, certs, "a", file))
+        assert finished(run) == honest
+    assert refused(caplog) == {"liar"}
+    assert f"is refused: {kept['liar']}" in caplog.text
+
+
+def test_an_expulsion_is_saved_before_the_generation_ends(certs: Path, config: RunConfig, tmp_path: Path) -> None:
+    place, file = placed(certs, 1.0), file_of(config)
+    with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
+        learner, saved = run.learner, list[tuple[int, list[str]]]()
+        save = type(learner.folder).save
+
+        def noted(folder: RunFolder, at: Checkpoint, **how: bool) -> None:
+            save(folder, at, **how)
+            saved.append((at.state["generation"], list(checkpoints.load(folder.checkpoint).expelled)))
+
+        hosts.enter_context(host(place.listen, certs, "liar", file, LIES["one percent"]))
+        hosts.enter_context(host(place.listen, certs, "a", file))
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(RunFolder, "save", noted)
+            finished(run)
+    first = next(at for at, (_, expelled) in enumerate(saved) if expelled)
+    before, after = saved[first - 1] if first else (0, []), saved[first]
+    assert after[0] == before[0], "it is saved with the state from before the generation under way"
+
+
+def test_the_command_goes_on_by_itself_and_no_generation_is_recorded_twice(
+    certs: Path, config: RunConfig, honest: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoint, bundle, file = tls(), find(certs, "learner"), file_of(config)
+    monkeypatch.chdir(tmp_path)
+    words = [*configs.flags(config), "--connect", endpoint, "--tls", str(certs / "learner"), "--audit", "1"]
+    lied, hosts = threading.Event(), ExitStack()
+
+    def lie(said: Any) -> Any:
+        if isinstance(said, Results) and said.round > 3:
+            lied.set()
+            return LIES["the last bit"](said)
+        return said
+
+    def come() -> None:
+        assert lied.wait(30)
+        hosts.enter_context(host(endpoint, certs, "a", file))
+
+    with listen(endpoint, "farm", bundle), hosts:
+        hosts.enter_context(host(endpoint, certs, "liar", file, lie))
+        coming = threading.Thread(target=come)
+        coming.start()
+        assert learner_command.main([*words, "--name", "r", "--quiet"]) == 0
+        coming.join()
+    folder = RunFolder(tmp_path / "runs" / "r")
+    summary = folder.read_summary()
+    assert summary is not None
+    assert (summary["parameters_sha256"], summary["generations"], summary["state"]) == (honest, 6, "finished")
+    assert summary["undone"] > 0
+    assert generations(folder.recording) == list(range(1, 7))
+    assert generations(folder.path / "undone.rrd") == list(range(1, summary["undone"] + 1))
+    assert "the run goes back to generation 0" in (folder.path / "log.txt").read_text()
