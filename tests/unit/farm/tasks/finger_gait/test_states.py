@@ -1,8 +1,13 @@
-"""The four state bases: sizes, the order of their parts, and independence of rows."""
+"""The four state bases: sizes, the order of their parts, scales and noise, and independence of rows."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gait import Frames, task
 
+from farm.tasks.finger_gait import touch as tactile
+from farm.tasks.finger_gait.hand import TIP_RADIUS
 from farm.tasks.finger_gait.observations import STATES, Felt
 
 SIZES = {"joints": 8, "joints+contacts": 17, "tactile": 54, "joints+tactile": 62}
@@ -53,3 +58,54 @@ def test_forces_are_what_the_taxels_add_up_to():
     np.testing.assert_array_equal(
         STATES["cop"].observe(felt), np.concatenate([points.reshape(len(joints), -1), images.sum(axis=-1)], axis=1)
     )
+
+
+def some_frames(count=4, seed=5):
+    rng = np.random.default_rng(seed)
+    force = rng.exponential(1.0, (count, 3, 4)) * (rng.random((count, 3, 4)) < 0.5)
+    place = rng.normal(size=(count, 3, 4, 3)) * TIP_RADIUS
+    return Frames(rng.uniform(0, 1, (count, 15)), force, place)
+
+
+def observed(made, some, noise):
+    sim = SimpleNamespace(qpos=some.qpos, force=some.force, place=some.place, t=0, own={"noise": noise[:, None]})
+    return made.observe(sim)
+
+
+@pytest.mark.parametrize("state", SIZES)
+def test_observations_are_scaled_part_by_part(state):
+    some = some_frames()
+    noise = np.random.default_rng(1).normal(size=(4, 8))
+    scaled = observed(task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0), some, noise)
+    images = tactile.image(some.force, some.place)
+    wanted = {
+        "joints": 2.0 * (some.qpos[:, :8] + noise),
+        "contacts": 3.0 * tactile.contact_points(images).reshape(4, 9),
+        "tactile": 5.0 * images.reshape(4, 54),
+    }
+    np.testing.assert_allclose(scaled, np.concatenate([wanted[part] for part in state.split("+")], axis=1), rtol=1e-12)
+
+
+@pytest.mark.parametrize("state", SIZES)
+def test_noise_is_in_the_joint_readings_only(state):
+    some = some_frames()
+    before = some.qpos.copy()
+    noise = np.random.default_rng(1).normal(size=(4, 8))
+    made = task(state=state)
+    quiet, noisy = observed(made, some, np.zeros((4, 8))), observed(made, some, noise)
+    count = 8 if state.startswith("joints") else 0
+    np.testing.assert_array_equal(noisy[:, count:], quiet[:, count:])
+    np.testing.assert_allclose(noisy[:, :count] - quiet[:, :count], noise[:, :count], atol=1e-15)
+    np.testing.assert_array_equal(some.qpos, before)
+
+
+@pytest.mark.parametrize("state", SIZES)
+def test_observations_of_a_batch_equal_one_by_one_bit_for_bit(state):
+    some = some_frames(32)
+    noise = np.random.default_rng(1).normal(size=(32, 8))
+    made = task(state=state, tactile_scale=0.3)
+    x = observed(made, some, noise)
+    for i in range(32):
+        own = Frames(some.qpos[i : i + 1], some.force[i : i + 1], some.place[i : i + 1])
+        alone = observed(made, own, noise[i : i + 1])
+        assert alone[0].tobytes() == x[i].tobytes()
