@@ -13,7 +13,7 @@ from farm.sim.channels import Camera, Channel
 from farm.sim.rendering import beside
 from farm.sim.scene import Scene
 from farm.tasks.base import TaskSpec
-from learner.recording.channels import entities, path, title
+from learner.recording.channels import Panel, entities, panels, title
 
 FOLLOWED: Final = "/world/view"
 """Entity that the eye follows, an invisible point: a body without a geometry of its own cannot be followed."""
@@ -168,14 +168,7 @@ def _picture(origin: str, name: str) -> rrb.View:
 
 
 def _images(spec: TaskSpec) -> list[rrb.View]:
-    """One view per image; with several channels the names are CHANNEL LABEL."""
-    channels, views = [channel for channel in spec.channels if channel.kind == "images"], []
-    for channel in channels:
-        before = f"{title(channel)} " if len(channels) > 1 or not channel.labels else ""
-        for label, entity in zip(channel.names, entities(channel), strict=True):
-            name = before + label
-            views.append(_picture(entity, name[:1].upper() + name[1:]))
-    return views
+    return [_picture(each.origin, each.name) for each in panels(spec.channels, "picture")]
 
 
 def _config() -> rrb.View:
@@ -234,20 +227,23 @@ def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-_MARGIN * horizon),
         end=rr.TimeRangeBoundary.cursor_relative(seconds=horizon),
     )
-    curves = [("/reward/terms", "Reward terms", len(spec.terms)), ("/actions", "Actions", spec.action)]
-    curves += [(path(c.name), title(c), c.shape[0] + 2 * len(c.limits)) for c in spec.channels if c.kind == "scalars"]
+    curves = [
+        Panel("curves", "/reward/terms", "Reward terms", len(spec.terms)),
+        Panel("curves", "/actions", "Actions", spec.action),
+        *panels(spec.channels, "curves"),
+    ]
     plots: list[rrb.View] = [
         rrb.TimeSeriesView(
-            origin=origin,
-            name=name,
+            origin=each.origin,
+            name=each.name,
             time_ranges=window,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=count <= _LEGEND),
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=each.legend <= _LEGEND),
         )
-        for origin, name, count in curves
+        for each in curves
     ]
     # A window would not move these lanes' axis, only clear the rest of it.
     lanes: list[rrb.View] = [
-        rrb.StateTimelineView(origin=path(c.name), name=title(c)) for c in spec.channels if c.kind == "flags"
+        rrb.StateTimelineView(origin=each.origin, name=each.name) for each in panels(spec.channels, "lanes")
     ]
     return _stacked(plots, lanes, "Rollout")
 

@@ -1,13 +1,8 @@
-"""A task's channels as Rerun entities, by kind: static parts, and columns for a rollout's frames.
+"""A task's channels in Rerun, a class per kind: what is logged once, columns for a rollout's frames, and views."""
 
-Scalars are curves at /NAME and their limits constant lines at /NAME/limits, flags state lanes at /NAME/LABEL, images
-pictures at /NAME/LABEL (and with places points on their bodies, at /world/BODY/NAME), arrows and points are at
-/world/NAME.
-"""
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -29,38 +24,28 @@ _OFF: Final = (52, 54, 58)
 _ARROW: Final = (255, 255, 255)  # of arrows without colours
 
 
+class Panel(NamedTuple):
+    """A view beside the scene."""
+
+    kind: Literal["curves", "lanes", "picture"]
+    origin: str
+    name: str
+    legend: int = 0
+    """Entries of its legend."""
+
+
 class ChannelDrawing:
-    """How one channel is drawn."""
+    """How one channel is drawn: a subclass for each kind."""
 
     def __init__(self, channel: Channel, scene: Scene) -> None:
-        self._channel = channel
-        self._bodies = [scene.index(body) for body in channel.bodies]
-        self._size = scene.radius
-        name = path(channel.name)
-        self._entity = f"/world{name}" if channel.kind in ("arrows", "points") else name
-        self._on = [] if channel.places is None else _on_bodies(channel, [scene.bodies[i] for i in self._bodies])
+        self.channel = channel
+        self.entity = path(channel.name)
+        self.size = scene.radius
+        self.bodies = [scene.index(body) for body in channel.bodies]
 
     def static(self) -> Iterator[tuple[str, Any]]:
         """Entities and archetypes that are logged once."""
-        channel = self._channel
-        colours = channel.colours or palette(channel.shape[0])
-        if channel.kind == "scalars":
-            yield self._entity, lines(channel.names, colours)
-            if channel.limits:
-                of = [lighter(colours[channel.names.index(label)]) for label in channel.limits for _ in range(2)]
-                yield f"{self._entity}/limits", lines(limits(channel), of, width=1.5)
-        elif channel.kind == "flags":
-            for entity, colour in zip(entities(channel), colours, strict=True):
-                yield entity, rr.StateConfiguration(values=STATES, colors=[_OFF, colour])
-        elif channel.kind == "images":
-            _, height, width = channel.shape
-            size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
-            style = rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)
-            for entity in entities(channel):
-                yield entity, style
-                yield from scale(entity, width, height, channel.top, channel.unit)
-            for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
-                yield entity, rr.Points3D.from_fields(positions=places, radii=POINT_RADIUS * self._size)
+        yield from ()
 
     def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:
         """A rollout's frames, or those of several that are joined.
@@ -70,20 +55,129 @@ class ChannelDrawing:
           bodies: (F, B, 7) poses of the drawn bodies [m], quaternions wxyz.
           begins: (F,) number of the rollout that the frame belongs to.
         """
-        match self._channel.kind:
-            case "scalars":
-                yield Columns(self._entity, scalars(values))
-                if self._channel.limits:
-                    ends = np.array([each for pair in self._channel.limits.values() for each in pair])
-                    yield Columns(f"{self._entity}/limits", scalars(np.tile(ends, (len(values), 1))))
-            case "flags":
-                yield from self._flags(values, begins)
-            case "images":
-                yield from self._images(values)
-            case "arrows":
-                yield Columns(self._entity, self._arrows(values, bodies))
-            case "points":
-                yield Columns(self._entity, self._points(values, bodies))
+        raise NotImplementedError
+
+    def curves(self) -> Mapping[str, int]:
+        """Its entities that are curves, and how many each is."""
+        return {}
+
+    @classmethod
+    def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
+        """Its views beside the scene; `alone`: no other channel is of its kind."""
+        return ()
+
+    def in_world(self, places: FloatArray, bodies: FloatArray) -> FloatArray:
+        """Convert positions in the frames of the channel's bodies to the world's (F, n, 3)."""
+        if not self.bodies:
+            return places
+        poses = bodies[:, self.bodies]
+        return poses[..., :3] + rotate(poses[..., 3:], places)
+
+
+class Scalars(ChannelDrawing):
+    """Curves at /NAME, and their limits as constant lines at /NAME/limits."""
+
+    def static(self) -> Iterator[tuple[str, Any]]:
+        """Names and colours."""
+        channel = self.channel
+        colours = channel.colours or palette(channel.shape[0])
+        yield self.entity, lines(channel.names, colours)
+        if channel.limits:
+            of = [lighter(colours[channel.names.index(label)]) for label in channel.limits for _ in range(2)]
+            yield f"{self.entity}/limits", lines(limits(channel), of, width=1.5)
+
+    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+        """Values, and limits."""
+        yield Columns(self.entity, scalars(values))
+        if self.channel.limits:
+            ends = np.array([each for pair in self.channel.limits.values() for each in pair])
+            yield Columns(f"{self.entity}/limits", scalars(np.tile(ends, (len(values), 1))))
+
+    def curves(self) -> Mapping[str, int]:
+        """Values, and limits."""
+        both = {self.entity: self.channel.shape[0], f"{self.entity}/limits": 2 * len(self.channel.limits)}
+        return {entity: count for entity, count in both.items() if count}
+
+    @classmethod
+    def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
+        """One plot."""
+        return (Panel("curves", path(channel.name), title(channel), channel.shape[0] + 2 * len(channel.limits)),)
+
+
+class Flags(ChannelDrawing):
+    """State lanes at /NAME/LABEL."""
+
+    def static(self) -> Iterator[tuple[str, Any]]:
+        """Names and colours."""
+        colours = self.channel.colours or palette(self.channel.shape[0])
+        for entity, colour in zip(entities(self.channel), colours, strict=True):
+            yield entity, rr.StateConfiguration(values=STATES, colors=[_OFF, colour])
+
+    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+        """Changes, and where a rollout begins."""
+        for entity, flags in zip(entities(self.channel), (values > 0).T, strict=True):
+            rows = changes(2 * begins + flags)
+            yield Columns(entity, rr.StateChange.columns(state=[STATES[int(flags[row])] for row in rows]), rows)
+
+    @classmethod
+    def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
+        """One view with all lanes."""
+        return (Panel("lanes", path(channel.name), title(channel)),)
+
+
+class Images(ChannelDrawing):
+    """Pictures at /NAME/LABEL; with places also points on their bodies, at /world/BODY/NAME."""
+
+    def __init__(self, channel: Channel, scene: Scene) -> None:
+        super().__init__(channel, scene)
+        self._on = [] if channel.places is None else _on_bodies(channel, [scene.bodies[i] for i in self.bodies])
+
+    def static(self) -> Iterator[tuple[str, Any]]:
+        """Sizes and colours, and places."""
+        channel = self.channel
+        _, height, width = channel.shape
+        size = rr.components.ImageFormat(width=width, height=height, channel_datatype="F32")
+        style = rr.DepthImage.from_fields(format=size, depth_range=(0.0, channel.top), **_STYLE)
+        for entity in entities(channel):
+            yield entity, style
+            yield from scale(entity, width, height, channel.top, channel.unit)
+        for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
+            yield entity, rr.Points3D.from_fields(positions=places, radii=POINT_RADIUS * self.size)
+
+    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+        """Pixels, in pictures and on bodies."""
+        for entity, image in zip(entities(self.channel), np.moveaxis(values, 1, 0), strict=True):
+            pixels = np.ascontiguousarray(image.reshape(len(image), -1), dtype=np.float32)
+            yield Columns(entity, rr.DepthImage.columns(buffer=pixels.view(np.uint8)))
+        for i, entity in enumerate(self._on):
+            pixels = values[:, i].reshape(len(values), -1)
+            colours = rr.Points3D.columns(colors=ramp(pixels.reshape(-1), self.channel.top))
+            yield Columns(entity, colours.partition(np.full(len(pixels), pixels.shape[1])))
+
+    @classmethod
+    def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:
+        """One per image; with several channels of images the names are CHANNEL LABEL."""
+        before = "" if alone and channel.labels else f"{title(channel)} "
+        names = (before + label for label in channel.names)
+        pairs = zip(entities(channel), names, strict=True)
+        return [Panel("picture", entity, name[:1].upper() + name[1:]) for entity, name in pairs]
+
+
+class Arrows(ChannelDrawing):
+    """Arrows at /world/NAME."""
+
+    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+        """All but those of length 0."""
+        origins, vectors = self.arrows(values, bodies)
+        visible = (vectors != 0).any(axis=-1)
+        colours = [pack(colour) for colour in self.channel.colours or [_ARROW] * values.shape[1]]
+        columns = rr.Arrows3D.columns(
+            origins=origins[visible],
+            vectors=vectors[visible],
+            colors=np.broadcast_to(np.array(colours, np.uint32), visible.shape)[visible],
+            radii=np.full(int(visible.sum()), ARROW_RADIUS * self.size),
+        )
+        yield Columns(f"/world{self.entity}", columns.partition(visible.sum(axis=1)))
 
     def arrows(self, values: FloatArray, bodies: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Origins [m] and vectors [m] of arrows in the world, (F, n, 3) each.
@@ -92,52 +186,37 @@ class ChannelDrawing:
           values: (F, n, 6) starts [m] and vectors [unit] in the frames of the channel's bodies.
           bodies: (F, B, 7) poses of the drawn bodies [m], quaternions wxyz.
         """
-        vectors = self._channel.vectors(values)
-        if self._bodies:
-            vectors = rotate(bodies[:, self._bodies, 3:], vectors)
-        return self._in_world(values[..., :3], bodies), vectors
+        vectors = self.channel.vectors(values)
+        if self.bodies:
+            vectors = rotate(bodies[:, self.bodies, 3:], vectors)
+        return self.in_world(values[..., :3], bodies), vectors
 
-    def _in_world(self, places: FloatArray, bodies: FloatArray) -> FloatArray:
-        """Convert positions in the frames of the channel's bodies to the world's (F, n, 3)."""
-        if not self._bodies:
-            return places
-        poses = bodies[:, self._bodies]
-        return poses[..., :3] + rotate(poses[..., 3:], places)
 
-    def _flags(self, values: FloatArray, begins: IntArray) -> Iterator[Columns]:
-        for entity, flags in zip(entities(self._channel), (values > 0).T, strict=True):
-            rows = changes(2 * begins + flags)  # and where a rollout begins
-            yield Columns(entity, rr.StateChange.columns(state=[STATES[int(flags[row])] for row in rows]), rows)
+class Points(ChannelDrawing):
+    """Points at /world/NAME."""
 
-    def _images(self, values: FloatArray) -> Iterator[Columns]:
-        for entity, image in zip(entities(self._channel), np.moveaxis(values, 1, 0), strict=True):
-            pixels = np.ascontiguousarray(image.reshape(len(image), -1), dtype=np.float32)
-            yield Columns(entity, rr.DepthImage.columns(buffer=pixels.view(np.uint8)))
-        for i, entity in enumerate(self._on):
-            pixels = values[:, i].reshape(len(values), -1)
-            colours = rr.Points3D.columns(colors=ramp(pixels.reshape(-1), self._channel.top))
-            yield Columns(entity, colours.partition(np.full(len(pixels), pixels.shape[1])))
-
-    def _arrows(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
-        origins, vectors = self.arrows(values, bodies)
-        visible = (vectors != 0).any(axis=-1)
-        colours = [pack(colour) for colour in self._channel.colours or [_ARROW] * values.shape[1]]
-        columns = rr.Arrows3D.columns(
-            origins=origins[visible],
-            vectors=vectors[visible],
-            colors=np.broadcast_to(np.array(colours, np.uint32), visible.shape)[visible],
-            radii=np.full(int(visible.sum()), ARROW_RADIUS * self._size),
-        )
-        return columns.partition(visible.sum(axis=1))
-
-    def _points(self, values: FloatArray, bodies: FloatArray) -> rr.ComponentColumnList:
+    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+        """Positions, and values as colours."""
         frames, count, _ = values.shape
         columns = rr.Points3D.columns(
-            positions=self._in_world(values[..., :3], bodies).reshape(-1, 3),
-            colors=ramp(values[..., 3].reshape(-1), self._channel.top),
-            radii=np.full(frames * count, 2 * POINT_RADIUS * self._size),
+            positions=self.in_world(values[..., :3], bodies).reshape(-1, 3),
+            colors=ramp(values[..., 3].reshape(-1), self.channel.top),
+            radii=np.full(frames * count, 2 * POINT_RADIUS * self.size),
         )
-        return columns.partition(np.full(frames, count))
+        yield Columns(f"/world{self.entity}", columns.partition(np.full(frames, count)))
+
+
+KINDS: Final[Mapping[str, type[ChannelDrawing]]] = {
+    "scalars": Scalars, "flags": Flags, "images": Images, "arrows": Arrows, "points": Points,
+}  # fmt: skip
+"""What draws each kind of channel."""
+
+
+def panels(channels: Sequence[Channel], kind: str) -> list[Panel]:
+    """The panels of this kind of some channels."""
+    kinds = [channel.kind for channel in channels]
+    each = (KINDS[one.kind].panels(one, alone=kinds.count(one.kind) == 1) for one in channels)
+    return [panel for some in each for panel in some if panel.kind == kind]
 
 
 def path(name: str) -> str:

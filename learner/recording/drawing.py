@@ -18,7 +18,7 @@ from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
 from farm.tasks.standard import start
 from learner.recording.blueprint import FOLLOWED, Eye
-from learner.recording.channels import ChannelDrawing, path
+from learner.recording.channels import KINDS
 from learner.recording.curves import Columns, lines, scalars
 from learner.recording.solids import solid, xyzw
 from learner.run.setup import Problem
@@ -36,7 +36,7 @@ class Drawing:
     def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None) -> None:
         """Draw a scene with its task's channels; seen from a camera, or (None) from the side of the moving bodies."""
         self.scene, self.spec, self.camera = scene, spec, camera
-        self._channels = {channel.name: ChannelDrawing(channel, scene) for channel in spec.channels}
+        self._channels = {channel.name: KINDS[channel.kind](channel, scene) for channel in spec.channels}
         self._some = [each for each in scene.geometries() if each.models]  # that not every model has
 
     @classmethod
@@ -125,10 +125,8 @@ class Drawing:
     def gaps(self, count: int) -> Iterator[Columns]:
         """Rows that break the curves: without them the viewer draws a line from each rollout to the next one."""
         widths = {"/reward/terms": len(self.spec.terms), "/actions": self.spec.action}
-        for channel in (channel for channel in self.spec.channels if channel.kind == "scalars"):
-            widths[path(channel.name)] = channel.shape[0]
-            if channel.limits:
-                widths[f"{path(channel.name)}/limits"] = 2 * len(channel.limits)
+        for channel in self._channels.values():
+            widths |= channel.curves()
         for entity, width in widths.items():
             yield Columns(entity, scalars(np.full((count, width), np.nan)))
 

@@ -14,7 +14,7 @@ from farm.sim.scene import MODEL, Geometry, Scene
 from farm.sim.trajectory import Trajectory, joined
 from farm.tasks.base import Camera, Channel, TaskSpec
 from learner.recording.blueprint import Eye
-from learner.recording.channels import ChannelDrawing, changes, title
+from learner.recording.channels import Arrows, changes, title
 from learner.recording.curves import ramp
 from learner.recording.drawing import Drawing
 from learner.recording.solids import ENDLESS, rotate, solid
@@ -112,7 +112,7 @@ def test_arrows_stand_on_their_bodies(written, scene):
 
 def test_long_arrows_are_cut(scene):
     channel = Channel(name="a", kind="arrows", shape=(1, 6), length=2.0, longest=0.5)
-    _, vectors = ChannelDrawing(channel, scene).arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
+    _, vectors = Arrows(channel, scene).arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
     np.testing.assert_allclose(vectors, [[[0.3, 0.0, 0.4]]])
 
 
