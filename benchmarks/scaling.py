@@ -39,7 +39,7 @@ from farm.net import codec, keys, session
 from farm.net.events import Event, Events
 from farm.net.messages import Spec
 from farm.net.session import free_endpoint
-from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated, traced
+from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated, rows_with_trace
 from farm.policies.base import Policy
 from farm.rollouts import served
 from farm.sim.scene import Scene
@@ -70,11 +70,11 @@ class MadeUp:
         """Invent results."""
         returns = jobs.theta(mu).sum(axis=1)
         exploring = ~np.repeat(jobs.seen, jobs.rollouts)
-        rows = traced(traces if self.spec.traced else "none", returns, exploring)
+        rows = rows_with_trace(traces if self.spec.trace_channels else "none", returns, exploring)
         seen = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
         flags = np.zeros((len(returns), 4), dtype=bool)
         steps = np.full(len(returns), self.spec.steps)
-        felt = np.zeros((len(rows), *self.spec.trace), "<f4")
+        felt = np.zeros((len(rows), *self.spec.trace_shape), "<f4")
         return Simulated(returns=returns, flags=flags, steps=steps, traces=felt, trajectories=seen)
 
     def _trajectory(self, *, physics: bool) -> Trajectory:

@@ -12,7 +12,7 @@ from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, UnservedError
 from farm.moments import usable
 from farm.net.messages import Spec
-from farm.net.work import NOT_NORMALISED, Jobs, Simulated, traced
+from farm.net.work import NOT_NORMALISED, Jobs, Simulated, rows_with_trace
 from farm.policies.base import Policy, check_vector
 from farm.policies.normalised import Normalised
 from farm.sim.engines import BatchEngine
@@ -104,8 +104,8 @@ class Runner:
                 trajectories[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
             done.append((rows, rollouts))
         returns = _placed(done, lambda part: part.returns)
-        wanted_traces = traces if self.spec.traced or traces == "steps" else "none"
-        selection = traced(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        wanted_traces = traces if self.spec.trace_channels or traces == "steps" else "none"
+        selection = rows_with_trace(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
             returns=returns,
             flags=_placed(done, lambda part: part.flags),
@@ -121,7 +121,7 @@ class Runner:
 
     def _traces(self, done: "list[_Part]", selection: IntArray, *, steps: bool) -> AnyArray:
         """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
-        values = np.zeros((len(selection), *(whole(self.spec) if steps else self.spec.trace)), dtype="<f4")
+        values = np.zeros((len(selection), *(whole(self.spec) if steps else self.spec.trace_shape)), dtype="<f4")
         traces = stepped if steps else loop.traces
         for rows, rollouts in done if len(selection) else ():
             mask = np.isin(selection, rows)

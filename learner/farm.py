@@ -72,7 +72,7 @@ class Evaluated:
     """Each reward term's part of the return, discounted and scaled (B, K): they add up to it, but for rounding; zeros
     if the return was clamped"""
     traces: AnyArray | None
-    """Values of the traced channels, float32, zero after the end (B, T, N); None if they were not requested"""
+    """Values of the channels with trace=True, float32, zero after the end (B, T, N); None if they were not requested"""
 
 
 class Farm:
@@ -198,11 +198,11 @@ class Farm:
         """
         theta, spec = self._parameters(thetas), self._problem.spec
         words = self._seeds(seeds, len(theta))
-        if traces and not spec.traced:
+        if traces and not spec.trace_channels:
             raise ConfigError("traces: no channel of the task has trace=True")
         count = len(theta)
         if not count:
-            sizes = ((0,), (0, len(spec.measures)), (0, len(spec.terms)), (0, *spec.trace))
+            sizes = ((0,), (0, len(spec.measures)), (0, len(spec.terms)), (0, *spec.trace_shape))
             none, measures, terms, trace = (np.zeros(size) for size in sizes)
             flags, empty = none.astype(bool), trace.astype("<f4") if traces else None
             return Evaluated(none, measures, flags if spec.success else None, flags, none.astype(int), terms, empty)

@@ -127,20 +127,20 @@ def _renew(command: CertificatesCommand) -> None:
 def _issue(
     command: CertificatesCommand,
     authority: "_Authority",
-    wanted: list[tuple[Role, str]],
+    identities: list[tuple[Role, str]],
     roster: dict[str, list[str]],
     hosts: tuple[str, ...] | None = None,
 ) -> None:
     """Make bundles, all or none, update the list of admitted names, and print the new folders."""
     with ExitStack() as undo:
         moves = []
-        for role, name in wanted:
+        for role, name in identities:
             folder = command.dir / (LEARNER if role == "learner" else f"{role}-{name}")
             aside = command.dir / f".{folder.name}.new"
             shutil.rmtree(aside, ignore_errors=True)
             undo.callback(shutil.rmtree, aside, ignore_errors=True)
-            names = () if role != "learner" else command.learner if hosts is None else hosts
-            authority.issue(aside, role, name, command.days, names)
+            addresses = () if role != "learner" else command.learner if hosts is None else hosts
+            authority.issue(aside, role, name, command.days, addresses)
             moves.append((aside, folder))
             roster[f"{role}s"] = sorted({name, *roster.get(f"{role}s", [])})
         for aside, folder in moves:

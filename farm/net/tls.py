@@ -186,14 +186,14 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
     """What a worker may send and receive."""
-    mine, rounds = f"{name}/**", keys.generation(farm, "*")
+    topics, rounds = f"{name}/**", keys.generation(farm, "*")
     queries = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), keys.asset(farm, "*", "*"), rounds]
-    messages = [keys.inbox(farm, mine), keys.refused(farm, mine), rounds]
+    messages = [keys.inbox(farm, topics), keys.refused(farm, topics), rounds]
     return [
-        ("ingress", ["put"], [keys.want(farm, mine), keys.result(farm, "*", mine)]),
+        ("ingress", ["put"], [keys.want(farm, topics), keys.result(farm, "*", topics)]),
         ("ingress", ["declare_subscriber"], messages),
         ("ingress", ["query"], queries),
-        ("ingress", _TOKENS, [keys.worker_token(farm, mine)]),
+        ("ingress", _TOKENS, [keys.worker_token(farm, topics)]),
         ("ingress", _WATCHES, [keys.learner_token(farm, "*")]),
         ("egress", ["put"], messages),
         ("egress", ["reply", "declare_queryable"], queries),

@@ -204,7 +204,7 @@ class Simulated:
     """Results of jobs: one array of each kind over all their S rollouts, in the jobs' order.
 
     The receiver derives each job's number of rollouts, and which of them have a trajectory or a trace, from the jobs
-    that it issued (`traced`). One map per job would take the learner ten times as long to read.
+    that it issued (`rows_with_trace`). One map per job would take the learner ten times as long to read.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -216,7 +216,7 @@ class Simulated:
     steps: IntArray = array("<i8", 1)
     """Control steps, (S,)"""
     traces: AnyArray = array("<f4", 3)
-    """Of the K rollouts selected by `traced`, (K, T, N)"""
+    """Of the K rollouts selected by `rows_with_trace`, (K, T, N)"""
     moments: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or return a trajectory.
     (0, 0) if observations are not normalised"""
@@ -275,7 +275,7 @@ class Results(Simulated):
         return cls(**head, seconds=seconds, jobs=np.ascontiguousarray(jobs.indices), **vars(simulated))
 
 
-def traced(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
+def rows_with_trace(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
     """Indices of a message's rollouts that have a trace, ascending (K,).
 
     Args:

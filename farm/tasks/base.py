@@ -93,14 +93,14 @@ class TaskSpec:
         return shapes | {f"channels/{channel.name}": channel.shape for channel in self.channels}
 
     @property
-    def traced(self) -> tuple[Channel, ...]:
+    def trace_channels(self) -> tuple[Channel, ...]:
         """The channels whose values are sent with results."""
         return tuple(channel for channel in self.channels if channel.trace)
 
     @property
-    def trace(self) -> tuple[int, int]:
-        """Shape of a rollout's trace: control steps, and numbers per step (0 if there are no traced channels)."""
-        return self.steps, sum(int(np.prod(channel.shape)) for channel in self.traced)
+    def trace_shape(self) -> tuple[int, int]:
+        """Shape of a rollout's trace: control steps, and numbers per step (0 if no channel is sent)."""
+        return self.steps, sum(int(np.prod(channel.shape)) for channel in self.trace_channels)
 
 
 @dataclass(frozen=True)

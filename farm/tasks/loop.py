@@ -372,9 +372,9 @@ def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
 
 def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> AnyArray:
     """The traces of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
-    if not spec.traced or not len(rows):
-        return np.zeros((len(rows), *spec.trace), dtype="<f4")
-    values = flat(spec.traced, task.show({name: frames[rows] for name, frames in rollouts.frames.items()}))
+    if not spec.trace_channels or not len(rows):
+        return np.zeros((len(rows), *spec.trace_shape), dtype="<f4")
+    values = flat(spec.trace_channels, task.show({name: frames[rows] for name, frames in rollouts.frames.items()}))
     values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
     return values
 

@@ -76,7 +76,9 @@ def _run(spec: TaskSpec, eye: Eye, curves: str) -> rrb.Container:
     """`curves` is the name of the tab of the learning curves."""
     pictures = rrb.Horizontal(*_images(spec), name="Images")
     traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
-    parts = [part for part, present in ((pictures, bool(_images(spec))), (traces, bool(spec.traced))) if present]
+    parts = [
+        part for part, present in ((pictures, bool(_images(spec))), (traces, bool(spec.trace_channels))) if present
+    ]
     left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
     horizon = spec.steps * spec.period

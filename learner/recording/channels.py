@@ -216,7 +216,7 @@ def panels(channels: Sequence[Channel], kind: str) -> list[Panel]:
     """The panels of this kind of some channels."""
     kinds = [channel.kind for channel in channels]
     each = (KINDS[one.kind].panels(one, alone=kinds.count(one.kind) == 1) for one in channels)
-    return [panel for some in each for panel in some if panel.kind == kind]
+    return [panel for group in each for panel in group if panel.kind == kind]
 
 
 def path(name: str) -> str:
@@ -276,11 +276,11 @@ def labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Po
 
 def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
     """Style and labels of a trace's pictures: names of their rows, their duration, and their colours."""
-    steps, rows = spec.trace
+    steps, rows = spec.trace_shape
     size = rr.components.ImageFormat(width=steps, height=rows, channel_datatype="F32")
-    yield entity, rr.DepthImage.from_fields(format=size, depth_range=(0.0, spec.traced[0].top), **_STYLE)
+    yield entity, rr.DepthImage.from_fields(format=size, depth_range=(0.0, spec.trace_channels[0].top), **_STYLE)
     first, places, texts = 0, [], []
-    for channel in spec.traced:
+    for channel in spec.trace_channels:
         each = int(np.prod(channel.shape[1:]))
         for i, name in enumerate(channel.names if each > 1 else [title(channel)]):
             count = each if each > 1 else channel.shape[0]
@@ -290,7 +290,7 @@ def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
     places += [(0.0, 1.06 * rows), (float(steps), 1.06 * rows)]
     texts += ["0", f"{steps * spec.period:g} s"]
     yield f"{entity}/axes", labels(places, texts)
-    yield from scale(entity, steps, rows, spec.traced[0].top, spec.traced[0].unit)
+    yield from scale(entity, steps, rows, spec.trace_channels[0].top, spec.trace_channels[0].unit)
 
 
 def changes(states: AnyArray) -> IntArray:

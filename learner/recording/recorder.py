@@ -128,7 +128,7 @@ class Recorder:
             *curves.static(success=spec.success, measures=spec.measures),
             ("/config", markdown(config)),
         ]
-        if spec.traced:
+        if spec.trace_channels:
             static += [each for entity in ("/traces/best", "/traces/worst") for each in axes(entity, spec)]
         log_static(self._stream, static)
 
@@ -136,7 +136,7 @@ class Recorder:
         """Record a finished generation; it may be held back for HOLD, or until `settle` or `close`.
 
         The traces `best` and `worst` (T, K) are drawn as pictures; `all` (S, T, K) is kept bit by bit. K are the
-        traced channels' values side by side, see `farm.tasks.base.flat`.
+        channels' values side by side, see `farm.sim.channels.flat`.
 
         Raises:
           ValueError: the sample or a trace has another shape.
@@ -146,8 +146,8 @@ class Recorder:
         if report.sample is not None:
             self._drawing.check(report.sample)
         for name, values in report.traces.items():
-            if values.shape[-2:] != self._drawing.spec.trace:
-                expected = self._drawing.spec.trace
+            if values.shape[-2:] != self._drawing.spec.trace_shape:
+                expected = self._drawing.spec.trace_shape
                 raise ValueError(f"trace {name} of shape {values.shape}, expected {expected} for each rollout")
         self._generation, now = report.generation, time.time()
         self._reports.append((now, report))

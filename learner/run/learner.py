@@ -78,7 +78,7 @@ class Learner:
         self._written = configs.to_dict(self.config)
         self._durable = time.monotonic()
         self._signs = self.config.algorithm_config.signs()
-        self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.traced else "none"
+        self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.trace_channels else "none"
         folder.keep_files(problem.task.sources)
         folder.save(self._at)
 

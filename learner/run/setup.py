@@ -53,7 +53,7 @@ class Problem:
         """What results look like; with `steps` traces of that kind."""
         spec = self.spec
         return Shapes(
-            trace=whole(spec) if steps else spec.trace, frame=spec.shapes(len(self.scene.bodies)),
+            trace=whole(spec) if steps else spec.trace_shape, frame=spec.shapes(len(self.scene.bodies)),
             observation=spec.observation, measures=len(spec.measures), substeps=self.task.substeps,
         )  # fmt: skip
 
@@ -243,10 +243,10 @@ def _other(config: RunConfig) -> Checkpoint:
     folder = RunFolder.open(Path(str(config.init_from)))
     other = folder.read_config()
     for name in ("task", "policy", "policy_config"):
-        there, here = getattr(other, name), getattr(config, name)
-        if there != here:
+        value, here = getattr(other, name), getattr(config, name)
+        if value != here:
             raise ConfigError(
-                f"--init-from {config.init_from}: its parameters mean something else ({there}, not {here})"
+                f"--init-from {config.init_from}: its parameters mean something else ({value}, not {here})"
             )
     return checkpoints.load(folder.checkpoint)
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.net.work import Jobs, Results, Simulated, traced
+from farm.net.work import Jobs, Results, Simulated, rows_with_trace
 from farm.sim.trajectory import Trajectory
 
 _MESSAGE: Final = 8 << 20  # [bytes] of jobs, and of their results, in one message, unless one job alone has more
@@ -73,8 +73,8 @@ class RoundResults:
         self._trajectories: dict[int, Trajectory] = {}
         count, measures = len(self._exploring), shapes.measures
         whole = traces in ("all", "steps")  # the two traces of `extremes` are one message's, not a job's
-        seen, plain = (shapes.answer_bytes(trajectory=one, traced=whole) for one in (True, False))
-        self._bytes = np.maximum(np.where(self._seen, seen, plain), jobs.eps.nbytes // max(1, len(jobs.eps)))
+        with_trajectory, plain = (shapes.answer_bytes(trajectory=one, traced=whole) for one in (True, False))
+        self._bytes = np.maximum(np.where(self._seen, with_trajectory, plain), jobs.eps.nbytes // max(1, len(jobs.eps)))
         self.returns: FloatArray = np.zeros(count)
         """(S,)"""
         self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
@@ -168,7 +168,7 @@ class RoundResults:
             return None
         if not ((1 <= results.steps) & (results.steps <= self._trace[0])).all():
             return None
-        with_trace = traced(self._traces, results.returns, self._exploring[rows])
+        with_trace = rows_with_trace(self._traces, results.returns, self._exploring[rows])
         traces = len(results.traces) == len(with_trace) and (
             not len(with_trace) or results.traces.shape[1:] == self._trace
         )
@@ -185,7 +185,7 @@ class RoundResults:
         for array, values in self._more(results):
             if array.size:
                 array[rows[selection]] = values[selection]
-        for at, trace in zip(place.traced.tolist(), results.traces, strict=True):
+        for at, trace in zip(place.with_trace.tolist(), results.traces, strict=True):
             if mask_of_rows[at]:
                 self.traces[int(rows[at])] = trace
         self.done[results.jobs[mask]] = True
@@ -217,7 +217,7 @@ class Place(NamedTuple):
 
     rows: IntArray
     """Row of each of the message's S rollouts, (S,)"""
-    traced: IntArray
+    with_trace: IntArray
     """Those of its rollouts that have a trace, (K,)"""
     shown: IntArray
     """The job of each of its trajectories."""

@@ -188,16 +188,16 @@ class Race:
 
     def _continued(self, file: Path) -> list[dict[str, float | None]]:
         """The scores in an existing race's file, if it is this race."""
-        saved, wanted = read(file), self._settings()
+        saved, current = read(file), self._settings()
         if saved["rollouts"] != self.rollouts:
             raise ConfigError(
                 f"{self.path} was started with --rollouts {saved['rollouts']}; here it is {self.rollouts}: use that, "
                 "or a different --out"
             )
-        if list(saved["entries"]) != list(wanted["entries"]):
+        if list(saved["entries"]) != list(current["entries"]):
             raise ConfigError(f"{self.path} has the entries {', '.join(saved['entries'])}: use a different --out")
         for name, values in saved["entries"].items():
-            if values != wanted["entries"][name]:
+            if values != current["entries"][name]:
                 raise ConfigError(f"{self.path} was started with different settings of {name}: use a different --out")
         return list(saved["scores"])
 

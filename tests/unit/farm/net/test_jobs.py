@@ -5,7 +5,7 @@ import pytest
 from messages import EPS, HEAD, JOBS, RNG, SEEDS, WIRE, P
 
 from farm.net import codec
-from farm.net.work import Chunk, Jobs, Results, Simulated, traced
+from farm.net.work import Chunk, Jobs, Results, Simulated, rows_with_trace
 
 
 def test_parameters_and_seeds_of_jobs():
@@ -59,7 +59,7 @@ def test_results_carry_the_jobs_indices():
 )
 def test_traces_of_the_best_and_the_worst(returns, expected):
     returns, exploring = np.array([9.0, *returns]), np.array([False, True, True, True, True])
-    assert traced("extremes", returns, exploring).tolist() == [1 + row for row in expected]
-    assert traced("all", returns, exploring).tolist() == [1, 2, 3, 4]
-    assert not traced("none", returns, exploring).size
-    assert not traced("extremes", returns, np.zeros(5, bool)).size
+    assert rows_with_trace("extremes", returns, exploring).tolist() == [1 + row for row in expected]
+    assert rows_with_trace("all", returns, exploring).tolist() == [1, 2, 3, 4]
+    assert not rows_with_trace("none", returns, exploring).size
+    assert not rows_with_trace("extremes", returns, np.zeros(5, bool)).size

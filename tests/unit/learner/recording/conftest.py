@@ -103,7 +103,7 @@ def rollout(scene: Scene, spec: TaskSpec) -> Callable[..., Trajectory]:
 @pytest.fixture
 def traces(rollout: Callable[..., Trajectory], spec: TaskSpec) -> Callable[..., dict[str, AnyArray]]:
     def make(rollouts: int = 4) -> dict[str, AnyArray]:
-        one = flat(spec.traced, rollout().channels)[1:]
+        one = flat(spec.trace_channels, rollout().channels)[1:]
         every = np.stack([one + i for i in range(rollouts)]).astype("<f4")
         return {"best": every[0], "worst": every[-1], "all": every}
 

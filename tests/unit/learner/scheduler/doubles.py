@@ -11,7 +11,7 @@ from made import spec
 from farm.net import codec, keys
 from farm.net.messages import WorkRequest
 from farm.net.session import Session
-from farm.net.work import Chunk, Failure, Jobs, Results, traced
+from farm.net.work import Chunk, Failure, Jobs, Results, rows_with_trace
 from learner.scheduler.dispatcher import Dispatcher
 from learner.scheduler.judging import Judge
 from learner.scheduler.membership import Admission
@@ -72,7 +72,7 @@ class Worker:
         """Of all jobs of a chunk, or of these."""
         chosen = sorted(indices or chunk.indices.tolist())
         returns = np.repeat(np.array(chosen, dtype=float) if value is None else value, 2)
-        traces = np.zeros((len(traced("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4")
+        traces = np.zeros((len(rows_with_trace("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4")
         return Results(
             **head(chunk), worker=self.name, jobs=np.array(chosen), returns=returns,
             flags=np.zeros((len(returns), 4), bool), steps=np.ones(len(returns), "<i8"), traces=traces, trajectories=(),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from farm.net import codec
-from farm.net.work import Jobs, Results, traced
+from farm.net.work import Jobs, Results, rows_with_trace
 from farm.sim.trajectory import Trajectory
 from learner.scheduler.round import RoundResults, Shapes
 
@@ -39,7 +39,7 @@ def message(indices: Sequence[int], traces: str) -> Results:
     jobs = sorted(indices)
     rows = [row for job in jobs for row in ((2 * job, 2 * job + 1) if job < PAIRS else (-1,))]
     returns = np.array([9.0 if row < 0 else RETURNS[row] for row in rows])
-    wanted = [rows[at] for at in traced(traces, returns, np.array(rows) >= 0)]
+    wanted = [rows[at] for at in rows_with_trace(traces, returns, np.array(rows) >= 0)]
     return Results(
         run="r", incarnation="i", round=1, worker="w/1", jobs=np.array(jobs), returns=returns,
         flags=np.array([[row % 2 == 1, False, row < 0, False] for row in rows]),
