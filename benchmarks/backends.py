@@ -18,7 +18,7 @@ from evaluations import evaluate, pid, theta
 import farm
 from farm.arrays import FloatArray
 from farm.net.session import free_endpoint
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.sim.engines import BatchEngine
 from learner.run.launch import Placement, open_run
 from learner.run.setup import problem

@@ -15,7 +15,7 @@ import numpy as np
 
 from farm import Policy, seeds
 from farm.arrays import FloatArray
-from farm.rollouts import Runner
+from farm.runner import Runner
 from learner.run import setup
 from learner.run.config import configure
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from farm.policies.networks import Linear
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
 from farm.tasks.gymnasium_engine import make
 

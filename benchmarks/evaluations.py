@@ -11,7 +11,7 @@ import mujoco.batch
 import numpy as np
 
 from farm.arrays import FloatArray
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.finger_gait.holding import CLOSING, SUBSTEPS
 from farm.tasks.loop import Batch, again
 from learner.run.config import RunConfig, configure

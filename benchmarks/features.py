@@ -14,7 +14,7 @@ from collections.abc import Callable
 import mujoco.batch
 import numpy as np
 
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.loop import Batch, again
 from learner.run.config import configure
 from learner.run.setup import problem

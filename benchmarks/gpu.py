@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from farm import configure, rollouts, seeds
-from farm.rollouts import Runner
+from farm import configure, seeds
+from farm.runner import Runner, make_backend
 from farm.sim.engines import BatchEngine
 from farm.sim.interfaces import MakeEngine
 from learner.run.setup import problem
@@ -34,7 +34,7 @@ def main() -> None:
         for count in map(int, chosen.threads.split(",")):
             row(name, f"{count} threads", 256, chosen.steps, threads(count, 256))
         for worlds in map(int, chosen.worlds.split(",")):
-            made = rollouts.backend("warp")
+            made = make_backend("warp")
             made.__class__.capacity = worlds
             row(name, "warp", worlds, chosen.steps, made.engine, exact=False)
 

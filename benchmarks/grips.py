@@ -16,7 +16,8 @@ from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, POSES
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD, TIMESTEP, moved
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
-from farm.tasks.loop import Batch, Rollouts, again, whole
+from farm.tasks.loop import Batch, again
+from farm.tasks.rollouts import Rollouts, whole
 
 SECONDS = (0.0, 0.5, 1.0, 2.0, 3.0)
 

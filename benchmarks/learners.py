@@ -19,8 +19,9 @@ import numpy as np
 from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.moments import merged, normaliser, usable
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks import loop
+from farm.tasks.rollouts import Rollouts, Seed
 from learner.run import setup
 from learner.run.config import RunConfig, configure
 from learner.run.learner import explored, learnt_from
@@ -181,15 +182,15 @@ def _generation(runner: Runner, searches: Sequence[Search]) -> None:
             search.moments = merged(search.moments, table)
 
 
-def _tried(runner: Runner, searches: Sequence[Search], seed: int) -> list[loop.Rollouts]:
+def _tried(runner: Runner, searches: Sequence[Search], seed: int) -> list[Rollouts]:
     """The mean policies on perturbed starts."""
     thetas = [np.repeat(search.state.mu[None], STARTS, axis=0) for search in searches]
     return _together(runner, searches, thetas, [streams.trial(seed, i) for i in range(STARTS)] * len(searches))
 
 
 def _together(
-    runner: Runner, searches: Sequence[Search], thetas: Sequence[FloatArray], starts: Sequence[loop.Seed]
-) -> list[loop.Rollouts]:
+    runner: Runner, searches: Sequence[Search], thetas: Sequence[FloatArray], starts: Sequence[Seed]
+) -> list[Rollouts]:
     """Rollouts of each search's parameters, simulated together."""
     rows = [np.column_stack([theta, np.full(len(theta), i)]) for i, theta in enumerate(thetas)]
     policy, moments = SideBySide(searches), bool(searches[0].moments.size)

@@ -39,7 +39,7 @@ import farm
 from farm.arrays import FloatArray
 from farm.moments import normaliser
 from farm.net.work import Jobs
-from farm.rollouts import Runner
+from farm.runner import Runner
 from learner.run.evaluation import evaluation_jobs
 from learner.run.folder import RunFolder
 from learner.run.setup import problem

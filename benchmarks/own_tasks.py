@@ -40,7 +40,7 @@ from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.moments import merged, normaliser
 from farm.net.work import Jobs
-from farm.rollouts import Runner
+from farm.runner import Runner
 from learner.again.replay import loaded
 from learner.run.evaluation import evaluation_jobs
 from learner.run.folder import RunFolder

@@ -41,7 +41,7 @@ from farm.net.messages import Spec
 from farm.net.session import free_endpoint
 from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader, Simulated, rows_with_trace
 from farm.policies.base import Policy
-from farm.rollouts import served
+from farm.runner import served
 from farm.sim.scene import Scene
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import Task

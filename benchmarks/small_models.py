@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from farm import elementary
-from farm.rollouts import Runner
+from farm.runner import Runner
 from learner.run.config import configure
 from learner.run.setup import problem
 

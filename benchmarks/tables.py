@@ -31,8 +31,9 @@ from farm import seeds
 from farm.arrays import FloatArray, IntArray
 from farm.commands.signals import INTERRUPTED
 from farm.moments import merged, normaliser, usable
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks import loop
+from farm.tasks.rollouts import Rollouts, Seed
 from learner.run import setup
 from learner.run.config import RunConfig, configure
 
@@ -124,14 +125,14 @@ class Search:
         """The algorithm, with the number of pairs of this generation."""
         return self.config.algorithm_of(self.pairs)
 
-    def ask(self) -> tuple[FloatArray, list[loop.Seed]]:
+    def ask(self) -> tuple[FloatArray, list[Seed]]:
         """Parameters of its next generation, (2 N, P), and seeds of their starts."""
         config, generation = self.config, self.state.generation
         self.eps = self.algorithm.ask(self.state, seeds.exploration(config.seed, generation))
         theta = (self.state.mu + self.eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(2 * len(self.eps), -1)
         return theta, [seeds.training(config.seed, generation, row // 2) for row in range(len(theta))]
 
-    def tell(self, rollouts: loop.Rollouts, offsets: FloatArray) -> None:
+    def tell(self, rollouts: Rollouts, offsets: FloatArray) -> None:
         """Update the state from their returns."""
         returns = (rollouts.returns + offsets[rollouts.steps]).reshape(-1, 2)
         self.state = self.algorithm.tell(self.state, self.eps, returns)

@@ -26,14 +26,15 @@ import numpy as np
 import farm
 from farm.arrays import AnyArray, FloatArray
 from farm.policies.base import Policy
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.settings import setting
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskSpec
 from farm.tasks.finger_gait.fragile_bar import BREAKS, TERMS, WANTED, FragileBar, FragileBarConfig
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
-from farm.tasks.loop import Batch, Seed, again
+from farm.tasks.loop import Batch, again
+from farm.tasks.rollouts import Seed
 from learner.again.replay import loaded
 from learner.run.folder import RunFolder
 from learner.run.setup import problem

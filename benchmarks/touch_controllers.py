@@ -15,11 +15,12 @@ from touch import FITS, GRID, STARTS
 
 import farm
 from farm.arrays import AnyArray, FloatArray
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.finger_gait.fragile_bar import BREAKS, WANTED
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.finger_gait.sensing import ZERO
-from farm.tasks.loop import Batch, Seed, again
+from farm.tasks.loop import Batch, again
+from farm.tasks.rollouts import Seed
 from learner.run.setup import problem
 
 _MIDDLE: Final = FINGER_JOINTS["middle"]

@@ -30,7 +30,8 @@ from farm.tasks.finger_gait.holding import MAX_SHIFT, TIMESTEP
 from farm.tasks.finger_gait.model import Hand
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.finger_gait.turning import Turning, turned, upright
-from farm.tasks.loop import Seed, again
+from farm.tasks.loop import again
+from farm.tasks.rollouts import Seed
 
 MOST_TILT: Final = 30.0
 """Tilt from which the plate counts as dropped [deg]."""

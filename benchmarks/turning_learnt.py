@@ -26,6 +26,7 @@ from farm.sim import video
 from farm.tasks import loop
 from farm.tasks.finger_gait.hand import FINGERS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD, SUBSTEPS
+from farm.tasks.rollouts import Rollouts, Seed
 from learner.again.replay import LoadedPolicy
 
 ROWS: Final = "phase,phase+forces,phase+joints,phase+joints+forces"
@@ -33,7 +34,7 @@ LONG: Final[Mapping[str, Any]] = {"steps": 160}
 """Settings of the test."""
 SLOW: Final[Mapping[str, Any]] = {"steps": 240, "cycle": 3.0}
 """Settings of the slowed test: the same number of cycles, each longer than in training."""
-STARTS: Final[list[loop.Seed]] = [seeds.trial(9, i) for i in range(200)]
+STARTS: Final[list[Seed]] = [seeds.trial(9, i) for i in range(200)]
 """Starts of the tests."""
 
 Figures = dict[str, float | None]
@@ -122,7 +123,7 @@ def _tested(policy: LoadedPolicy, mean: FloatArray, *, shuffle: bool = False) ->
     return _figures(_turned(loop.run(runner.task, acts, runner.sim, theta, STARTS)))
 
 
-def _turned(found: loop.Rollouts) -> Turned:
+def _turned(found: Rollouts) -> Turned:
     """Motion of the plate in these rollouts."""
     qpos, force = (
         np.concatenate([found.start[name][:, None], found.frames[name]], axis=1) for name in ("qpos", "force")

@@ -15,7 +15,7 @@ import numpy as np
 from farm import plugins, seeds
 from farm.arrays import FloatArray
 from farm.policies.base import Policy
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
 from farm.tasks.probe import specification

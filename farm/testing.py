@@ -21,12 +21,12 @@ import numpy as np
 from farm import __version__, fingerprint, plugins, seeds, settings
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, writing
-from farm.rollouts import build_policy, build_task, draw_constants
+from farm.runner import build_policy, build_task, draw_constants
 from farm.tasks import loop
-from farm.tasks.acting import Acts
 from farm.tasks.base import Task, TaskSpec
-from farm.tasks.loop import Seed
+from farm.tasks.loop import Acts
 from farm.tasks.probe import specification, tried
+from farm.tasks.rollouts import Seed
 
 _MADE: Final = "made"
 """The entry of a file that says what made it, as JSON."""

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from farm import rollouts
 from farm.errors import ConfigError
 from farm.link import Joining
 from farm.net import keys
 from farm.net.tls import Role
+from farm.runner import make_backend
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class WorkerConfig(Joining):
             host = socket.gethostname().split(".")[0]
             object.__setattr__(self, "name", "".join(c if c.isascii() and c.isalnum() else "-" for c in host) or "host")
         keys.checked("worker", self.name)
-        rollouts.backend(self.backend)
+        make_backend(self.backend)
         if self.accept_code and self.tls is None:
             raise ConfigError("--accept-code needs --tls: without certificates anyone could send code")
         for path in self.allow_file:

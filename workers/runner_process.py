@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from farm import plugins, rollouts
+from farm import plugins
 from farm.arrays import FloatArray, array
 from farm.errors import FarmError, MessageError, UnservedError, brief
 from farm.net import codec
 from farm.net.codec import M
 from farm.net.messages import Spec
 from farm.net.work import Jobs, Simulated
-from farm.rollouts import Runner, served
+from farm.runner import Runner, is_exact, make_backend, served
 
 _MOST: Final = 4 * codec.MAX_BYTES  # [bytes] of a mean, a chunk, a normaliser and their headers
 _LENGTH: Final = struct.Struct("<Q")
@@ -110,8 +110,8 @@ def serve(link: socket.socket) -> None:
     try:
         files = tuple(Path(path) for path in begin.files)
         contents = {name: (Path(begin.assets) / name).read_bytes() for name in begin.spec.assets.values()}
-        backend = rollouts.backend(begin.backend)
-        runner = Runner(*served(begin.spec, files, contents), backend.engine, exact=rollouts.exact(backend))
+        backend = make_backend(begin.backend)
+        runner = Runner(*served(begin.spec, files, contents), backend.engine, exact=is_exact(backend))
     except Exception as error:  # the code may raise anything
         send(link, _failed(error, begin.files, built=False))
         return

@@ -5,13 +5,13 @@ import logging
 from collections import OrderedDict
 from typing import Final, TypeAlias
 
-from farm import plugins, rollouts
+from farm import plugins
 from farm.errors import FarmError
 from farm.net import codec, keys
 from farm.net.messages import Spec
 from farm.net.notices import Notices
 from farm.net.work import RoundHeader
-from farm.rollouts import Runner, served
+from farm.runner import Runner, is_exact, served
 from farm.sim.interfaces import Backend
 from workers.config import WorkerConfig
 from workers.queries import Queries
@@ -102,7 +102,7 @@ class Runners:
         if contents is None:
             return None
         if not (travels and self._config.accept_code):
-            problem, exact = served(spec, self._config.allow_file, contents), rollouts.exact(self._backend)
+            problem, exact = served(spec, self._config.allow_file, contents), is_exact(self._backend)
             return Runner(*problem, self._backend.engine, exact=exact)
         for name, digest in travels:
             path = self._sources.place(name, digest)

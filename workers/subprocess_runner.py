@@ -79,7 +79,7 @@ class RunnerProcess:
 
 
 class SubprocessRunner:
-    """Runs one run's jobs as `farm.rollouts.Runner` does, in a process that is restarted if it dies."""
+    """Runs one run's jobs as `farm.runner.Runner` does, in a process that is restarted if it dies."""
 
     def __init__(self, begin: Begin, folder: Path, process: RunnerProcess | None = None) -> None:
         """Build the task in the process.

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import __version__, fingerprint, plugins, rollouts
+from farm import __version__, fingerprint, plugins
 from farm.errors import FarmError, MessageError, UnservedError, brief
 from farm.net import codec, keys
 from farm.net.events import Event
@@ -23,6 +23,7 @@ from farm.net.messages import Refusal, WorkRequest
 from farm.net.notices import Notices
 from farm.net.session import Session, connect
 from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
+from farm.runner import is_exact, make_backend
 from workers.config import WorkerConfig
 from workers.inbox import Inbox
 from workers.queries import ASK, Queries
@@ -63,8 +64,8 @@ class Worker:
         """Choose a unique identity."""
         self.id = f"{config.name}/{os.getpid()}-{secrets.token_hex(3)}"
         self._session, self._farm = session, config.farm
-        backend = rollouts.backend(config.backend)
-        self._canary = fingerprint.digest() if rollouts.exact(backend) else ""
+        backend = make_backend(config.backend)
+        self._canary = fingerprint.digest() if is_exact(backend) else ""
         self._credits = 2 * backend.capacity
         self._notices, self._queries = Notices(log), Queries(session)
         self.inbox = Inbox(self._credits)

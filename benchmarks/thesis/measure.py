@@ -24,7 +24,7 @@ from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.holding import SUCCESS_STEPS
 from farm.tasks.finger_gait.sensing import Perturbation
 from farm.tasks.finger_gait.task import FingerGait
-from farm.tasks.loop import Seed
+from farm.tasks.rollouts import Seed
 from learner.again.chain import chain
 from learner.again.replay import LoadedPolicy, loaded
 from learner.again.replay import load as load_policy

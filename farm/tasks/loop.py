@@ -5,82 +5,92 @@ order, or threads. They equal, bit for bit, those of one rollout at a time in a 
 """
 
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
-from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, shaped
 from farm.errors import TaskError
 from farm.moments import Moments
-from farm.sim.channels import flat
 from farm.sim.interfaces import Rebound
-from farm.sim.scene import Scene
 from farm.sim.sim import Sim, unwritable
-from farm.sim.trajectory import Trajectory, single
-from farm.tasks.acting import Acting, Acts, shaped
-from farm.tasks.base import Record, Task, TaskSpec
-from farm.tasks.outcomes import drawn, measured
+from farm.sim.trajectory import single
+from farm.tasks.base import Record, Task
+from farm.tasks.rollouts import RETURN_FLOOR, Rollouts, Seed, discounted, drawn, measured
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-RETURN_FLOOR: Final = -1e12
-"""The return of a rollout that overflowed or failed: it must never look good."""
 
-Seed = tuple[int, ...] | None
-"""Seed of a rollout's random numbers; None for nominal conditions."""
+class Acts(Protocol):
+    """The methods that rollouts need from a policy. It may have `memory` and `scale`, as `farm.Policy`."""
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """Compute from the parameters (B, P) what stays constant during a rollout, (B, ...)."""
+        ...
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions (B, A) of observations (B, d)."""
+        ...
 
 
-@dataclass(frozen=True)
-class Rollouts:
-    """B finished rollouts; T control steps, F frames: T, or T x substeps at physics rate."""
+class Acting:
+    """A policy in B rollouts. It keeps their memories, so each rollout must act once in each of its control steps."""
 
-    returns: FloatArray
-    """(B,)"""
-    success: BoolArray
-    """(B,); false if the task does not define success"""
-    ended: BoolArray
-    """(B,) whether the task ended it before its last step"""
-    failed: BoolArray
-    """(B,) whether the simulation became unstable"""
-    clamped: BoolArray
-    """(B,) whether the return overflowed"""
-    steps: IntArray
-    """(B,) control steps until the end, including the last one"""
-    terms: FloatArray
-    """(B, T, K), zero after the end."""
-    actions: FloatArray
-    """(B, T, A), zero after the end."""
-    start: Mapping[str, FloatArray]
-    """Measured values at the start, qpos and (if there are mocap bodies) mocap, (B, ...)."""
-    frames: Mapping[str, FloatArray]
-    """The same in every frame, zero after the end, (B, F, ...)."""
-    which: IntArray
-    """(B,) index of each one's model among the task's"""
-    measures: FloatArray
-    """Of the task's measures, in their order (B, M)"""
-    moments: FloatArray
-    """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) if not requested."""
-    observations: AnyArray
-    """Before each control step, zero after the end, (B, T, d) in single precision; (B, 0) if not requested."""
+    def __init__(self, policy: Acts, theta: FloatArray) -> None:
+        """Prepare parameters (B, P), in the search's units; all rollouts are at their starts.
 
-    @property
-    def flags(self) -> BoolArray:
-        """success, ended, failed, clamped, (B, 4)."""
-        return np.stack([self.success, self.ended, self.failed, self.clamped], axis=1)
+        Raises:
+          TaskError: `prepare` gives something else than one array with a row per rollout.
+        """
+        scale: FloatArray | None = getattr(policy, "scale", None)
+        prepared: object = policy.prepare(theta if scale is None else scale * theta)
+        if not isinstance(prepared, np.ndarray):
+            raise TaskError(
+                f"prepare of the policy gave a {type(prepared).__name__}; expected one array, with a row per rollout: "
+                "join what act needs, and split it there"
+            )
+        self._policy: Any = policy
+        self._all = self._prepared = shaped("prepare of the policy", prepared, (len(theta), *prepared.shape[1:]))
+        self._rows = np.arange(len(theta))  # of which `_prepared` is
+        self._first: FloatArray | None = getattr(policy, "memory", None)
+        self._memory = None if self._first is None else np.tile(self._first, (len(theta), 1))
 
-    @staticmethod
-    def joined(parts: Sequence["Rollouts"]) -> "Rollouts":
-        """Concatenate rollouts of one task."""
-        return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
+    def act(self, x: FloatArray, rows: IntArray | None = None) -> AnyArray:
+        """Actions (n, A), which nothing has checked.
 
-    def at(self, rows: slice | IntArray) -> "Rollouts":
-        """Select some rollouts."""
-        return _each(lambda values: values[rows], self)
+        Args:
+          x: observations (n, d).
+          rows: which rollouts these are, (n,); None: all.
+
+        Raises:
+          TaskError: a policy with memory does not give actions and memories (n, m).
+        """
+        rows = np.arange(len(self._all)) if rows is None else rows
+        if rows is not self._rows:
+            if not np.array_equal(rows, self._rows):
+                self._prepared = self._all[rows]
+            self._rows = rows
+        if self._memory is None:
+            action: AnyArray = self._policy.act(self._prepared, x)
+            return action
+        result: object = self._policy.act(self._prepared, x, self._memory[rows])
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise TaskError(
+                f"act of the policy gave a {type(result).__name__}; expected (action, memory), as the policy has memory"
+            )
+        action, after = result
+        self._memory[rows] = shaped("memory from act of the policy", after, (len(rows), self._memory.shape[1]))
+        return action
+
+    def forget(self, rows: IntArray) -> None:
+        """Let rollouts (n,) remember what they did at their starts."""
+        if self._memory is not None:
+            self._memory[rows] = self._first
 
 
 def _explained(call: Callable[P, T]) -> Callable[P, T]:
@@ -321,72 +331,3 @@ def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doin
 def scores(task: Task) -> bool:
     """Whether the task scores whole rollouts."""
     return type(task).score is not Task.score
-
-
-def discounted(terms: FloatArray, gamma: float, scale: float) -> tuple[FloatArray, BoolArray]:
-    """Return R = scale * sum_t gamma^t r_t, t from 0.
-
-    Args:
-      terms: (B, T, K) reward terms of every step, zero after the end.
-      gamma: discount factor.
-      scale: factor of the sum.
-
-    Returns:
-      returns (B,), and (B,) where the sum overflowed and was clamped to RETURN_FLOOR.
-    """
-    total = np.zeros(len(terms))
-    with np.errstate(over="ignore", invalid="ignore"):
-        reward = terms.sum(axis=-1)
-        for t in range(terms.shape[1]):
-            total += gamma**t * reward[:, t]
-        total *= scale
-        clamped = ~(total >= RETURN_FLOOR)  # catches nan as well
-    return np.where(clamped, RETURN_FLOOR, total), clamped
-
-
-def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row: int) -> Trajectory:
-    """One rollout, frame by frame, its start first."""
-    parts = next(iter(rollouts.frames.values())).shape[1] // task.steps
-    steps = int(rollouts.steps[row])
-    control = np.repeat(np.arange(steps), parts)
-    frames = whole(rollouts, row)
-    terms, actions, which = rollouts.terms[row], rollouts.actions[row], int(rollouts.which[row])
-    return Trajectory.of(
-        times=np.arange(steps * parts + 1, dtype=float) * (task.period / parts),
-        bodies=scene.each[which].poses(frames["qpos"], frames.get("mocap")),
-        actions=np.concatenate([np.zeros((1, actions.shape[1])), actions[control]]),
-        terms=np.concatenate([np.zeros((1, terms.shape[1])), terms[control]]),
-        channels=task.show(frames) | scene.said(which, len(frames["qpos"])),
-        value=float(rollouts.returns[row]),
-        success=bool(rollouts.success[row]) if spec.success else None,
-    )
-
-
-def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
-    """Measured values of one rollout: at its start, and in every frame until its end, (F + 1, ...)."""
-    count = len(next(iter(rollouts.frames.values()))[row])
-    frames = int(rollouts.steps[row]) * (count // rollouts.actions.shape[1])
-    first = {name: values[row][None] for name, values in rollouts.start.items()}
-    return {name: np.concatenate([first[name], values[row, :frames]]) for name, values in rollouts.frames.items()}
-
-
-def traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> AnyArray:
-    """The traces of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
-    if not spec.trace_channels or not len(rows):
-        return np.zeros((len(rows), *spec.trace_shape), dtype="<f4")
-    values = flat(spec.trace_channels, task.show({name: frames[rows] for name, frames in rollouts.frames.items()}))
-    values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
-    return values
-
-
-def _each(call: Callable[..., AnyArray], *parts: Rollouts) -> Rollouts:
-    """Apply a function to every array of rollouts, or to the corresponding arrays of several."""
-    arrays: dict[str, Any] = {}
-    for name in Rollouts.__dataclass_fields__:
-        values = [getattr(part, name) for part in parts]
-        arrays[name] = (
-            {key: call(*(value[key] for value in values)) for key in values[0]}
-            if isinstance(values[0], Mapping)
-            else call(*values)
-        )
-    return Rollouts(**arrays)

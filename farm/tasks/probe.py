@@ -8,14 +8,13 @@ from typing import Final, TypeVar
 import mujoco
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm.arrays import FloatArray, shaped
 from farm.errors import ConfigError, TaskError
 from farm.sim import mixed
 from farm.sim.channels import Camera, Channel, Measure, Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
-from farm.tasks.acting import shaped
 from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
 

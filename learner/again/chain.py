@@ -16,9 +16,9 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
-from farm.tasks.acting import Acting
 from farm.tasks.base import Task
-from farm.tasks.loop import Batch, Rollouts, Seed, again
+from farm.tasks.loop import Acting, Batch, again
+from farm.tasks.rollouts import Rollouts, Seed
 from learner.again.replay import LoadedPolicy
 
 FELT: Final = 3

@@ -26,7 +26,7 @@ from farm.errors import ConfigError, RunError, writing
 from farm.moments import normaliser
 from farm.net.work import Jobs
 from farm.settings import read_json
-from farm.tasks.outcomes import whole
+from farm.tasks.rollouts import steps_shape
 from learner import parquet
 from learner.again.lerobot import Episode, Format
 from learner.again.replay import restored
@@ -137,7 +137,7 @@ class Work:
         self._normaliser = np.stack([normaliser(at.moments)] * 2)
         self.format = Format(of.path, problem.spec, _wire("tasks", config.task))
         self.file = of.path / "unfinished.json"
-        size = int(np.prod(whole(problem.spec))) * 4
+        size = int(np.prod(steps_shape(problem.spec))) * 4
         self._each = max(1, min(_MOST, PART // size))
         self.parts = -(-of.episodes // self._each)
         state = read(self.file) if self.file.exists() else {"done": [], "expelled": {}}

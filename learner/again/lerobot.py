@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray, FloatArray
 from farm.errors import writing
 from farm.tasks.base import TaskSpec
-from farm.tasks.outcomes import step_shapes
+from farm.tasks.rollouts import step_shapes
 from learner import parquet
 from learner.run.files import replace_text
 

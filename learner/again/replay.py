@@ -20,11 +20,11 @@ from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.moments import normaliser
 from farm.policies.normalised import Normalised
-from farm.rollouts import Runner, build_task
+from farm.runner import Runner, build_task
 from farm.sim.model_files import Content, Files
 from farm.sim.trajectory import Trajectory
-from farm.tasks.acting import Acting
-from farm.tasks.loop import Rollouts, Seed, whole
+from farm.tasks.loop import Acting
+from farm.tasks.rollouts import Rollouts, Seed, whole
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.checkpoint import Checkpoint

@@ -19,7 +19,7 @@ from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.moments import merged, normaliser
-from farm.tasks.loop import Rollouts, Seed
+from farm.tasks.rollouts import Rollouts, Seed
 from learner import algorithms
 from learner.again.replay import LoadedPolicy, Replay, restored, seeing
 from learner.algorithms import SearchState

@@ -111,17 +111,17 @@ def figures(chained: "Chained", policies: int) -> dict[str, Any]:
 
 def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     """The unperturbed chain, at physics rate."""
-    from farm.tasks import loop
+    from farm.tasks.rollouts import trajectory, whole
     from learner.again.chain import chain
 
     first = policies[0].problem
     chained = chain(policies, [None], command.shown, every=1)
-    trajectory = loop.trajectory(chained.task, first.spec, first.scene, chained.rollouts, 0)
+    rollout = trajectory(chained.task, first.spec, first.scene, chained.rollouts, 0)
     # Its reward would be the first policy's throughout.
-    trajectory = replace(trajectory, terms=np.zeros_like(trajectory.terms), value=float("nan"), success=None)
+    rollout = replace(rollout, terms=np.zeros_like(rollout.terms), value=float("nan"), success=None)
     name = f"{len(policies)} policies in turn: the goal is reached {chained.changes[0]} times"
-    recordings.record(command.to, "chain", first, name, trajectory)
+    recordings.record(command.to, "chain", first, name, rollout)
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.video is not None:
-        frames = loop.whole(chained.rollouts, 0)
-        recordings.film(chained.task, [(trajectory, frames)], command.video, command.speed)
+        frames = whole(chained.rollouts, 0)
+        recordings.film(chained.task, [(rollout, frames)], command.video, command.speed)

@@ -32,8 +32,8 @@ from learner.run import config as configs
 from learner.run.config import RunConfig
 
 if TYPE_CHECKING:
-    from farm.rollouts import Runner
-    from farm.tasks.loop import Rollouts
+    from farm.runner import Runner
+    from farm.tasks.rollouts import Rollouts
     from learner.run.setup import Problem
 
 ROWS = 8
@@ -102,10 +102,10 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
       backend: compared with cpu.
       words: of the command, from which a second process makes the same run.
     """
-    from farm import rollouts
+    from farm.runner import Runner, is_exact, make_backend
     from learner.run import setup
 
-    other = None if backend == "cpu" else rollouts.backend(backend)
+    other = None if backend == "cpu" else make_backend(backend)
     problem = setup.problem(config)
     spec = problem.spec
     low, high = problem.task.limits
@@ -137,9 +137,9 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
     yield "same bits together, in another order, one by one, and in another process"
     yield f"{_speed(runner, theta, starts):.0f} rollouts/s on one core"
     if other is not None:
-        compared = rollouts.Runner(problem.task, problem.policy, other.engine, exact=rollouts.exact(other))
+        compared = Runner(problem.task, problem.policy, other.engine, exact=is_exact(other))
         most = np.abs(compared.rollouts(theta, starts).returns - together.returns).max()
-        if most and rollouts.exact(other):
+        if most and is_exact(other):
             raise TaskError(f"returns on backend {backend} differ by up to {most:.3g}: its class needs exact = False")
         speed = _speed(compared, theta, starts)
         yield f"backend {backend}: returns differ by at most {most:.3g}; {speed:.0f} rollouts/s"

@@ -20,7 +20,7 @@ from farm.seeds import SEEDS, trial
 from farm.settings import Settings, setting
 from farm.sim.mixed import names
 from farm.tasks.base import TaskSpec
-from farm.tasks.outcomes import drawn
+from farm.tasks.rollouts import drawn
 from learner.again.replay import loaded
 from learner.run.config import MOST_GENERATIONS
 from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from farm import rollouts
 from farm.errors import ConfigError
 from farm.net.session import free_endpoint
+from farm.runner import make_backend
 from farm.settings import Settings, setting
 from learner.commands.learner import learn
 from learner.commands.options import LearnerOptions, parse
@@ -28,7 +28,7 @@ class RunCommand(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rollouts.backend(self.backend)
+        make_backend(self.backend)
 
 
 def main(words: Sequence[str]) -> int:

@@ -178,7 +178,7 @@ _MANY: Final[Mapping[str, Any]] = {
 @cache
 def _general(task: plugins.Plugin) -> Mapping[str, Any]:
     """Of a task without presets."""
-    from farm.rollouts import build_task  # imports MuJoCo, which looks for a screen once, when it is imported
+    from farm.runner import build_task  # imports MuJoCo, which looks for a screen once, when it is imported
     from farm.tasks.probe import specification
 
     with suppress(Exception):  # what is wrong with it is said when it is used

@@ -5,7 +5,7 @@ import logging
 from farm import fingerprint
 from farm.arrays import FloatArray
 from farm.net.work import Jobs, Simulated
-from farm.rollouts import Runner
+from farm.runner import Runner
 from learner.run.setup import Problem
 from learner.scheduler.round import bits
 

@@ -8,18 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import fingerprint, plugins, rollouts, seeds, settings
+from farm import fingerprint, plugins, seeds, settings
 from farm.arrays import FloatArray
 from farm.errors import CheckpointError, ConfigError
 from farm.net.messages import Spec
 from farm.policies.base import Policy, check_vector
 from farm.policies.fourier import Kernel, Projected
-from farm.rollouts import Runner, build_policy, build_task, draw_constants
+from farm.runner import SIMULATION, Runner, build_policy, build_task, draw_constants
 from farm.sim.model_files import Files, split
 from farm.sim.scene import Scene
 from farm.tasks.base import Task, TaskSpec
-from farm.tasks.outcomes import whole
 from farm.tasks.probe import specification
+from farm.tasks.rollouts import steps_shape
 from farm.tasks.standard import nominal
 from learner import algorithms
 from learner.algorithms import SearchState
@@ -53,7 +53,7 @@ class Problem:
         """What results look like; with `steps` traces of that kind."""
         spec = self.spec
         return Shapes(
-            trace=whole(spec) if steps else spec.trace_shape, frame=spec.shapes(len(self.scene.bodies)),
+            trace=steps_shape(spec) if steps else spec.trace_shape, frame=spec.shapes(len(self.scene.bodies)),
             observation=spec.observation, measures=len(spec.measures), substeps=self.task.substeps,
         )  # fmt: skip
 
@@ -100,7 +100,7 @@ class Problem:
     def code(self) -> dict[str, str]:
         """Digests of the code that determines its numbers."""
         parts = {name: plugin.digest() for name, plugin in self._plugins.items()}
-        return parts | {"simulation": plugins.code_digest(rollouts.SIMULATION)}
+        return parts | {"simulation": plugins.code_digest(SIMULATION)}
 
     @cached_property
     def _plugins(self) -> dict[str, plugins.Plugin]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import writing
-from farm.tasks.loop import RETURN_FLOOR
+from farm.tasks.rollouts import RETURN_FLOOR
 from learner import parquet
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder

@@ -29,7 +29,7 @@ import numpy as np
 from farm import seeds, settings
 from farm.errors import ConfigError, RunError, writing
 from farm.net import keys
-from farm.tasks.loop import Seed
+from farm.tasks.rollouts import Seed
 from learner.run import config as configs
 from learner.run import setup
 from learner.run.config import RunConfig

@@ -24,12 +24,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
-from farm import plugins, rollouts
+from farm import plugins
 from farm.errors import ConfigError, RunError
 from farm.link import Link
 from farm.net import session
 from farm.net.session import free_endpoint
 from farm.processes import LocalWorkers, cores, end
+from farm.runner import make_backend
 from farm.settings import setting
 from learner.run import config as configs
 from learner.run.config import RunConfig
@@ -75,7 +76,7 @@ class Sharing(Link):
             raise ConfigError("--workers with --tls: a farm's workers have certificates of their own; see farm worker")
         if self.workers == 0 and not self.connect:
             raise ConfigError("--workers 0 without --connect: there would be no workers")
-        rollouts.backend(self.backend)
+        make_backend(self.backend)
 
     @property
     def processes(self) -> int:

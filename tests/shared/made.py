@@ -8,7 +8,7 @@ from farm import plugins
 from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report
-from farm.rollouts import SIMULATION
+from farm.runner import SIMULATION
 from farm.sim.trajectory import Trajectory
 from learner.algorithms import PGPE
 from learner.run.checkpoint import Checkpoint

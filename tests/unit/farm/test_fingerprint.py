@@ -9,7 +9,7 @@ import pytest
 from farm import fingerprint, plugins
 from farm.policies import fourier
 from farm.sim.sim import Sim
-from farm.tasks import loop
+from farm.tasks import loop, rollouts
 
 
 def fresh() -> str:
@@ -24,7 +24,7 @@ def test_every_process_says_the_same() -> None:
 
 
 def _reward(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = loop.discounted
+    whole = rollouts.discounted
     monkeypatch.setattr(loop, "discounted", lambda terms, *scales: whole(np.nextafter(terms, 1.0), *scales))
 
 

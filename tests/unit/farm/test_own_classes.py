@@ -8,9 +8,8 @@ import pytest
 from made import POLE, pole
 
 from farm import plugins
-from farm import rollouts as rolling
 from farm.errors import ConfigError, TaskError
-from farm.rollouts import backend, build_task
+from farm.runner import build_task, make_backend
 from farm.sim.sim import Sim
 from learner.run.config import RunConfig, configure
 from learner.run.setup import problem
@@ -18,21 +17,20 @@ from workers.backends.cpu import CpuBackend
 
 
 def test_backends_by_name(tmp_path):
-    assert isinstance(backend("cpu"), CpuBackend)
+    assert isinstance(make_backend("cpu"), CpuBackend)
     with pytest.raises(ConfigError, match="unknown backend 'gpu'; known are cpu"):
-        backend("gpu")
+        make_backend("gpu")
     path = pole(tmp_path, "import farm\nclass Mine(farm.Task):\n    def __init__(self): pass\n", "mine.py")
     with pytest.raises(ConfigError, match=r"mine.py:Mine is no backend: it needs capacity and engine"):
-        backend(f"{path}:Mine")
+        make_backend(f"{path}:Mine")
     with pytest.raises(ConfigError, match=r"its __init__ must take config, variant and files"):
         build_task(plugins.find("tasks", f"{path}:Mine"), {}, None)
-    assert rolling.SIMULATION == "farm.tasks.loop"
 
 
 def test_backends_that_cannot_be_are_named(tmp_path):
     path = pole(tmp_path, "class Mine:\n    capacity = 'x'\n    def engine(self, model): return 3\n", "mine.py")
     with pytest.raises(ConfigError, match="mine.py:Mine is 'x'; expected a whole number of at least 1"):
-        backend(f"{path}:Mine")
+        make_backend(f"{path}:Mine")
     with pytest.raises(TaskError, match="the backend gave a int, which is no engine: it has no model, size, field"):
         Sim(3)
 

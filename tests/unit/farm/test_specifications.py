@@ -13,7 +13,7 @@ from farm.net import codec
 from farm.net.messages import Spec
 from farm.net.work import Jobs
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import Runner, served
+from farm.runner import Runner, served
 from farm.tasks.probe import specification
 
 

@@ -10,7 +10,7 @@ from farm.errors import FarmError
 from farm.net.work import Jobs
 from farm.policies.networks import Linear
 from farm.policies.recurrent import Cpg, Rnn
-from farm.rollouts import Runner, backend, exact
+from farm.runner import Runner, is_exact, make_backend
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
@@ -55,8 +55,8 @@ class Kicked(Task):
 @pytest.fixture(scope="module")
 def runners() -> tuple[Runner, Runner]:
     """Of one task, on the processor and in Warp."""
-    made = backend("warp")
-    assert not exact(made)
+    made = make_backend("warp")
+    assert not is_exact(made)
     task = Kicked(TaskConfig())
     policy = Linear(Linear.Config(), specification(task), {})
     return Runner(task, policy), Runner(task, policy, made.engine, exact=False)
@@ -87,7 +87,7 @@ class Either(Kicked):
 def test_several_models_in_one_batch_are_mujocos_to_single_precision() -> None:
     task = Either(TaskConfig())
     policy = Linear(Linear.Config(), specification(task), {})
-    cpu, gpu = Runner(task, policy), Runner(task, policy, backend("warp").engine, exact=False)
+    cpu, gpu = Runner(task, policy), Runner(task, policy, make_backend("warp").engine, exact=False)
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
     drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
     expected, found = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)

@@ -9,12 +9,12 @@ import pytest
 from farm import Task
 from farm.errors import ConfigError, TaskError
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.sim.engines import BatchEngine
 from farm.sim.mixed import MixedEngine
 from farm.sim.scene import MODEL, Scene
-from farm.tasks.loop import Rollouts, whole
 from farm.tasks.probe import specification
+from farm.tasks.rollouts import Rollouts, whole
 
 XML = """<mujoco model="{name}"><option timestep="0.01"/><worldbody>
   <geom name="floor" type="plane" size="2 2 0.1"/>

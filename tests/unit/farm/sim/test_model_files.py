@@ -12,7 +12,7 @@ from robot import ARM, SCENE, robot, stl
 from farm import plugins
 from farm.__main__ import main as command
 from farm.errors import ConfigError
-from farm.rollouts import build_task
+from farm.runner import build_task
 from farm.sim import model_files
 from farm.sim.model_files import by_digest, compiled, joined, read, split
 

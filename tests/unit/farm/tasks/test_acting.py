@@ -8,11 +8,11 @@ from farm.errors import TaskError
 from farm.policies.base import Policy, PolicyConfig
 from farm.policies.normalised import Normalised
 from farm.policies.recurrent import Cpg, Rnn
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
-from farm.tasks.acting import Acting
 from farm.tasks.base import Task
+from farm.tasks.loop import Acting
 from farm.tasks.probe import specification
 
 

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Dict, Discrete, OneOf, Tuple, flatdim, flatten
 
 from farm.errors import ConfigError, TaskError
 from farm.policies.networks import Linear, LinearConfig
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
 from farm.tasks.loop import Batch
 from farm.tasks.standard import standard

@@ -9,12 +9,13 @@ import pytest
 
 from farm.errors import TaskError
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.sim.engines import BatchEngine, DataEngine
 from farm.sim.sim import WRITABLE, Sim
 from farm.tasks.base import Task
-from farm.tasks.loop import Batch, Rollouts
+from farm.tasks.loop import Batch
 from farm.tasks.probe import specification
+from farm.tasks.rollouts import Rollouts
 
 XML = """<mujoco><option timestep="0.01"/><worldbody>
   <body name="goal" mocap="true" pos="0 0 2"><geom size="0.05" contype="0" conaffinity="0"/></body>

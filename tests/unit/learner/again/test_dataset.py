@@ -11,7 +11,7 @@ from alone import POLE, Alone
 
 from farm.errors import RunError
 from farm.net.work import Jobs, Results
-from farm.tasks.outcomes import whole
+from farm.tasks.rollouts import steps_shape
 from learner.again import dataset
 from learner.again.dataset import DataSet, Work
 from learner.again.replay import restored
@@ -78,7 +78,7 @@ def make(run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
         assert not of.begin(run)
         at = checkpoints.load(run.checkpoint)
         problem = restored(run, at)
-        monkeypatch.setattr(dataset, "PART", 2 * 4 * int(np.prod(whole(problem.spec))))
+        monkeypatch.setattr(dataset, "PART", 2 * 4 * int(np.prod(steps_shape(problem.spec))))
         work = Work(of, problem, at, True)
         assert work.parts == 4
         hosts = Hosts(work, change, expelled.get("expelled", {}))

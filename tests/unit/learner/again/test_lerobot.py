@@ -8,7 +8,7 @@ import pytest
 
 from farm.sim.channels import Channel
 from farm.tasks.base import TaskSpec
-from farm.tasks.outcomes import whole
+from farm.tasks.rollouts import steps_shape
 from learner import parquet
 from learner.again.lerobot import Episode, Format
 
@@ -40,7 +40,7 @@ def data(tmp_path: Path) -> Format:
     """Two parts, of two episodes and of one."""
     rng, made = np.random.default_rng(0), Format(tmp_path, SPEC, "pole.py:Pole")
     episodes = [
-        Episode((4, 1, i, 0), rng.normal(size=(i + 2, whole(SPEC)[1])).astype("<f4"), float(i), i == 1, False)
+        Episode((4, 1, i, 0), rng.normal(size=(i + 2, steps_shape(SPEC)[1])).astype("<f4"), float(i), i == 1, False)
         for i in range(3)
     ]
     made.write(0, 0, 0, episodes[:2])

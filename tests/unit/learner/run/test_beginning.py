@@ -10,7 +10,7 @@ from alone import POLE, learnt
 
 from farm import plugins, seeds
 from farm.errors import ConfigError
-from farm.rollouts import served
+from farm.runner import served
 from learner.again.replay import load
 from learner.run import checkpoint as checkpoints
 from learner.run import setup

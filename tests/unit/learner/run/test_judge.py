@@ -7,7 +7,7 @@ import pytest
 
 from farm import fingerprint
 from farm.net.work import Jobs
-from farm.rollouts import NOT_NORMALISED
+from farm.runner import NOT_NORMALISED
 from learner.run.config import RunConfig
 from learner.run.judge import LocalJudge
 from learner.run.setup import problem

@@ -8,7 +8,7 @@ import pytest
 from made import stats
 
 from farm.errors import ConfigError
-from farm.tasks.loop import RETURN_FLOOR
+from farm.tasks.rollouts import RETURN_FLOOR
 from learner.commands import sweep as command
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder

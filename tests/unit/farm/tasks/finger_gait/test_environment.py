@@ -13,14 +13,14 @@ from gymnasium.utils.env_checker import check_env
 from farm.errors import ConfigError
 from farm.policies.fourier import Kernel, KernelConfig
 from farm.policies.recurrent import Rnn, RnnConfig
-from farm.rollouts import Runner
-from farm.tasks.acting import Acting
+from farm.runner import Runner
 from farm.tasks.finger_gait.env import FingerGaitEnv
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import STATES
 from farm.tasks.finger_gait.rewards import RETURN_SCALE, WEIGHTS
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
-from farm.tasks.loop import discounted
+from farm.tasks.loop import Acting
+from farm.tasks.rollouts import discounted
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

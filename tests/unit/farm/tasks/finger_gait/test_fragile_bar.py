@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from farm.errors import ConfigError
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.base import Record
 from farm.tasks.finger_gait.fragile_bar import BREAKS, HEIGHT, TERMS, WINDOW, FragileBar, FragileBarConfig
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
-from farm.tasks.loop import Batch, Rollouts, Seed, again
+from farm.tasks.loop import Batch, again
+from farm.tasks.rollouts import Rollouts, Seed
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

@@ -8,7 +8,7 @@ from learning import learnt
 from farm import settings
 from farm.errors import ConfigError
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.env import FingerGaitEnv
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig

@@ -13,7 +13,8 @@ from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS
 from farm.tasks.finger_gait.holding import MOVED, TURNED, moved
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
-from farm.tasks.loop import Batch, Rollouts, again, whole
+from farm.tasks.loop import Batch, again
+from farm.tasks.rollouts import Rollouts, whole
 
 
 def held(config: FingerGaitConfig) -> tuple[FingerGait, Rollouts]:

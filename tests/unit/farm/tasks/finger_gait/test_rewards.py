@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import Felt
 from farm.tasks.finger_gait.rewards import RETURN_SCALE, REWARDS, TERMS, WEIGHTS, end
-from farm.tasks.loop import RETURN_FLOOR
-from farm.tasks.loop import discounted as _discounted
+from farm.tasks.rollouts import RETURN_FLOOR
+from farm.tasks.rollouts import discounted as _discounted
 
 STEPS = 15
 

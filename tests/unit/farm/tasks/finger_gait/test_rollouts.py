@@ -10,7 +10,7 @@ import pytest
 from farm import plugins
 from farm.errors import ConfigError
 from farm.policies.base import Policy
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.base import Record
 from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.grasp import Grasping
@@ -20,7 +20,7 @@ from farm.tasks.finger_gait.observations import Felt
 from farm.tasks.finger_gait.rewards import WEIGHTS
 from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
-from farm.tasks.loop import Rollouts, discounted
+from farm.tasks.rollouts import Rollouts, discounted
 
 POLICIES = ("direct", "projected", "kernel", "cosine")
 CENTRE = {"direct": 0.0, "cosine": np.pi / 2, "projected": 1.0, "kernel": 0.6}

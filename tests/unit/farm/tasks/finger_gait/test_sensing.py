@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from farm.errors import ConfigError
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.finger_gait.fragile_bar import FragileBarConfig
 from farm.tasks.finger_gait.hand import JOINTS
 from farm.tasks.finger_gait.sensing import ZERO, Perturbation, SensingConfig
-from farm.tasks.loop import Batch, Seed
+from farm.tasks.loop import Batch
+from farm.tasks.rollouts import Seed
 from learner.run.config import configure
 from learner.run.setup import problem
 
@@ -113,12 +114,17 @@ def test_a_zeroed_hand_holds_still_first_and_sees_no_constant_error():
 
 
 def test_stiffer_servos_are_pushed_back_less():
-    soft, _ = observed(state="zeroed", joint_noise=0.0, joint_bias=0.0, action=CLOSING / 4)
     runner = problem(configure("fragile-bar", stiffness=4.0)).runner()
     assert runner.task.model.actuator_gainprm[:, 0].tolist() == [12.0] * 8
     assert runner.task.model.actuator_biasprm[:, 1].tolist() == [-12.0] * 8
     runner.close()
-    assert np.isfinite(soft[:ZERO]).all()
+    soft, stiff = (
+        observed(state="zeroed", joint_noise=0.0, joint_bias=0.0, action=CLOSING / 4, stiffness=factor)[0] / factor
+        for factor in (1.0, 4.0)
+    )  # as forces by the servos' stiffness; without it, as angles
+    for each in (soft, stiff):
+        assert (each[:ZERO] == 0.0).all()
+    assert (np.abs(stiff).mean(axis=(0, 1)) < 0.7 * np.abs(soft).mean(axis=(0, 1))).all()
 
 
 @pytest.mark.parametrize(

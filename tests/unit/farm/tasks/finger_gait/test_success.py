@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from farm.tasks.base import Record
 from farm.tasks.finger_gait.hand import GRIPS, TIP_RADIUS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, PRESSES, moved, touching
-from farm.tasks.loop import discounted
+from farm.tasks.rollouts import discounted
 
 STEPS = 15
 START = np.array([0.08, 0.04, 0.02, 1.0, 0.0, 0.0, 0.0])

@@ -11,7 +11,7 @@ from benchmarks.turning import Keys, Script, script_of, task, turn
 from farm.errors import ConfigError
 from farm.policies.base import PolicyConfig
 from farm.policies.networks import Linear
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.tasks.base import Record
 from farm.tasks.finger_gait.hand import FINGERS, JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD, SUBSTEPS, TIMESTEP

@@ -8,7 +8,7 @@ import pytest
 from farm.net import codec
 from farm.net.work import Jobs, Results, Simulated
 from farm.policies.fourier import Direct, FeaturesConfig
-from farm.rollouts import Runner
+from farm.runner import Runner
 from farm.settings import setting
 from farm.sim.channels import Channel
 from farm.tasks.base import Task, TaskConfig

@@ -23,8 +23,8 @@ from farm.sim.sim import Sim
 from farm.sim.trajectory import Trajectory
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
-from farm.tasks.outcomes import shares, stepped, whole
 from farm.tasks.probe import specification
+from farm.tasks.rollouts import Rollouts, Seed, channel_traces, shares, step_traces, steps_shape, trajectory
 from farm.tasks.standard import standard
 
 SIMULATION = "farm.tasks.loop"
@@ -121,12 +121,12 @@ class Runner:
 
     def _traces(self, done: "list[_Part]", selection: IntArray, *, steps: bool) -> AnyArray:
         """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
-        values = np.zeros((len(selection), *(whole(self.spec) if steps else self.spec.trace_shape)), dtype="<f4")
-        traces = stepped if steps else loop.traces
+        values = np.zeros((len(selection), *(steps_shape(self.spec) if steps else self.spec.trace_shape)), dtype="<f4")
+        make = step_traces if steps else channel_traces
         for rows, rollouts in done if len(selection) else ():
             mask = np.isin(selection, rows)
             if mask.any():
-                values[mask] = traces(self.task, self.spec, rollouts, np.searchsorted(rows, selection[mask]))
+                values[mask] = make(self.task, self.spec, rollouts, np.searchsorted(rows, selection[mask]))
         return values
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy]:
@@ -139,13 +139,13 @@ class Runner:
         return around, earlier
 
     @plugins.no_exit
-    def rollouts(self, theta: FloatArray, seeds: Sequence[loop.Seed], *, physics: bool = False) -> loop.Rollouts:
+    def rollouts(self, theta: FloatArray, seeds: Sequence[Seed], *, physics: bool = False) -> Rollouts:
         """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
         return loop.run(self.task, self.policy, self.sim, theta, seeds, 1 if physics else 0)
 
-    def trajectory(self, rollouts: loop.Rollouts, row: int) -> Trajectory:
+    def trajectory(self, rollouts: Rollouts, row: int) -> Trajectory:
         """One of them, frame by frame."""
-        return loop.trajectory(self.task, self.spec, self.scene, rollouts, row)
+        return trajectory(self.task, self.spec, self.scene, rollouts, row)
 
     def close(self) -> None:
         """Release its resources."""
@@ -153,11 +153,11 @@ class Runner:
             sim.engine.close()
 
 
-_Part: TypeAlias = tuple[IntArray, loop.Rollouts]
+_Part: TypeAlias = tuple[IntArray, Rollouts]
 """Some of a call's rollouts: their rows, and their results."""
 
 
-def _placed(parts: list[_Part], values: Callable[[loop.Rollouts], AnyArray]) -> AnyArray:
+def _placed(parts: list[_Part], values: Callable[[Rollouts], AnyArray]) -> AnyArray:
     """Values of all rollouts (S, ...), from those of each part."""
     pieces = [values(rollouts) for _, rollouts in parts]
     if len(parts) == 1:  # the usual case: its rows are all rows
@@ -168,7 +168,7 @@ def _placed(parts: list[_Part], values: Callable[[loop.Rollouts], AnyArray]) -> 
     return out
 
 
-def _moments(rollouts: loop.Rollouts, size: int) -> FloatArray:
+def _moments(rollouts: Rollouts, size: int) -> FloatArray:
     """Moments of the observations (n, 1 + 2 d) as they are sent: zeros for those that failed or have none."""
     if not rollouts.moments.size:
         return np.zeros((len(rollouts.returns), 1 + 2 * size))
@@ -278,7 +278,7 @@ def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple
     return plugin
 
 
-def backend(name: str) -> Backend:
+def make_backend(name: str) -> Backend:
     """The backend with this name; a ConfigError if there is none, or if it is no backend."""
     target = plugins.find("backends", name).target
     if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
@@ -288,6 +288,6 @@ def backend(name: str) -> Backend:
     return cast("Backend", target())
 
 
-def exact(backend: Backend) -> bool:
+def is_exact(backend: Backend) -> bool:
     """Whether a backend's numbers are those of the backend `cpu`."""
     return bool(getattr(backend, "exact", True))
