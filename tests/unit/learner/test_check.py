@@ -80,8 +80,8 @@ def test_a_task_that_exits_is_a_failure_that_names_it(
     path.write_text(f"{before}{head}{first}\n        sys.exit(5)\n{rest}")
     assert main(["check", f"{path}:Leaves", "--picture", str(tmp_path / "x.png")]) == 1
     line = path.read_text().partition("sys.exit")[0].count("\n") + 1
-    said = capsys.readouterr().err
-    assert said == f"farm: sys.exit(5) in leaves.py, line {line}: raise an error instead\n"
+    errors = capsys.readouterr().err
+    assert errors == f"farm: sys.exit(5) in leaves.py, line {line}: raise an error instead\n"
 
 
 SLIDES = """import random
@@ -118,24 +118,24 @@ def written(folder: Path, members: str = "", reward: str = "sim.qpos[:, 0]") -> 
 def checks(folder: Path, capsys: pytest.CaptureFixture[str], members: str = "", reward: str = "sim.qpos[:, 0]") -> str:
     """What `farm check` says of it, errors included."""
     status = main(["check", written(folder, members, reward)])
-    said = capsys.readouterr()
-    assert status == (1 if said.err else 0)
-    return said.out + said.err
+    output = capsys.readouterr()
+    assert status == (1 if output.err else 0)
+    return output.out + output.err
 
 
 def warnings(name: str) -> list[str]:
-    found = problem(configure(name))
-    return [*check._odd(found.runner().rollouts(*check._batch(found))), *check._unread(type(found.task))]
+    subject = problem(configure(name))
+    return [*check._odd(subject.runner().rollouts(*check._batch(subject))), *check._unread(type(subject.task))]
 
 
 @pytest.mark.usefixtures("no_picture")
 def test_nothing_odd_is_said_of_a_sound_task_and_its_terms_move_no_cursor(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = checks(tmp_path, capsys, reward="{'\\x1b[2J\\x9b1m': sim.qpos[:, 0]}")
-    assert "warning" not in said
-    assert "reward of \\x1b[2J\\x9b1m\n" in said
-    assert "same bits together, in another order, one by one, and in another process" in said
+    output = checks(tmp_path, capsys, reward="{'\\x1b[2J\\x9b1m': sim.qpos[:, 0]}")
+    assert "warning" not in output
+    assert "reward of \\x1b[2J\\x9b1m\n" in output
+    assert "same bits together, in another order, one by one, and in another process" in output
 
 
 @pytest.mark.usefixtures("no_picture")
@@ -161,16 +161,16 @@ def test_a_policy_of_ones_own_is_checked(
         f"    memory = {memory}\n    def act(self, prepared, x, memory):\n        return {act}\n"
     )
     assert main(["check", "--policy", f"{tmp_path}/own.py:Own", written(tmp_path)]) == status
-    said = capsys.readouterr()
-    assert said.err.startswith(f"farm: {line}" if line else "")
-    assert said.err.count("\n") == (1 if line else 0)
-    assert line or "same bits together, in another order, one by one, and in another process" in said.out
+    output = capsys.readouterr()
+    assert output.err.startswith(f"farm: {line}" if line else "")
+    assert output.err.count("\n") == (1 if line else 0)
+    assert line or "same bits together, in another order, one by one, and in another process" in output.out
 
 
 @pytest.mark.usefixtures("no_picture")
 def test_warnings_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = checks(tmp_path, capsys, "    step = 7", "np.ones(len(sim))")
-    assert [line for line in said.splitlines() if line.startswith("warning: ")] == [
+    output = checks(tmp_path, capsys, "    step = 7", "np.ones(len(sim))")
+    assert [line for line in output.splitlines() if line.startswith("warning: ")] == [
         "warning: all 8 rollouts have the same return, so that there is nothing to learn",
         "warning: Slides.step is not read by anything; is steps meant?",
     ]
@@ -202,9 +202,9 @@ def test_perturbations_that_change_no_action_are_said(
     (tmp_path / "deaf.py").write_text(DEAF)
     names = {"DEAF": f"{tmp_path}/deaf.py:Deaf", "SLIDES": written(tmp_path)}
     assert main(["check", *(names.get(word, word) for word in words)]) == 0
-    said = [line for line in capsys.readouterr().out.splitlines() if "no perturbation" in line]
-    assert len(said) == (1 if policy else 0)
-    for line in said:
+    lines = [line for line in capsys.readouterr().out.splitlines() if "no perturbation" in line]
+    assert len(lines) == (1 if policy else 0)
+    for line in lines:
         assert line.startswith("warning: no perturbation changes any action: ")
         assert f"change those of policy {names.get(policy, policy)} by at most " in line
         assert line.endswith(f", so that a run learns nothing; try {advice}")
@@ -255,16 +255,16 @@ def test_numbers_of_a_process_of_its_own_are_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("PYTHONHASHSEED", "0")  # inherited, it would give the second process the same hashes
-    said = checks(tmp_path, capsys, members, reward).splitlines()[-1]
-    assert said.startswith(f"farm: {name} differs when the same rollouts run in another process: numbers must not")
+    output = checks(tmp_path, capsys, members, reward).splitlines()[-1]
+    assert output.startswith(f"farm: {name} differs when the same rollouts run in another process: numbers must not")
 
 
 @pytest.mark.usefixtures("no_picture")
 def test_a_task_that_another_process_cannot_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     once = "    from pathlib import Path; Path(__file__).with_suffix('.once').touch(exist_ok=False)"
-    said = checks(tmp_path, capsys, once).splitlines()[-1]
-    assert said.startswith("farm: the same rollouts cannot be simulated in another process: ")
-    assert "FileExistsError" in said
+    output = checks(tmp_path, capsys, once).splitlines()[-1]
+    assert output.startswith("farm: the same rollouts cannot be simulated in another process: ")
+    assert "FileExistsError" in output
 
 
 @pytest.mark.skipif(
@@ -277,6 +277,6 @@ def test_a_picture_is_drawn_without_a_display(tmp_path: Path) -> None:
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
     command = [sys.executable, "-P", "-m", "farm", "check", "pendulum.py:Pendulum"]
-    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-    assert ended.stdout.splitlines()[-1] == "the start: pendulum.png"
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert process.stdout.splitlines()[-1] == "the start: pendulum.png"
     assert (tmp_path / "pendulum.png").stat().st_size > 1000

@@ -29,28 +29,28 @@ def rows(text: str) -> dict[str, list[str]]:
 
 def test_a_table_has_what_differs_and_what_came_out() -> None:
     other = configure(preset="thesis", seed=7, features=99)
-    ended = {"mean_policy_return": -0.0619, "mean_policy_success": True, "robust_success_rate": 0.98}
+    summary = {"mean_policy_return": -0.0619, "mean_policy_success": True, "robust_success_rate": 0.98}
     runs = [
-        compared("a", RunConfig(), [False, False, True, True], **ended, parameters_sha256="0123456789abcdef"),
+        compared("a", RunConfig(), [False, False, True, True], **summary, parameters_sha256="0123456789abcdef"),
         compared("b", other, [False, False]),
         compared("c", RunConfig(seed=1), [True]),
         compared("d", configure(preset="thesis", seed=7, features=50), [False]),
     ]
-    found = rows(table(runs))
-    assert found[""] == ["**a**", "**b**", "**c**", "**d**"]
-    assert found["preset"] == ["default", "own", "default", "own"]
-    assert found["seed"] == ["0", "7", "1", "7"]
-    assert found["features"] == ["-", "99", "-", "50"], "the kernel has none"
-    assert found["policy"] == ["kernel", "projected", "kernel", "projected"]
-    assert found["generations done"] == ["4", "2", "1", "1"]
-    assert found["rollouts"] == ["120", "60", "30", "30"]
-    assert found["return of the final policy"] == ["-0.062", "-", "-", "-"]
-    assert found["it succeeds"] == ["yes", "-", "-", "-"]
-    assert found["robust success"] == ["98%", "-", "-", "-"]
-    assert found["first success, generation"] == ["2", "-", "0", "-"]  # a generation shows the policy before its update
-    assert found["hash"] == ["01234567", "-", "-", "-"]
-    assert "gamma" not in found  # the same everywhere
-    assert {len(row) for row in found.values()} == {4}
+    cells = rows(table(runs))
+    assert cells[""] == ["**a**", "**b**", "**c**", "**d**"]
+    assert cells["preset"] == ["default", "own", "default", "own"]
+    assert cells["seed"] == ["0", "7", "1", "7"]
+    assert cells["features"] == ["-", "99", "-", "50"], "the kernel has none"
+    assert cells["policy"] == ["kernel", "projected", "kernel", "projected"]
+    assert cells["generations done"] == ["4", "2", "1", "1"]
+    assert cells["rollouts"] == ["120", "60", "30", "30"]
+    assert cells["return of the final policy"] == ["-0.062", "-", "-", "-"]
+    assert cells["it succeeds"] == ["yes", "-", "-", "-"]
+    assert cells["robust success"] == ["98%", "-", "-", "-"]
+    assert cells["first success, generation"] == ["2", "-", "0", "-"]  # a generation shows the policy before its update
+    assert cells["hash"] == ["01234567", "-", "-", "-"]
+    assert "gamma" not in cells  # the same everywhere
+    assert {len(row) for row in cells.values()} == {4}
 
 
 def test_names_are_as_short_as_they_can_be() -> None:
@@ -71,6 +71,6 @@ def test_stored_means(tmp_path: Path) -> None:
     for generation in (1, 2, 3):
         folder.append(progress(generation, False), np.full(4, generation + 0.5), np.ones(4), 3)
     assert folder.parameters.mean(2)[0].tolist() == [2.5] * 4
-    for wanted, nearest in ((9, 3), (-4, 1)):
+    for number, nearest in ((9, 3), (-4, 1)):
         with pytest.raises(ConfigError, match=f"stored are 1 to 3, the nearest is {nearest}"):
-            folder.parameters.mean(wanted)
+            folder.parameters.mean(number)

@@ -23,9 +23,9 @@ def screen(workers: list[WorkerStatus], width: int, show: Callable[[], None] = l
     run = cast("Any", SimpleNamespace(learner=learner, dispatcher=dispatcher, recording=None, live=None))
     report = Report(progress=stats(ended=1, failed=1), rate=1.0)
     file = io.StringIO()
-    with LiveDisplay(Console(file=file, force_terminal=True, width=width, color_system=None), run, []) as shown:
+    with LiveDisplay(Console(file=file, force_terminal=True, width=width, color_system=None), run, []) as display:
         show()
-        shown.show(report)
+        display.show(report)
     return file.getvalue()
 
 
@@ -36,23 +36,23 @@ def worker(name: str, rate: float, host: str = "h") -> WorkerStatus:
 def test_nothing_of_the_network_reaches_the_terminal_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging.root, "handlers", [])
     attacker = worker(f"w{ATTACK}/1", 1.0, f"h{ATTACK}")
-    said = screen([attacker], 300, lambda: logging.getLogger().warning("it says %s", ATTACK))
-    assert "it says \\x1b[2J" in said
-    assert "h\\x1b[2J" in said
+    text = screen([attacker], 300, lambda: logging.getLogger().warning("it says %s", ATTACK))
+    assert "it says \\x1b[2J" in text
+    assert "h\\x1b[2J" in text
     for part in ("\x1b[2J", "\x1b]", "\a", "\u202e", "\x9b"):
-        assert part not in said
-    assert "[bold]" in said
+        assert part not in text
+    assert "[bold]" in text
 
 
 def test_the_workers_rates_add_up_to_the_farms() -> None:
-    said = screen([worker(f"h/{i}", 0.5 + i) for i in range(9)], 80)
-    rates = [int(line.split("rollouts/s")[0].split()[-1]) for line in said.splitlines() if "rollouts/s" in line]
-    named = [int(line.split()[0]) for line in said.splitlines() if "h/" in line or line.strip().endswith(" more")]
-    assert rates[-1] == sum(named[-7:])
+    text = screen([worker(f"h/{i}", 0.5 + i) for i in range(9)], 80)
+    rates = [int(line.split("rollouts/s")[0].split()[-1]) for line in text.splitlines() if "rollouts/s" in line]
+    parts = [int(line.split()[0]) for line in text.splitlines() if "h/" in line or line.strip().endswith(" more")]
+    assert rates[-1] == sum(parts[-7:])
 
 
 @pytest.mark.parametrize("width", [58, 80, 120])
 def test_nothing_is_cut_off(width: int) -> None:
-    said = screen([worker("lab-machine-3/123456", 1234.0, "lab-machine-3")], width)
-    assert "…" not in said
-    assert "1 rollouts ended early, 1 failed" in said
+    text = screen([worker("lab-machine-3/123456", 1234.0, "lab-machine-3")], width)
+    assert "…" not in text
+    assert "1 rollouts ended early, 1 failed" in text

@@ -57,14 +57,14 @@ def events(folder: Path) -> list[object]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from tensorboardX.proto.event_pb2 import Event
-    found = []
+    records = []
     for path in sorted(folder.glob("events.*")):
         content = path.read_bytes()
         while content:
             (size,) = struct.unpack("<Q", content[:8])
-            found.append(Event.FromString(content[12 : 12 + size]))
+            records.append(Event.FromString(content[12 : 12 + size]))
             content = content[16 + size :]
-    return found
+    return records
 
 
 def test_tensorboard_has_every_figure_of_every_generation(tmp_path: Path) -> None:
@@ -80,10 +80,10 @@ def test_tensorboard_has_every_figure_of_every_generation(tmp_path: Path) -> Non
     assert curves["mean_policy_success"] == [(1, 1.0), (2, 1.0)]
     assert curves["measures_height"] == [(1, 0.25), (2, 0.25)]
     tables = {"measures", "mean_policy_measures"}
-    known = set(GenerationStats.__dataclass_fields__) - {"generation", "success_rate"} - tables
-    assert set(curves) == known | {"measures_height"}, "what is not known is left out"
-    for name, wanted in (("config", CONFIG), ("summary", SUMMARY)):
-        assert json.loads(texts[name].removeprefix("```json\n").removesuffix("\n```")) == wanted
+    names = set(GenerationStats.__dataclass_fields__) - {"generation", "success_rate"} - tables
+    assert set(curves) == names | {"measures_height"}, "what is not known is left out"
+    for name, expected in (("config", CONFIG), ("summary", SUMMARY)):
+        assert json.loads(texts[name].removeprefix("```json\n").removesuffix("\n```")) == expected
 
 
 def test_a_run_that_goes_on_replaces_what_was_logged_beyond_its_checkpoint(tmp_path: Path) -> None:
@@ -95,29 +95,29 @@ def test_a_run_that_goes_on_replaces_what_was_logged_beyond_its_checkpoint(tmp_p
 
 
 def test_wandb_has_the_figures_and_goes_on_with_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[tuple[str, object]] = []
+    calls: list[tuple[str, object]] = []
     run = SimpleNamespace(
-        log=lambda figures, step: said.append((f"step {step}", figures["return_mean"])),
-        summary=SimpleNamespace(update=lambda summary: said.append(("summary", summary))),
-        finish=lambda exit_code: said.append(("finish", exit_code)),
+        log=lambda figures, step: calls.append((f"step {step}", figures["return_mean"])),
+        summary=SimpleNamespace(update=lambda summary: calls.append(("summary", summary))),
+        finish=lambda exit_code: calls.append(("finish", exit_code)),
     )
 
-    def init(**given: object) -> object:
-        said.append(("init", (given["name"], given["id"], given["config"])))
+    def init(**settings: object) -> object:
+        calls.append(("init", (settings["name"], settings["id"], settings["config"])))
         return run
 
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init, Settings=dict))
     logged(("wandb",), tmp_path)
-    own = (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG)
+    start = (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG)
     end = [("summary", SUMMARY), ("finish", 0)]
-    assert said == [("init", own), ("step 1", -0.5), ("step 2", -1.0), *end]
-    said.clear()
+    assert calls == [("init", start), ("step 1", -0.5), ("step 2", -1.0), *end]
+    calls.clear()
     logged(("wandb",), tmp_path, first=3, last=3)
-    assert said == [("init", own), ("step 3", -1.5), *end]
-    said.clear()
+    assert calls == [("init", start), ("step 3", -1.5), *end]
+    calls.clear()
     logged(("wandb",), tmp_path, first=2, last=2)  # a host was expelled: no step is logged twice in one run
-    assert said[0] == ("init", (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG)) != ("init", own)
-    assert said[1:] == [("step 2", -1.0), *end]
+    assert calls[0] == ("init", (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG)) != ("init", start)
+    assert calls[1:] == [("step 2", -1.0), *end]
 
 
 @pytest.mark.slow
@@ -131,14 +131,14 @@ def test_wandb_itself_without_a_network(tmp_path: Path, monkeypatch: pytest.Monk
 def test_one_that_fails_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "own.py").write_text(OWN)
     logged((f"{tmp_path}/own.py:Failing", "tensorboard"), tmp_path, last=3)
-    (said,) = caplog.messages
-    assert said == f"--log {tmp_path}/own.py:Failing ends here, learning continues: OSError: the disk is full"
+    (message,) = caplog.messages
+    assert message == f"--log {tmp_path}/own.py:Failing ends here, learning continues: OSError: the disk is full"
     assert (tmp_path / "own.txt").read_text() == "3 0"
     assert max(event.step for event in events(tmp_path / "tensorboard")) == 3
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reason"),
     [
         ("mlflow", "unknown logger 'mlflow'; known are tensorboard, wandb, or FILE.py:CLASS"),
         ("tensorboard", r"--log tensorboard needs tensorboardX: pip install tensorboardX$"),
@@ -146,10 +146,10 @@ def test_one_that_fails_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixt
         ("own.py:Nothing", "--log own.py:Nothing: it is no logger: it has no generation and no end"),
     ],
 )
-def test_those_that_cannot_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, said: str) -> None:
+def test_those_that_cannot_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str) -> None:
     (tmp_path / "own.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=reason):
         Loggers(("own.py:Failing", name), tmp_path, CONFIG, 0)
     assert (tmp_path / "own.txt").read_text() == "ended"

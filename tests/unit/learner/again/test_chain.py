@@ -33,22 +33,22 @@ def gait() -> Make:
     @cache
     def make(start: str, goal: str, item: str = "bar") -> LoadedPolicy:
         config = configure(policy="direct", features=1, start_grip=start, goal_grip=goal, object=item)
-        found = problem(config, {"frequencies": np.zeros((1, 8)), "phases": np.zeros(1)})
-        assert isinstance(found.task, FingerGait)
-        grasping = Grasping(found.task.hand)
+        climb = problem(config, {"frequencies": np.zeros((1, 8)), "phases": np.zeros(1)})
+        assert isinstance(climb.task, FingerGait)
+        grasping = Grasping(climb.task.hand)
         offset = grasping.command(GRIPS[goal]) - grasping.command(GRIPS[start])
-        return LoadedPolicy(found, 0, offset / np.sqrt(2.0))
+        return LoadedPolicy(climb, 0, offset / np.sqrt(2.0))
 
     return make
 
 
-def drawn(count: int) -> list[tuple[int, ...]]:
+def starts(count: int) -> list[tuple[int, ...]]:
     return [(seed,) for seed in range(count)]
 
 
 def test_the_grip_changes_there_and_back_by_touch(gait: Make) -> None:
     add, remove = gait("index+thumb", "index+middle+thumb"), gait("index+middle+thumb", "index+thumb")
-    done = chain([add, remove], drawn(3), 30)
+    done = chain([add, remove], starts(3), 30)
     assert (done.changes >= 4).all()
     assert (done.acting[:, 0] == 0).all()
     for acting, force in zip(done.acting, done.rollouts.frames["force"].sum(axis=-1), strict=True):
@@ -78,13 +78,13 @@ def test_a_policy_with_memory_begins_anew_whenever_its_turn_comes(gait: Make) ->
         )
         for link in links
     ]
-    done, plain = chain(counts, drawn(3), 30), chain(links, drawn(3), 30)
+    done, plain = chain(counts, starts(3), 30), chain(links, starts(3), 30)
     assert np.array_equal(done.acting, plain.acting)
     for acting, controls in zip(done.acting, done.rollouts.actions - plain.rollouts.actions, strict=True):
-        said, count = np.rint(controls.max(axis=1) * 1e6).astype(int).tolist(), 0
+        memories, count = np.rint(controls.max(axis=1) * 1e6).astype(int).tolist(), 0
         for t in range(30):
             count = count + 1 if t and acting[t] == acting[t - 1] else 0
-            assert said[t] == count
+            assert memories[t] == count
     assert (done.changes >= 4).all()
 
 
@@ -105,14 +105,14 @@ def test_only_the_policy_whose_turn_it_is_writes_states(gait: Make, monkeypatch:
         )
         for each in links
     ]
-    seen: list[FloatArray] = []
+    forces: list[FloatArray] = []
     monkeypatch.setattr(
         Pushes,
         "reached",
-        lambda self, sim: seen.append(sim.xfrc_applied[:, -1, 0].copy()) or FingerGait.reached(self, sim),
+        lambda self, sim: forces.append(sim.xfrc_applied[:, -1, 0].copy()) or FingerGait.reached(self, sim),
     )
-    done = chain(pushing, drawn(2), 20)
-    applied = np.array(seen[::2])
+    done = chain(pushing, starts(2), 20)
+    applied = np.array(forces[::2])
     for t, acting in enumerate(done.acting.T):
         if (acting >= 0).all():
             assert np.array_equal(applied[t], 1e-3 * (1 + acting))
@@ -122,17 +122,17 @@ def test_only_the_policy_whose_turn_it_is_writes_states(gait: Make, monkeypatch:
 @pytest.mark.slow
 def test_more_rollouts_than_are_stepped_together_are_the_same(gait: Make) -> None:
     policies = [gait("index+thumb", "index+middle+thumb"), gait("index+middle+thumb", "index+thumb")]
-    many = chain(policies, drawn(66), 4)
-    few = chain(policies, drawn(66)[65:], 4)
+    many = chain(policies, starts(66), 4)
+    few = chain(policies, starts(66)[65:], 4)
     assert np.array_equal(many.rollouts.frames["qpos"][65:], few.rollouts.frames["qpos"])
 
 
 def test_gaits_that_do_not_follow_each_other(gait: Make) -> None:
     add = gait("index+thumb", "index+middle+thumb")
     with pytest.raises(ConfigError, match=r"ends in index\+middle\+thumb is not followed by one from index\+thumb"):
-        chain([add], drawn(1), 3)
+        chain([add], starts(1), 3)
     with pytest.raises(ConfigError, match="simulate different models"):
-        chain([add, gait("index+middle+thumb", "index+thumb", "thick-bar")], drawn(1), 3)
+        chain([add, gait("index+middle+thumb", "index+thumb", "thick-bar")], starts(1), 3)
 
 
 @pytest.mark.parametrize("flags", [{"shown": 2}, {"shown": 1001}, {"steps": 1001}], ids=str)

@@ -34,13 +34,15 @@ class Hosts:
         self._runner = work.problem.runner()
         self.admission, self.parts = SimpleNamespace(expelled={}), list[int]()
 
-    def begin(self, part: int, mu: np.ndarray, jobs: Jobs, traces: str, seen: np.ndarray, *, terms: bool) -> None:
+    def begin(self, part: int, mu: np.ndarray, jobs: Jobs, traces: str, normaliser: np.ndarray, *, terms: bool) -> None:
         self.round = RoundResults(jobs, traces, self._work.problem.shapes(steps=True), terms=terms)
-        given = self._runner.run(mu, jobs, traces, seen, terms=terms)
-        said = self._change(part, Results.carrying(given, jobs, 0.0, run="r", incarnation="i", round=0, worker="w/1"))
-        place = self.round.place(said)
+        simulated = self._runner.run(mu, jobs, traces, normaliser, terms=terms)
+        results = self._change(
+            part, Results.carrying(simulated, jobs, 0.0, run="r", incarnation="i", round=0, worker="w/1")
+        )
+        place = self.round.place(results)
         assert place is not None
-        self.round.put(said, place, np.ones(len(jobs), bool))
+        self.round.put(results, place, np.ones(len(jobs), bool))
         self.parts.append(part)
         self.hosts = [f"host-{part}"]
 
@@ -71,8 +73,8 @@ def run(tmp_path: Path) -> RunFolder:
 def make(run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Work, Hosts]]:
     """Writes a data set of four parts."""
 
-    def made(
-        name: str, change: Callable[[int, Any], Any] = lambda _, said: said, **expelled: Any
+    def write(
+        name: str, change: Callable[[int, Any], Any] = lambda _, results: results, **expelled: Any
     ) -> tuple[Work, Hosts]:
         of = DataSet(tmp_path / name, EPISODES, 1)
         assert not of.begin(run)
@@ -86,14 +88,14 @@ def make(run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
             pass
         return work, hosts
 
-    return made
+    return write
 
 
-def shifted(part: int, said: Results) -> Results:
+def shifted(part: int, results: Results) -> Results:
     """In the third part, one channel's values, and no number that a spot check compares."""
     if part == 2:
-        said.traces[:, 1, -1] += 1e-3
-    return said
+        results.traces[:, 1, -1] += 1e-3
+    return results
 
 
 def test_a_worker_that_changes_a_channel_is_found(make: Callable[..., tuple[Work, Hosts]], tmp_path: Path) -> None:

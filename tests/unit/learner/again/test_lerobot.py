@@ -38,15 +38,15 @@ EPISODES = (
 @pytest.fixture
 def data(tmp_path: Path) -> Format:
     """Two parts, of two episodes and of one."""
-    rng, made = np.random.default_rng(0), Format(tmp_path, SPEC, "pole.py:Pole")
+    rng, data_set = np.random.default_rng(0), Format(tmp_path, SPEC, "pole.py:Pole")
     episodes = [
         Episode((4, 1, i, 0), rng.normal(size=(i + 2, steps_shape(SPEC)[1])).astype("<f4"), float(i), i == 1, False)
         for i in range(3)
     ]
-    made.write(0, 0, 0, episodes[:2])
-    made.write(1, 2, 5, episodes[2:])
-    made.finish(2)
-    return made
+    data_set.write(0, 0, 0, episodes[:2])
+    data_set.write(1, 2, 5, episodes[2:])
+    data_set.finish(2)
+    return data_set
 
 
 def test_info_has_the_fields_of_the_schema(data: Format) -> None:
@@ -77,11 +77,11 @@ def test_the_columns_have_the_types_and_shapes_of_the_features(data: Format) -> 
 
 def test_times_and_numbers_count_as_the_format_wants(data: Format) -> None:
     rows = [parquet.read(data.data(part), list(DEFAULT)) for part in (0, 1)]
-    joined = {name: [*rows[0][name], *rows[1][name]] for name in DEFAULT}
-    assert joined["index"] == list(range(9))
-    assert joined["episode_index"] == [0] * 2 + [1] * 3 + [2] * 4
-    assert joined["frame_index"] == [0, 1, 0, 1, 2, 0, 1, 2, 3]
-    np.testing.assert_allclose(joined["timestamp"], np.array(joined["frame_index"]) / 50, rtol=1e-6)
+    columns = {name: [*rows[0][name], *rows[1][name]] for name in DEFAULT}
+    assert columns["index"] == list(range(9))
+    assert columns["episode_index"] == [0] * 2 + [1] * 3 + [2] * 4
+    assert columns["frame_index"] == [0, 1, 0, 1, 2, 0, 1, 2, 3]
+    np.testing.assert_allclose(columns["timestamp"], np.array(columns["frame_index"]) / 50, rtol=1e-6)
 
 
 def test_episodes_say_where_they_are(data: Format) -> None:
@@ -100,10 +100,10 @@ def test_statistics_are_those_of_all_rows(data: Format) -> None:
     for name in json.loads((data.path / "meta/info.json").read_text())["features"]:
         values = np.array([row for part in (0, 1) for row in parquet.read(data.data(part), [name])[name]], dtype=float)
         values = values[:, None] if values.ndim == 1 else values
-        own = stats[name]
-        assert own["count"] == [9]
+        column = stats[name]
+        assert column["count"] == [9]
         for each in ("min", "max", "mean", "std"):
-            np.testing.assert_allclose(own[each], getattr(values, each)(axis=0), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(column[each], getattr(values, each)(axis=0), rtol=1e-12, atol=1e-12)
 
 
 def test_pandas_finds_the_task_as_the_index(data: Format) -> None:

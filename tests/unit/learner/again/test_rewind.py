@@ -60,10 +60,10 @@ class _Kept:
         return getattr(self._alone, name)
 
     def collect(self) -> object:
-        found = self._alone.collect()
+        results = self._alone.collect()
         jobs = self._alone.rounds[-1][1]
-        self._returns.append(found.returns[: int(jobs.rollouts[jobs.around].sum())].copy())
-        return found
+        self._returns.append(results.returns[: int(jobs.rollouts[jobs.around].sum())].copy())
+        return results
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: "-".join(map(str, each.values())) or "default")
@@ -90,9 +90,9 @@ def test_a_run_that_began_from_another(task: str, tmp_path: Path, caplog: pytest
     learnt(task, tmp_path / "other", seed=1)
     (tmp_path / "other" / "checkpoint").replace(tmp_path / "r" / "checkpoint")
     assert rewind(tmp_path / "s", 1).returns.tolist() != first.tolist()
-    (said,) = caplog.messages
-    assert "these are not the rollouts of generation 1 to the last bit" in said
-    assert "--init-from run have changed" in said
+    (message,) = caplog.messages
+    assert "these are not the rollouts of generation 1 to the last bit" in message
+    assert "--init-from run have changed" in message
 
 
 def test_the_best_the_worst_and_those_that_ended(task: str, tmp_path: Path) -> None:
@@ -103,9 +103,9 @@ def test_the_best_the_worst_and_those_that_ended(task: str, tmp_path: Path) -> N
     assert values[again.best(1)[0]] == line["return_max"]
     assert values[again.worst(1)[0]] == line["return_min"]
     assert sorted(again.best(len(values))) == sorted(again.worst(99)) == list(range(len(values)))
-    ended = again.ended(99)
-    assert len(ended) == line["ended"] > 0
-    assert all(len(shown.trajectory.times) < 5 for shown in again.again(ended))
+    early = again.ended(99)
+    assert len(early) == line["ended"] > 0
+    assert all(len(rollout.trajectory.times) < 5 for rollout in again.again(early))
     assert np.array_equal(rewind(tmp_path / "r").returns, rewind(tmp_path / "r", GENERATIONS).returns)
 
 
@@ -120,9 +120,9 @@ def test_a_rollout_of_an_episode_is_found_by_its_number(task: str, tmp_path: Pat
 def test_under_other_settings_of_the_task(task: str, tmp_path: Path) -> None:
     learnt(task, tmp_path / "r", algorithm="ars", policy="linear", normalise=True)
     folder = RunFolder(tmp_path / "r")
-    own, again = folder.read_config().task_config, rewind(folder.path, 3)
-    for changed, same in ((own, True), (replace(own, mass=3.0), False)):  # type: ignore[call-arg]
-        values = [shown.trajectory.value for shown in again.again([4, 1], under(folder, again, changed))]
+    settings, again = folder.read_config().task_config, rewind(folder.path, 3)
+    for changed, same in ((settings, True), (replace(settings, mass=3.0), False)):  # type: ignore[call-arg]
+        values = [rollout.trajectory.value for rollout in again.again([4, 1], under(folder, again, changed))]
         assert (values == again.returns[[4, 1]].tolist()) == same
 
 

@@ -225,10 +225,10 @@ def test_an_interrupted_verification_continues(
     words, repeated = ["verify", "r", "--share", "0.8", "--receipt", "r.json"], command.verify_some
 
     def pressed(*values: Any) -> Iterator[tuple[int, int]]:
-        for count, found in enumerate(repeated(*values), 1):
+        for count, result in enumerate(repeated(*values), 1):
             if count == 2:
                 signal.raise_signal(signal.SIGINT)
-            yield found
+            yield result
 
     with monkeypatch.context() as patched:
         patched.setattr(command, "verify_some", pressed)
@@ -237,11 +237,13 @@ def test_an_interrupted_verification_continues(
     before = json.loads(Path("r.json").read_text())
     assert (before["verdict"], len(before["chosen"]), before["generations"]) == ("interrupted", 5, before["chosen"][:2])
     with monkeypatch.context() as patched:
-        tried: list[int] = []
-        patched.setattr(command, "verify_some", lambda run, some, do: tried.extend(some) or repeated(run, some, do))
+        attempts: list[int] = []
+        patched.setattr(
+            command, "verify_some", lambda run, numbers, do: attempts.extend(numbers) or repeated(run, numbers, do)
+        )
         assert main(words) == 0
     after = json.loads(Path("r.json").read_text())
-    assert tried == before["chosen"][2:]
+    assert attempts == before["chosen"][2:]
     assert (after["verdict"], after["generations"]) == ("the same", before["chosen"])
 
 
@@ -272,13 +274,13 @@ def test_other_code_is_said_before_anything_is_computed(tmp_path: Path, capsys: 
     at = checkpoints.load(folder.checkpoint)
     checkpoints.save(folder.checkpoint, replace(at, code=at.code | {"simulation": "0" * 64}))
     main(["verify", str(folder.path)])
-    said = capsys.readouterr().err
-    assert "the code of its task has changed since the run began" in said
-    assert "the simulation's code (farm/) is of another release than when the run began" in said
+    errors = capsys.readouterr().err
+    assert "the code of its task has changed since the run began" in errors
+    assert "the simulation's code (farm/) is of another release than when the run began" in errors
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reason"),
     [
         (("--tls", "certs"), "--tls is for a farm to --connect to, or to sign a --receipt"),
         (("--all", "--workers", "0"), "--all with --workers 0, without --connect"),
@@ -287,8 +289,8 @@ def test_other_code_is_said_before_anything_is_computed(tmp_path: Path, capsys: 
     ],
 )
 def test_what_it_cannot_do(
-    words: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = learnt(tmp_path / "r")
     assert main(["verify", str(folder.path), *words]) == 2
-    assert said in capsys.readouterr().err
+    assert reason in capsys.readouterr().err

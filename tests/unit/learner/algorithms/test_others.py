@@ -53,11 +53,11 @@ def learnt(algorithm, state, first, last):
 def test_it_is_chosen_by_its_name_and_climbs(name):
     algorithm = OTHERS[name]
     assert plugins.find("algorithms", name).target is type(algorithm)
-    begin = algorithm.init(P)
-    end = learnt(algorithm, begin, 0, 120)
-    assert sphere(begin.mu) == -45.0
+    start = algorithm.init(P)
+    end = learnt(algorithm, start, 0, 120)
+    assert sphere(start.mu) == -45.0
     assert sphere(end.mu) > -0.1
-    assert (end.generation, begin.generation) == (120, 0)
+    assert (end.generation, start.generation) == (120, 0)
     assert end.best >= sphere(end.mu) - 0.5
 
 
@@ -105,9 +105,9 @@ def test_returns_may_be_shifted_and_scaled(name):
 def test_equal_returns_move_no_mean(name):
     algorithm = OTHERS[name]
     state = algorithm.init(P)
-    told = algorithm.tell(state, algorithm.ask(state, np.random.default_rng(0)), np.full((6, 2), -1e12))
-    np.testing.assert_allclose(told.mu, state.mu, atol=1e-15)
-    np.testing.assert_allclose(told.sigma, state.sigma, rtol=1e-15)
+    after = algorithm.tell(state, algorithm.ask(state, np.random.default_rng(0)), np.full((6, 2), -1e12))
+    np.testing.assert_allclose(after.mu, state.mu, atol=1e-15)
+    np.testing.assert_allclose(after.sigma, state.sigma, rtol=1e-15)
 
 
 def test_snes_as_written():
@@ -130,12 +130,12 @@ def test_snes_as_written():
 
 def test_utilities_of_ties_and_of_any_order():
     returns = np.array([[3.0, -1.0], [3.0, 2.0], [-1.0, 7.0]])
-    found = utilities(returns)
-    assert found[0, 0] == found[1, 0]
-    assert found[0, 1] == found[2, 0]
-    assert found.ravel().argmax() == 5
-    assert found.sum() == pytest.approx(0.0, abs=1e-15)
-    assert utilities(returns[::-1]).tolist() == found[::-1].tolist()
+    weights = utilities(returns)
+    assert weights[0, 0] == weights[1, 0]
+    assert weights[0, 1] == weights[2, 0]
+    assert weights.ravel().argmax() == 5
+    assert weights.sum() == pytest.approx(0.0, abs=1e-15)
+    assert utilities(returns[::-1]).tolist() == weights[::-1].tolist()
 
 
 def test_ars_as_written():
@@ -173,16 +173,16 @@ def test_es_sees_only_the_order_of_returns():
 
 
 def test_the_weight_decay_of_es_pulls_to_zero():
-    told = {}
+    means = {}
     for decay in (0.0, 0.1):
         algorithm = ES(pairs=6, initial_mu=2.0, weight_decay=decay)
         state = algorithm.init(P)
         for seed in range(100):
             eps = algorithm.ask(state, np.random.default_rng(seed))
             state = algorithm.tell(state, eps, np.zeros((6, 2)))
-        told[decay] = state.mu
-    assert told[0.0].tolist() == [2.0] * P
-    assert np.abs(told[0.1]).max() < 0.5
+        means[decay] = state.mu
+    assert means[0.0].tolist() == [2.0] * P
+    assert np.abs(means[0.1]).max() < 0.5
 
 
 def test_es_needs_its_memory():
@@ -233,24 +233,24 @@ def test_cma_learns_a_direction_that_sep_cma_cannot_have():
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "size", "said"),
+    ("algorithm", "size", "reason"),
     [
         (CMAES(), 1001, "the policy has 1001 parameters; cma-es takes 1 to 1000"),
         (SepCMA(), 1, "the policy has 1 parameters; sep-cma takes 2 to 10000000"),
     ],
 )
-def test_sizes_that_cma_does_not_take(algorithm, size, said):
-    with pytest.raises(ConfigError, match=said):
+def test_sizes_that_cma_does_not_take(algorithm, size, reason):
+    with pytest.raises(ConfigError, match=reason):
         algorithm.init(size)
 
 
 def test_what_is_missing_is_said_in_one_line(monkeypatch):
-    own = builtins.__import__
+    original = builtins.__import__
 
     def missing(name, *rest):
         if name == "cmaes":
             raise ImportError(name)
-        return own(name, *rest)
+        return original(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(ConfigError, match=r"algorithm sep-cma needs cmaes: pip install cmaes$"):

@@ -116,10 +116,10 @@ def slow_tell(config, state, eps, returns):
 @pytest.mark.parametrize("strength", [2, 3])
 def test_settings_meet_beside_either_shaping(shaping, strength):
     others = [name for name in CHOICES if name != "shaping"]
-    found = [case for case in cases(strength) if case["shaping"] == shaping]
+    matches = [case for case in cases(strength) if case["shaping"] == shaping]
     for names in itertools.combinations(others, strength):
-        wanted = set(itertools.product(*(CHOICES[name] for name in names)))
-        assert {tuple(case[name] for name in names) for case in found} == wanted
+        combinations = set(itertools.product(*(CHOICES[name] for name in names)))
+        assert {tuple(case[name] for name in names) for case in matches} == combinations
 
 
 @pytest.mark.parametrize("choices", cases(3), ids=name_of)

@@ -65,8 +65,8 @@ def test_optimal_baseline_by_brute_force():
             up[i], down[i] = at[i] + h, at[i] - h
             gradient.append((log_density(up) - log_density(down)) / (2 * h))
         weights.append(sum(g * g for g in gradient))
-    wanted = float((returns[:, 0] * weights).sum() / sum(weights))
-    assert config.tell(state, eps, returns).baseline == pytest.approx(wanted, rel=1e-6)
+    expected = float((returns[:, 0] * weights).sum() / sum(weights))
+    assert config.tell(state, eps, returns).baseline == pytest.approx(expected, rel=1e-6)
 
 
 @settings(deadline=None)

@@ -42,11 +42,11 @@ class Cart(farm.Task):
 
 
 def exported(task: str, **settings: Any) -> LoadedPolicy:
-    found, _ = start(configure(task, policy="linear", **settings), "r")
-    return LoadedPolicy(found, 3, np.zeros(found.policy.size))
+    problem, _ = start(configure(task, policy="linear", **settings), "r")
+    return LoadedPolicy(problem, 3, np.zeros(problem.policy.size))
 
 
-def named(folder: Path, observations: str) -> LoadedPolicy:
+def cart_with(folder: Path, observations: str) -> LoadedPolicy:
     (folder / "named.py").write_text(NAMED.format(observations=observations))
     return exported(f"{folder}/named.py:Cart")
 
@@ -66,7 +66,7 @@ def test_a_task_without_methods_is_named_after_its_joints_and_actuators() -> Non
 
 
 def test_a_task_names_its_own_observations(tmp_path: Path) -> None:
-    of = interface(named(tmp_path, '(farm.Quantity("twice the angle", "0.5 rad", low=-3.2),)'))
+    of = interface(cart_with(tmp_path, '(farm.Quantity("twice the angle", "0.5 rad", low=-3.2),)'))
     assert of["observations"] == [{"name": "twice the angle", "unit": "0.5 rad", "low": -3.2, "high": None}]
     assert of["controls"][0]["unit"] == "rad"
     assert of["joints"][0]["low"] == pytest.approx(-np.pi / 2)
@@ -83,14 +83,14 @@ def test_a_task_names_its_own_observations(tmp_path: Path) -> None:
 )
 def test_wrong_names_are_refused_before_anything_is_learnt(observations: str, line: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=line):
-        named(tmp_path, observations)
+        cart_with(tmp_path, observations)
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_the_hand_names_each_number_of_a_state(state: str) -> None:
-    known = STATES[state].quantities((2.0, 1.0, 1.0))
-    assert len(known) == len({each.name for each in known}) == STATES[state].size
-    assert {each.unit for each in known if each.name == "index_1"} <= {"0.5 rad"}
+    numbers = STATES[state].quantities((2.0, 1.0, 1.0))
+    assert len(numbers) == len({each.name for each in numbers}) == STATES[state].size
+    assert {each.unit for each in numbers if each.name == "index_1"} <= {"0.5 rad"}
 
 
 @pytest.mark.parametrize("state", ["phase", "phase+joints+forces"])
@@ -133,18 +133,20 @@ def test_free_and_ball_joints_have_several_numbers() -> None:
         "<mujoco><worldbody><body><freejoint name='box'/><geom size='1'/></body>"
         "<body><joint type='ball'/><geom size='1'/></body></worldbody></mujoco>"
     )
-    known = quantities.states(model)
-    assert len(known) == model.nq + model.nv
-    assert known[2] == Quantity("box z", "m")
-    assert known[6].name == "box quaternion z"
-    assert known[-1] == Quantity("joint 1 velocity about z", "rad/s")
+    numbers = quantities.states(model)
+    assert len(numbers) == model.nq + model.nv
+    assert numbers[2] == Quantity("box z", "m")
+    assert numbers[6].name == "box quaternion z"
+    assert numbers[-1] == Quantity("joint 1 velocity about z", "rad/s")
 
 
 def test_both_files_are_listed_alike_and_as_the_run_would_be(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     policy = exported(f"{robot(tmp_path / 'mine')}:Reach")
-    seen = np.stack([np.arange(policy.problem.spec.observation, dtype=float), np.ones(policy.problem.spec.observation)])
-    policy = replace(policy, problem=replace(policy.problem, policy=Normalised(policy.problem.policy, seen)))
+    normaliser = np.stack(
+        [np.arange(policy.problem.spec.observation, dtype=float), np.ones(policy.problem.spec.observation)]
+    )
+    policy = replace(policy, problem=replace(policy.problem, policy=Normalised(policy.problem.policy, normaliser)))
     npz.write(tmp_path / "p.npz", policy)
     onnx.write(tmp_path / "p.onnx", policy)
     first, second = listed(tmp_path / "p.npz"), listed(tmp_path / "p.onnx")
@@ -157,7 +159,7 @@ def test_both_files_are_listed_alike_and_as_the_run_would_be(tmp_path: Path) -> 
         f"gives action (N, {policy.problem.spec.action})",
     ]
     with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
-        assert json.loads(file["interface"].item())["normaliser"]["mean"] == seen[0].tolist()
+        assert json.loads(file["interface"].item())["normaliser"]["mean"] == normaliser[0].tolist()
 
 
 @pytest.mark.parametrize("name", ["p.npz", "p.onnx"])

@@ -50,9 +50,9 @@ def played(path: Path) -> float:
     spec.loader.exec_module(module)
     policy = module.Policy(path)
     policy.reset()
-    total, held, t = 0.0, True, 0
-    while held and t < policy.p["steps"]:
-        reward, held = policy.step()
+    total, alive, t = 0.0, True, 0
+    while alive and t < policy.p["steps"]:
+        reward, alive = policy.step()
         total += policy.p["gamma"] ** t * reward
         t += 1
     return float(policy.p["return_scale"] * total)
@@ -63,11 +63,13 @@ def played(path: Path) -> float:
 )
 def test_the_example_plays_every_policy(policy: str, normalise: bool, state: str, tmp_path: Path) -> None:
     config = configure(policy=policy.partition(",")[0], state=state, normalise=normalise, **SETTINGS[policy])
-    found, _ = start(config, "r")
+    problem, _ = start(config, "r")
     if normalise:
-        seen = np.random.default_rng(2).uniform(0.5, 1.0, (2, found.spec.observation))
-        found = replace(found, policy=Normalised(found.policy, seen))
-    assert_played_alike(LoadedPolicy(found, 0, np.random.default_rng(1).normal(0.3, 0.2, found.policy.size)), tmp_path)
+        normaliser = np.random.default_rng(2).uniform(0.5, 1.0, (2, problem.spec.observation))
+        problem = replace(problem, policy=Normalised(problem.policy, normaliser))
+    assert_played_alike(
+        LoadedPolicy(problem, 0, np.random.default_rng(1).normal(0.3, 0.2, problem.policy.size)), tmp_path
+    )
 
 
 def assert_played_alike(learnt: LoadedPolicy, folder: Path) -> None:
@@ -87,13 +89,15 @@ def assert_played_alike(learnt: LoadedPolicy, folder: Path) -> None:
     ids=str,
 )
 def test_the_example_plays_every_state_and_other_settings(settings: dict[str, Any], tmp_path: Path) -> None:
-    found, _ = start(configure(**settings), "r")
-    assert_played_alike(LoadedPolicy(found, 0, np.random.default_rng(1).normal(0.3, 0.2, found.policy.size)), tmp_path)
+    problem, _ = start(configure(**settings), "r")
+    assert_played_alike(
+        LoadedPolicy(problem, 0, np.random.default_rng(1).normal(0.3, 0.2, problem.policy.size)), tmp_path
+    )
 
 
 def test_the_example_ends_where_the_object_is_dropped(tmp_path: Path) -> None:
-    found, _ = start(configure(policy="direct", features=20), "r")
-    learnt = LoadedPolicy(found, 0, np.random.default_rng(1).normal(3.0, 0.1, found.policy.size))
+    problem, _ = start(configure(policy="direct", features=20), "r")
+    learnt = LoadedPolicy(problem, 0, np.random.default_rng(1).normal(3.0, 0.1, problem.policy.size))
     assert learnt.rollout().rollouts.ended[0]
     assert_played_alike(learnt, tmp_path)
 
@@ -116,25 +120,25 @@ class Built(Task):
 
 def test_a_refused_export_says_why_and_leaves_the_file_that_was_there(tmp_path: Path) -> None:
     (tmp_path / "built.py").write_text(BUILT)
-    found, _ = start(configure(f"{tmp_path}/built.py:Built"), "r")
+    problem, _ = start(configure(f"{tmp_path}/built.py:Built"), "r")
     path = tmp_path / "p.npz"
     for before in (None, b"an earlier one"):
         if before is not None:
             path.write_bytes(before)
         with pytest.raises(ConfigError, match=r"task Built makes its model by compiled\(\): without mjcf\(\)"):
-            export.write(path, LoadedPolicy(found, 0, np.zeros(found.policy.size)))
+            export.write(path, LoadedPolicy(problem, 0, np.zeros(problem.policy.size)))
         assert (path.read_bytes() if path.exists() else None) == before
     assert {each.name for each in tmp_path.iterdir()} <= {"built.py", "p.npz"}
 
 
 def test_a_model_in_files_comes_with_all_of_them(tmp_path: Path) -> None:
-    found, _ = start(configure(f"{robot(tmp_path / 'mine')}:Reach", policy="linear"), "r")
-    export.write(tmp_path / "p.npz", LoadedPolicy(found, 0, np.zeros(found.policy.size)))
+    problem, _ = start(configure(f"{robot(tmp_path / 'mine')}:Reach", policy="linear"), "r")
+    export.write(tmp_path / "p.npz", LoadedPolicy(problem, 0, np.zeros(problem.policy.size)))
     with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
-        own = {name.removeprefix("file/"): file[name].tobytes() for name in file.files if name.startswith("file/")}
+        files = {name.removeprefix("file/"): file[name].tobytes() for name in file.files if name.startswith("file/")}
         main, mjcf = file["model"].item(), file["mjcf"].item()
-    assert own[main].decode() == mjcf
-    model_files.write(tmp_path / "elsewhere", own)
+    assert files[main].decode() == mjcf
+    model_files.write(tmp_path / "elsewhere", files)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "elsewhere" / main))
-    np.testing.assert_array_equal(model.mesh_vert, found.task.model.mesh_vert)
+    np.testing.assert_array_equal(model.mesh_vert, problem.task.model.mesh_vert)
     assert (model.nhfield, model.ntex) == (1, 1)

@@ -36,11 +36,11 @@ MEMORY: dict[str, dict[str, Any]] = {"rnn": {"units": 5}, "cpg": {}}
 
 def learnt(policy: str, normalise: bool = False) -> LoadedPolicy:
     config = configure(HOPPER, policy=policy, normalise=normalise, **(SETTINGS | MEMORY)[policy])
-    found, _ = start(config, "r")
+    problem, _ = start(config, "r")
     if normalise:
-        seen = np.random.default_rng(2).uniform(0.5, 1.0, (2, found.spec.observation))
-        found = replace(found, policy=Normalised(found.policy, seen))
-    return LoadedPolicy(found, 7, np.random.default_rng(1).normal(0.3, 0.5, found.policy.size))
+        normaliser = np.random.default_rng(2).uniform(0.5, 1.0, (2, problem.spec.observation))
+        problem = replace(problem, policy=Normalised(problem.policy, normaliser))
+    return LoadedPolicy(problem, 7, np.random.default_rng(1).normal(0.3, 0.5, problem.policy.size))
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -48,16 +48,16 @@ def learnt(policy: str, normalise: bool = False) -> LoadedPolicy:
 def test_a_runtime_acts_as_the_policy_does(policy: str, normalise: bool, tmp_path: Path) -> None:
     runtime = pytest.importorskip("onnxruntime")
     loaded = learnt(policy, normalise)
-    own = loaded.problem.policy
+    actor = loaded.problem.policy
     x = np.random.default_rng(3).normal(0.5, 0.5, (1000, loaded.problem.spec.observation))
-    wanted = own.act(np.repeat(own.prepare(loaded.mu[None]), len(x), axis=0), x)
+    expected = actor.act(np.repeat(actor.prepare(loaded.mu[None]), len(x), axis=0), x)
     onnx.write(tmp_path / "p.onnx", loaded)
     session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
-    (given,) = session.run(None, {"observation": x})
-    np.testing.assert_allclose(given, wanted, rtol=1e-11, atol=1e-12)
-    assert policy == "constant" or np.ptp(wanted, axis=0).min() > 1e-6
-    said = session.get_modelmeta().custom_metadata_map
-    assert (said["policy"], said["generation"], said["task"]) == (policy, "7", "hopper.py:Hopper")
+    (actions,) = session.run(None, {"observation": x})
+    np.testing.assert_allclose(actions, expected, rtol=1e-11, atol=1e-12)
+    assert policy == "constant" or np.ptp(expected, axis=0).min() > 1e-6
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert (metadata["policy"], metadata["generation"], metadata["task"]) == (policy, "7", "hopper.py:Hopper")
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -67,8 +67,8 @@ def test_a_memory_goes_in_and_comes_out(policy: str, normalise: bool, tmp_path: 
     loaded = learnt(policy, normalise)
     onnx.write(tmp_path / "p.onnx", loaded)
     session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
-    said = session.get_modelmeta().custom_metadata_map
-    memory, acting = np.tile(json.loads(said["memory"]), (20, 1)), loaded.acting(20)
+    metadata = session.get_modelmeta().custom_metadata_map
+    memory, acting = np.tile(json.loads(metadata["memory"]), (20, 1)), loaded.acting(20)
     rng, actions = np.random.default_rng(3), []
     for _ in range(10):
         x = rng.normal(0.5, 0.5, (20, loaded.problem.spec.observation))
@@ -81,25 +81,25 @@ def test_a_memory_goes_in_and_comes_out(policy: str, normalise: bool, tmp_path: 
 def test_single_precision_is_exported_as_double(tmp_path: Path) -> None:
     runtime = pytest.importorskip("onnxruntime")
     config = configure(policy="projected", features=300, precision="single")
-    found, _ = start(config, "r")
-    loaded = LoadedPolicy(found, 7, np.random.default_rng(1).normal(0.3, 0.5, found.policy.size))
-    x = np.random.default_rng(3).normal(0.5, 0.5, (100, found.spec.observation))
-    wanted = found.policy.act(np.repeat(found.policy.prepare(loaded.mu[None]), len(x), axis=0), x)
+    problem, _ = start(config, "r")
+    loaded = LoadedPolicy(problem, 7, np.random.default_rng(1).normal(0.3, 0.5, problem.policy.size))
+    x = np.random.default_rng(3).normal(0.5, 0.5, (100, problem.spec.observation))
+    expected = problem.policy.act(np.repeat(problem.policy.prepare(loaded.mu[None]), len(x), axis=0), x)
     onnx.write(tmp_path / "p.onnx", loaded)
     session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
-    (given,) = session.run(None, {"observation": x})
-    np.testing.assert_allclose(given, wanted, atol=5e-6)
+    (actions,) = session.run(None, {"observation": x})
+    np.testing.assert_allclose(actions, expected, atol=5e-6)
 
 
 def test_a_policy_for_an_environment_of_gymnasium() -> None:
     runtime, _ = pytest.importorskip("onnxruntime"), pytest.importorskip("gymnasium")
-    found, _ = start(configure("gym:Reacher-v5", policy="linear"), "r")
-    loaded = LoadedPolicy(found, 0, np.random.default_rng(1).normal(size=found.policy.size))
+    problem, _ = start(configure("gym:Reacher-v5", policy="linear"), "r")
+    loaded = LoadedPolicy(problem, 0, np.random.default_rng(1).normal(size=problem.policy.size))
     session = runtime.InferenceSession(onnx.contents(loaded), providers=["CPUExecutionProvider"])
     x = np.random.default_rng(3).normal(size=(4, 10))
-    (given,) = session.run(None, {"observation": x})
-    wanted = found.policy.act(np.repeat(loaded.mu[None], 4, axis=0), x)
-    np.testing.assert_allclose(given, wanted, rtol=1e-11, atol=1e-12)
+    (actions,) = session.run(None, {"observation": x})
+    expected = problem.policy.act(np.repeat(loaded.mu[None], 4, axis=0), x)
+    np.testing.assert_allclose(actions, expected, rtol=1e-11, atol=1e-12)
 
 
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,14 +134,14 @@ GOOD = """pull = graph.put("MatMul", graph.put("{operator}", x), theta.reshape(s
 """
 
 
-def own(folder: Path, body: str) -> LoadedPolicy:
+def policy_with(folder: Path, body: str) -> LoadedPolicy:
     (folder / "own.py").write_text(OWN.format(name="Own", body=body))
-    found, _ = start(configure(HOPPER, policy=f"{folder}/own.py:Own"), "r")
-    return LoadedPolicy(found, 0, np.random.default_rng(1).normal(size=found.policy.size))
+    problem, _ = start(configure(HOPPER, policy=f"{folder}/own.py:Own"), "r")
+    return LoadedPolicy(problem, 0, np.random.default_rng(1).normal(size=problem.policy.size))
 
 
 def test_a_policy_of_ones_own_has_a_method(tmp_path: Path) -> None:
-    runtime, loaded = pytest.importorskip("onnxruntime"), own(tmp_path, GOOD.format(operator="Relu"))
+    runtime, loaded = pytest.importorskip("onnxruntime"), policy_with(tmp_path, GOOD.format(operator="Relu"))
     session = runtime.InferenceSession(onnx.contents(loaded), providers=["CPUExecutionProvider"])
     x, memory = np.random.default_rng(3).normal(size=(2, 5, 11)), np.zeros((5, 3))
     acting = loaded.acting(5)
@@ -157,8 +157,8 @@ def test_the_method_on_the_page_suits_the_policy_on_another(tmp_path: Path) -> N
     [policy] = re.findall(r"`linear.py`:\n\n```python\n(.*?)```", (docs / "extending.md").read_text("utf-8"), re.S)
     [method] = re.findall(r"^(    def onnx.*?)\n\n", (docs / "export.md").read_text("utf-8"), re.S | re.M)
     (tmp_path / "linear.py").write_text(f"{policy}\n{method}\n")
-    found, _ = start(configure(HOPPER, policy=f"{tmp_path}/linear.py:Linear"), "r")
-    loaded = LoadedPolicy(found, 0, np.random.default_rng(1).normal(size=found.policy.size))
+    problem, _ = start(configure(HOPPER, policy=f"{tmp_path}/linear.py:Linear"), "r")
+    loaded = LoadedPolicy(problem, 0, np.random.default_rng(1).normal(size=problem.policy.size))
     assert b"linear.py:Linear" in onnx.contents(loaded), "it has been compared with the policy"
 
 
@@ -178,7 +178,7 @@ def test_the_method_on_the_page_suits_the_policy_on_another(tmp_path: Path) -> N
 )
 def test_a_wrong_form_is_refused(body: str, line: str, tmp_path: Path) -> None:
     pytest.importorskip("onnx")
-    loaded = own(tmp_path, body)
+    loaded = policy_with(tmp_path, body)
     (tmp_path / "p.onnx").write_bytes(b"an earlier one")
     with pytest.raises(ConfigError, match=line):
         onnx.write(tmp_path / "p.onnx", loaded)

@@ -136,18 +136,18 @@ class Rows:
     def _rows(self, entity: str, name: str) -> list[tuple[int, Any]]:
         rows = []
         for batch in self.batches[entity]:
-            found = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
-            if found and "sim_time" in batch.schema.names:
+            columns = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
+            if columns and "sim_time" in batch.schema.names:
                 times = batch.column("sim_time").cast("int64").to_pylist()
-                rows += zip(times, batch.column(found[0]).to_pylist(), strict=True)
+                rows += zip(times, batch.column(columns[0]).to_pylist(), strict=True)
         return [row for row in sorted(rows, key=lambda row: row[0]) if row[1] is not None]
 
     def fixed(self, entity: str, name: str) -> Any:
         """Return a static value."""
         for batch in self.batches[entity]:
-            for found in batch.schema.names:
-                if found.endswith(f":{name}") and "sim_time" not in batch.schema.names:
-                    return batch.column(found).to_pylist()[0]
+            for column in batch.schema.names:
+                if column.endswith(f":{name}") and "sim_time" not in batch.schema.names:
+                    return batch.column(column).to_pylist()[0]
         raise KeyError(name)
 
     def times(self, entity: str) -> list[int]:
@@ -157,5 +157,5 @@ class Rows:
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[[str], Rows]:
+def rows_of(tmp_path: Path) -> Callable[[str], Rows]:
     return lambda name="run.rrd": Rows(tmp_path / name)

@@ -21,26 +21,26 @@ from learner.recording.solids import ENDLESS, rotate, solid
 
 
 @pytest.fixture
-def written(start, rollout, read):
-    shown = rollout(7)  # it ended early
+def written(start, rollout, rows_of):
+    trajectory = rollout(7)  # it ended early
     recorder = start()
-    recorder.generation(report(stats(), shown))
+    recorder.generation(report(stats(), trajectory))
     recorder.close()
-    return shown, read()
+    return trajectory, rows_of()
 
 
 def test_curves_hold_what_the_rollout_held(written):
-    shown, rows = written
-    np.testing.assert_array_equal(rows.column("/reward/terms", "scalars"), shown.terms)
-    np.testing.assert_array_equal(rows.column("/actions", "scalars"), shown.actions)
-    np.testing.assert_array_equal(rows.column("/touch/force", "scalars"), shown.channels["touch/force"])
+    trajectory, rows = written
+    np.testing.assert_array_equal(rows.column("/reward/terms", "scalars"), trajectory.terms)
+    np.testing.assert_array_equal(rows.column("/actions", "scalars"), trajectory.actions)
+    np.testing.assert_array_equal(rows.column("/touch/force", "scalars"), trajectory.channels["touch/force"])
     assert rows.fixed("/touch/force", "names") == ["left", "right side"]
     assert rows.fixed("/reward/terms", "names") == ["reach", "cost"]
     assert rows.fixed("/actions", "names") == ["1", "2"]
 
 
 def test_limits_are_constant_lines_beside_their_curve(written):
-    shown, rows = written
+    trajectory, rows = written
     assert rows.column("/touch/force/limits", "scalars") == [[0.25, 1.5]] * 7
     assert rows.times("/touch/force/limits") == rows.times("/touch/force")
     assert rows.fixed("/touch/force/limits", "names") == ["right side, least 0.25 N", "right side, most 1.5 N"]
@@ -68,8 +68,8 @@ def test_limits_without_a_curve_or_a_range_are_refused(wrong):
 
 
 def test_bodies_are_where_they_were(written, scene):
-    shown, rows = written
-    poses = shown.bodies[:, scene.bodies.index("arm")]
+    trajectory, rows = written
+    poses = trajectory.bodies[:, scene.bodies.index("arm")]
     np.testing.assert_allclose(
         np.array(rows.column("/world/arm", "quaternion"))[:, 0], poses[:, [4, 5, 6, 3]], atol=1e-6
     )
@@ -84,8 +84,8 @@ def test_flags_are_recorded_where_they_change(written):
 
 
 def test_images_are_pictures_and_points_on_their_bodies(written):
-    shown, rows = written
-    images = shown.channels["pads"]
+    trajectory, rows = written
+    images = trajectory.channels["pads"]
     pixels = np.array(rows.column("/pads/right\\ side", "buffer"), dtype=np.uint8)[:, 0]
     np.testing.assert_array_equal(
         np.ascontiguousarray(pixels).view(np.float32), images[:, 1].reshape(7, -1).astype("f4")
@@ -97,17 +97,17 @@ def test_images_are_pictures_and_points_on_their_bodies(written):
 
 
 def test_arrows_stand_on_their_bodies(written, scene):
-    shown, rows = written
-    values, found = shown.channels["touch/push"], rows.column("/world/touch/push", "vectors")
-    assert [len(arrows) for arrows in found] == [0, 0, 0, 2, 2, 2, 2], "arrows of zero length are not drawn"
+    trajectory, rows = written
+    values, vectors = trajectory.channels["touch/push"], rows.column("/world/touch/push", "vectors")
+    assert [len(arrows) for arrows in vectors] == [0, 0, 0, 2, 2, 2, 2], "arrows of zero length are not drawn"
     origins = rows.column("/world/touch/push", "origins")
     for frame in range(3, 7):
         for i, body in enumerate(("ball", "arm")):
-            pose, place, vector = shown.bodies[frame, scene.bodies.index(body)], np.zeros(3), np.zeros(3)
+            pose, place, vector = trajectory.bodies[frame, scene.bodies.index(body)], np.zeros(3), np.zeros(3)
             mujoco.mju_rotVecQuat(place, values[frame, i, :3], pose[3:])
             mujoco.mju_rotVecQuat(vector, 0.5 * values[frame, i, 3:], pose[3:])
             np.testing.assert_allclose(origins[frame][i], pose[:3] + place, atol=1e-6)
-            np.testing.assert_allclose(found[frame][i], vector, atol=1e-6)
+            np.testing.assert_allclose(vectors[frame][i], vector, atol=1e-6)
 
 
 def test_long_arrows_are_cut(scene):
@@ -117,18 +117,18 @@ def test_long_arrows_are_cut(scene):
 
 
 def test_points_are_coloured_by_value(written):
-    shown, rows = written
-    values = shown.channels["goals"]
+    trajectory, rows = written
+    values = trajectory.channels["goals"]
     np.testing.assert_allclose(rows.column("/world/goals", "positions"), values[..., :3], atol=1e-6)
     np.testing.assert_array_equal(rows.column("/world/goals", "colors"), ramp(values[..., 3], 4.0))
 
 
-def test_a_task_without_channels_has_bodies_actions_and_reward(start, rollout, read, plain):
+def test_a_task_without_channels_has_bodies_actions_and_reward(start, rollout, rows_of, plain):
     recorder = start(spec=plain)
     unknown = {"mean_policy_success": None, "success_rate": None}
     recorder.generation(report(stats(**unknown), rollout(spec=plain)))
     recorder.close()
-    rows = read()
+    rows = rows_of()
     moving = {"/world/ball", "/world/arm", "/world/caption", "/world/view", "/reward/terms", "/actions"}
     assert {entity for entity in rows.batches if len(rows.times(entity)) == 16} == moving
     assert "/learning/success" not in rows.batches
@@ -175,9 +175,9 @@ def test_titles_say_the_unit():
 
 
 def test_a_capsule_starts_where_its_axis_begins(scene):
-    drawn = solid(next(g for g in scene.geometries() if g.name == "arm"))
-    start = np.array(drawn.translations.as_arrow_array().to_pylist()[0])
-    [turn], [length] = drawn.quaternions.as_arrow_array().to_pylist(), drawn.lengths.as_arrow_array().to_pylist()
+    capsule = solid(next(g for g in scene.geometries() if g.name == "arm"))
+    start = np.array(capsule.translations.as_arrow_array().to_pylist()[0])
+    [turn], [length] = capsule.quaternions.as_arrow_array().to_pylist(), capsule.lengths.as_arrow_array().to_pylist()
     end = start + rotate(np.roll(turn, 1), np.array([0.0, 0.0, length]))
     np.testing.assert_allclose(sorted([start[2], end[2]]), [0.1, 0.5], atol=1e-6)
 
@@ -186,8 +186,8 @@ def test_a_capsule_starts_where_its_axis_begins(scene):
 def test_a_plane_is_a_thin_box_with_its_top_where_the_plane_is(size, sides):
     half = np.sqrt(0.5)  # turned by 90 degrees about x: its normal is -y
     plane = Geometry("floor", "world", "plane", size, (1.0, 2.0, 3.0), (half, half, 0.0, 0.0), (0.5, 0.5, 0.5, 1.0))
-    drawn = solid(plane)
-    [extent], [centre] = (part.as_arrow_array().to_pylist() for part in (drawn.half_sizes, drawn.centers))
+    box = solid(plane)
+    [extent], [centre] = (part.as_arrow_array().to_pylist() for part in (box.half_sizes, box.centers))
     np.testing.assert_allclose(extent, [*sides, 0.001], atol=1e-9)
     np.testing.assert_allclose(centre, [1.0, 2.001, 3.0], atol=1e-6)
 
@@ -202,13 +202,13 @@ def test_a_mesh_is_turned_and_placed_with_normals_that_look_outwards():
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     place, turn, colour = (1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (0.2, 0.4, 0.6, 1.0)
-    drawn = solid(Geometry("m", "b", "mesh", (1.0, 1.0, 1.0), place, turn, colour, corners, faces))
-    found = np.array(drawn.vertex_positions.as_arrow_array().to_pylist())
-    np.testing.assert_allclose(found, [[1, 2, 3], [1, 3, 3], [0, 2, 3], [1, 2, 4]], atol=1e-6)
-    normals = np.array(drawn.vertex_normals.as_arrow_array().to_pylist())
+    mesh = solid(Geometry("m", "b", "mesh", (1.0, 1.0, 1.0), place, turn, colour, corners, faces))
+    vertices = np.array(mesh.vertex_positions.as_arrow_array().to_pylist())
+    np.testing.assert_allclose(vertices, [[1, 2, 3], [1, 3, 3], [0, 2, 3], [1, 2, 4]], atol=1e-6)
+    normals = np.array(mesh.vertex_normals.as_arrow_array().to_pylist())
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
-    assert (np.sum(normals * (found - found.mean(axis=0)), axis=1) > 0).all()
-    assert drawn.triangle_indices.as_arrow_array().to_pylist() == faces.tolist()
+    assert (np.sum(normals * (vertices - vertices.mean(axis=0)), axis=1) > 0).all()
+    assert mesh.triangle_indices.as_arrow_array().to_pylist() == faces.tolist()
 
 
 def test_colours_run_from_violet_to_yellow():
@@ -229,17 +229,17 @@ def test_a_rollout_shows_the_geometries_of_its_own_model_only():
     spec = TaskSpec(observation=1, action=1, steps=1, period=1.0, channels=(channel,))
     scene = Scene.of([compiled(text, "one of two") for text in texts])
     drawing = Drawing(scene, spec)
-    drawn = dict(drawing.static())
-    assert {"/world/world/floor", "/world/ball/ball-0", "/world/ball/ball-1"} <= drawn.keys()
-    assert drawn["/world/ball/ball-1"].half_sizes.as_arrow_array().to_pylist() == [pytest.approx([0.2] * 3)]
-    shown = [
+    solids = dict(drawing.static())
+    assert {"/world/world/floor", "/world/ball/ball-0", "/world/ball/ball-1"} <= solids.keys()
+    assert solids["/world/ball/ball-1"].half_sizes.as_arrow_array().to_pylist() == [pytest.approx([0.2] * 3)]
+    rollouts = [
         Trajectory.of(
             times=np.arange(2.0), bodies=np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, len(scene.bodies), 1)),
             actions=np.zeros((2, 1)), terms=np.zeros((2, 1)), channels=scene.said(which, 2), value=0.0, success=None,
         )
         for which in (1, 0)
     ]  # fmt: skip
-    parts = {part.entity: part.columns for part in drawing.columns(joined(shown))}
+    parts = {part.entity: part.columns for part in drawing.columns(joined(rollouts))}
     assert "/world/world/floor" not in parts
     for which, scales in ((0, [0.0, 0.0, 1.0, 1.0]), (1, [1.0, 1.0, 0.0, 0.0])):
         [column] = [each for each in parts[f"/world/ball/ball-{which}"] if "scale" in str(each.component_descriptor())]

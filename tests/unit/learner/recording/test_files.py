@@ -24,19 +24,19 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends
 def killed_while_compacting(path: Path) -> None:
     """Compact a recording in another process, kill that, and see that the one it started ends as well."""
     folder = path.parent
-    hangs, told = folder / "hangs", folder / "told"
-    os.mkfifo(told)
+    hangs, pipe = folder / "hangs", folder / "told"
+    os.mkfifo(pipe)
     hangs.write_text(HANGS)
     hangs.chmod(0o755)
     code = "import sys, pathlib; from learner.recording import files; files.compact(pathlib.Path(sys.argv[1]))"
     environment = {**os.environ, "RERUN_CLI_PATH": str(hangs)}
     process = subprocess.Popen([sys.executable, "-c", code, str(path)], cwd=folder, env=environment)
-    child = os.pidfd_open(int(told.read_text()))
+    child = os.pidfd_open(int(pipe.read_text()))
     process.kill()
     process.wait()
-    ended, _, _ = select.select([child], [], [], 10)
+    exits, _, _ = select.select([child], [], [], 10)
     os.close(child)
-    assert ended, "it goes on without its parent"
+    assert exits, "it goes on without its parent"
 
 
 def test_no_process_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,6 +60,6 @@ def test_what_was_left_goes_although_there_is_nothing_to_compact(tmp_path: Path)
 
 def test_rerun_sends_no_usage_data_and_says_nothing_of_it(tmp_path: Path) -> None:
     command = [files.program(), "analytics", "config"]
-    said = subprocess.run(command, env=files.quiet(tmp_path), capture_output=True, text=True, check=True)
-    assert '"analytics_enabled":false' in said.stdout.replace(" ", "").replace("\n", "")
-    assert "usage data" not in said.stdout + said.stderr
+    process = subprocess.run(command, env=files.quiet(tmp_path), capture_output=True, text=True, check=True)
+    assert '"analytics_enabled":false' in process.stdout.replace(" ", "").replace("\n", "")
+    assert "usage data" not in process.stdout + process.stderr

@@ -48,17 +48,17 @@ os._exit(9)
 
 
 def killed(path, mjcf, spec, calls, limit=0):
-    sent = pickle.dumps((str(path), mjcf, spec, calls, limit))
-    return subprocess.run([sys.executable, "-uc", WRITE], input=sent, capture_output=True, check=False, timeout=60)
+    job = pickle.dumps((str(path), mjcf, spec, calls, limit))
+    return subprocess.run([sys.executable, "-uc", WRITE], input=job, capture_output=True, check=False, timeout=60)
 
 
-def test_generations_are_recorded_on_every_timeline(start, rollout, traces, read):
+def test_generations_are_recorded_on_every_timeline(start, rollout, traces, rows_of):
     recorder = start()
     recorder.log("it begins")
     for generation in (1, 2, 3):
         recorder.generation(report(stats(generation), rollout(), traces(), rate=120.0))
     recorder.close()
-    rows = read()
+    rows = rows_of()
     assert rows.column("/learning/return", "scalars")[2] == [-4.7, -40.0, -1.0, -0.5, -5.0]
     assert rows.column("/learning/return_std", "variances") == [[6.25]] * 3
     assert rows.column("/learning/lost", "scalars") == [[2.0, 0.0, 0.0]] * 3
@@ -77,12 +77,12 @@ def test_generations_are_recorded_on_every_timeline(start, rollout, traces, read
             assert not {"log_time", "log_tick"} & set(batch.schema.names), entity
 
 
-def test_rollouts_follow_each_other_without_gap(start, rollout, read):
+def test_rollouts_follow_each_other_without_gap(start, rollout, rows_of):
     recorder = start()
     for generation in (4, 5):
         recorder.generation(report(stats(generation), rollout()))
     recorder.close()
-    rows = read()
+    rows = rows_of()
     at = np.array(rows.times("/touch/force")) / 1e9
     expected = np.concatenate([4.5 + np.arange(16) * 0.1, 6.0 + np.arange(16) * 0.1])
     np.testing.assert_allclose(at, expected, atol=2e-6)
@@ -90,13 +90,13 @@ def test_rollouts_follow_each_other_without_gap(start, rollout, read):
     assert rows.times("/learning/return") == [6_000_000_000, 7_500_000_000]
 
 
-def test_a_finished_run_opens_with_its_last_policy_playing(start, rollout, read, tmp_path):
+def test_a_finished_run_opens_with_its_last_policy_playing(start, rollout, rows_of, tmp_path):
     recorder = start()
     for generation in (1, 2):
         recorder.generation(report(stats(generation), rollout()))
     recorder.final(rollout(31, step=0.05))
     recorder.close()
-    rows, reader = read(), RrdReader(tmp_path / "run.rrd")
+    rows, reader = rows_of(), RrdReader(tmp_path / "run.rrd")
     assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0], [-4.0], [-3.25]]
     assert rows.column("/world/caption", "generation") == [0] * 16 + [1] * 16 + [2] * 31
     [*_, last] = rows.column("/world/caption", "labels")
@@ -115,17 +115,17 @@ def test_a_finished_run_opens_with_its_last_policy_playing(start, rollout, read,
     assert ["Learning (sim_time: 1.5 s per generation)"] in tabs
 
 
-def test_traces_come_back_bit_by_bit(start, traces, read):
+def test_traces_come_back_bit_by_bit(start, traces, rows_of):
     recorder = start()
-    kept = traces(30)
-    recorder.generation(report(stats(), None, kept))
+    arrays = traces(30)
+    recorder.generation(report(stats(), None, arrays))
     recorder.close()
-    [[found]] = read().column("/traces/all", "data")
-    assert found["shape"] == [30, 15, 12]
-    assert np.array(found["buffer"], dtype=np.float32).tobytes() == kept["all"].tobytes()
-    [[worst]] = read().column("/traces/worst", "buffer")
+    [[tensor]] = rows_of().column("/traces/all", "data")
+    assert tensor["shape"] == [30, 15, 12]
+    assert np.array(tensor["buffer"], dtype=np.float32).tobytes() == arrays["all"].tobytes()
+    [[worst]] = rows_of().column("/traces/worst", "buffer")
     picture = np.array(worst, dtype=np.uint8).view(np.float32).reshape(12, 15)
-    np.testing.assert_array_equal(picture, kept["worst"].T)
+    np.testing.assert_array_equal(picture, arrays["worst"].T)
 
 
 def test_a_wrong_trace_is_refused(start):
@@ -136,7 +136,7 @@ def test_a_wrong_trace_is_refused(start):
     recorder.close()
 
 
-def test_a_run_that_goes_on_keeps_what_is_there(start, rollout, tmp_path, read):
+def test_a_run_that_goes_on_keeps_what_is_there(start, rollout, tmp_path, rows_of):
     path = tmp_path / "run.rrd"
     first = start()
     first.generation(report(stats(1), rollout()))
@@ -148,7 +148,7 @@ def test_a_run_that_goes_on_keeps_what_is_there(start, rollout, tmp_path, read):
     second.close()
     assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
     assert [r.recording_id for r in RrdReader(path).recordings()] == ["try"]
-    rows = read()
+    rows = rows_of()
     assert rows.column("/learning/return", "generation") == [1, 2]
     assert len(rows.times("/reward/terms")) == 2 * 16
     assert rows.column("/log", "generation") == [1]
@@ -164,7 +164,7 @@ def test_parts_are_found_in_order(tmp_path):
     assert [p.name for p in parts(path)] == names
 
 
-def test_what_cannot_be_merged_stays(start, tmp_path, read, monkeypatch, caplog):
+def test_what_cannot_be_merged_stays(start, tmp_path, rows_of, monkeypatch, caplog):
     path = tmp_path / "run.rrd"
     start().close()
     monkeypatch.setattr("sys.executable", "/nowhere/python")
@@ -178,53 +178,53 @@ def test_what_cannot_be_merged_stays(start, tmp_path, read, monkeypatch, caplog)
     monkeypatch.undo()
     start(done=2).close()
     assert parts(path) == [path]
-    assert read().column("/learning/return", "generation") == [2]
+    assert rows_of().column("/learning/return", "generation") == [2]
 
 
-def test_rollouts_written_together_are_as_written_one_by_one(start, rollout, read, monkeypatch):
+def test_rollouts_written_together_are_as_written_one_by_one(start, rollout, rows_of, monkeypatch):
     lengths = (16, 3, 16, 1)  # some ended early
-    shown = [rollout(frames) for frames in lengths]
-    found = []
+    samples = [rollout(frames) for frames in lengths]
+    columns = []
     for hold in (0.0, 1e9):
         monkeypatch.setattr(recorders, "HOLD", hold)
         monkeypatch.setattr(recorders.time, "time", iter(range(1_700_000_000, 1_800_000_000)).__next__)
         recorder = start(f"held-{hold:g}.rrd")
-        for generation, sample in enumerate(shown, 1):
+        for generation, sample in enumerate(samples, 1):
             recorder.generation(report(stats(generation), sample))
         recorder.close()
-        rows = read(f"held-{hold:g}.rrd")
+        rows = rows_of(f"held-{hold:g}.rrd")
         names = {(e, n) for e, batches in rows.batches.items() for batch in batches for n in batch.schema.names}
-        found.append({(e, n): rows.column(e, n) for e, n in names if ":" in n or n == "generation"})
-    assert len(found[0]) > 60
-    assert found[0] == found[1]
-    assert found[0]["/actions", "generation"] == [g for g, n in enumerate(lengths) for _ in range(n)]
-    assert set(found[0]["/touch/state/left", "generation"]) == {0, 1, 2, 3}, "a rollout begins with its state"
+        columns.append({(e, n): rows.column(e, n) for e, n in names if ":" in n or n == "generation"})
+    assert len(columns[0]) > 60
+    assert columns[0] == columns[1]
+    assert columns[0]["/actions", "generation"] == [g for g, n in enumerate(lengths) for _ in range(n)]
+    assert set(columns[0]["/touch/state/left", "generation"]) == {0, 1, 2, 3}, "a rollout begins with its state"
 
 
-def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, read):
+def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, rows_of):
     path = tmp_path / "run.rrd"
-    ended = killed(path, scene_text, spec, [(stats(g), {}) for g in range(1, 6)])
-    assert ended.returncode == 9, ended.stderr.decode()
+    process = killed(path, scene_text, spec, [(stats(g), {}) for g in range(1, 6)])
+    assert process.returncode == 9, process.stderr.decode()
     path.write_bytes(path.read_bytes()[:-37])
     recorder = start()
     recorder.generation(report(stats(6)))
     recorder.close()
-    assert read().column("/learning/return", "generation") == [1, 2, 3, 4, 5, 6]
+    assert rows_of().column("/learning/return", "generation") == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_full_disk_is_noticed(traces, spec, scene_text, tmp_path):
-    ended = killed(tmp_path / "run.rrd", scene_text, spec, [(stats(), traces(30))] * 100, limit=300_000)
-    assert b"noticed" in ended.stdout, ended.stderr.decode()
+    process = killed(tmp_path / "run.rrd", scene_text, spec, [(stats(), traces(30))] * 100, limit=300_000)
+    assert b"noticed" in process.stdout, process.stderr.decode()
 
 
-def test_a_recording_ends_before_the_disk_is_full(start, read, monkeypatch):
+def test_a_recording_ends_before_the_disk_is_full(start, rows_of, monkeypatch):
     recorder = start()
     recorder.generation(report(stats(1)))
     monkeypatch.setattr("learner.recording.recorder.RESERVE", 1 << 60)
     with pytest.raises(OSError, match="are needed"):
         recorder.generation(report(stats(2)))
     recorder.close()
-    assert read().column("/learning/return", "generation") == [1]
+    assert rows_of().column("/learning/return", "generation") == [1]
 
 
 def test_viewers_are_served(scene, spec, rollout, traces):
@@ -240,11 +240,11 @@ def test_viewers_are_served(scene, spec, rollout, traces):
     recorder.close()
 
 
-def test_replays_follow_each_other(scene, spec, rollout, tmp_path, read):
-    path, shown = tmp_path / "replay.rrd", [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())]
+def test_replays_follow_each_other(scene, spec, rollout, tmp_path, rows_of):
+    path, rollouts = tmp_path / "replay.rrd", [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())]
     for _ in range(2):  # the second takes the first one's place
-        record_replay(path, run="try", drawing=Drawing(scene, spec), config="# settings", rollouts=shown)
-    rows = read("replay.rrd")
+        record_replay(path, run="try", drawing=Drawing(scene, spec), config="# settings", rollouts=rollouts)
+    rows = rows_of("replay.rrd")
     assert [p.name for p in tmp_path.iterdir()] == ["replay.rrd"]
     assert [r.recording_id for r in RrdReader(path).recordings()] == ["try-replay"]
     assert rows.column("/reward/terms", "rollout") == [1] * 31 + [2] * 16
@@ -257,38 +257,38 @@ def test_replays_follow_each_other(scene, spec, rollout, tmp_path, read):
 CURVES = ("/reward/terms", "/actions", "/touch/force", "/touch/force/limits")
 
 
-def test_no_curve_goes_from_one_rollout_of_a_replay_to_the_next(scene, spec, rollout, tmp_path, read):
-    shown = [("one", rollout(31, 0.01)), ("other", rollout()), ("third", rollout())]
-    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=shown)
+def test_no_curve_goes_from_one_rollout_of_a_replay_to_the_next(scene, spec, rollout, tmp_path, rows_of):
+    rollouts = [("one", rollout(31, 0.01)), ("other", rollout()), ("third", rollout())]
+    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=rollouts)
     for entity in CURVES:
-        np.testing.assert_allclose(read("r.rrd").breaks(entity), [0.35e9, 1.95e9])
+        np.testing.assert_allclose(rows_of("r.rrd").breaks(entity), [0.35e9, 1.95e9])
 
 
-def test_no_curve_goes_from_a_rollout_that_ended_early_to_the_next_generations(start, rollout, read):
+def test_no_curve_goes_from_a_rollout_that_ended_early_to_the_next_generations(start, rollout, rows_of):
     recorder = start()
     for generation, frames in ((1, 16), (2, 4), (3, 16)):
         recorder.generation(report(stats(generation), rollout(frames)))
     recorder.close()
     for entity in CURVES:
-        np.testing.assert_allclose(read().breaks(entity), [1.5e9 + 0.3e9 + 1e3])
+        np.testing.assert_allclose(rows_of().breaks(entity), [1.5e9 + 0.3e9 + 1e3])
 
 
-def test_the_eye_follows_a_body_that_moves_away(scene, spec, rollout, tmp_path, read):
-    shown, mover = rollout(), scene.mover
+def test_the_eye_follows_a_body_that_moves_away(scene, spec, rollout, tmp_path, rows_of):
+    sample, mover = rollout(), scene.mover
     bodies = np.tile(scene.poses(scene.model.qpos0[None]), (16, 1, 1))
     bodies[8:, scene.bodies.index(mover.body), 0] += 10.0
-    gone = dataclasses.replace(shown, bodies=bodies.astype("<f4"))
-    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=[("gone", gone)])
-    places = np.array(read("r.rrd").column("/world/view", "positions"))[:, 0]
+    away = dataclasses.replace(sample, bodies=bodies.astype("<f4"))
+    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=[("gone", away)])
+    places = np.array(rows_of("r.rrd").column("/world/view", "positions"))[:, 0]
     np.testing.assert_allclose(places[:8], np.tile(mover.centre, (8, 1)), atol=1e-6)
     np.testing.assert_allclose(places[8:, 0], mover.centre[0] + 10.0 - 0.4 * mover.radius, atol=1e-5)
 
 
-def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, rollout, tmp_path, read):
+def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, rollout, tmp_path, rows_of):
     curves = [stats(g) for g in (1, 2)]
     both = [Side(name, Drawing(scene, spec), curves, rollout()) for name in ("one", "other")]
     record_comparison(tmp_path / "compare.rrd", both, "| table |")
-    rows = read("compare.rrd")
+    rows = rows_of("compare.rrd")
     force = rollout().channels["touch/force"]
     for root in ("/runs/one", "/runs/other"):
         np.testing.assert_array_equal(np.array(rows.column(f"{root}/touch/force/left", "scalars"))[:, 0], force[:, 0])
@@ -298,7 +298,7 @@ def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, roll
     record_comparison(
         tmp_path / "mixed.rrd", [both[0], Side("c", Drawing(scene, plain), curves, rollout(spec=plain))], ""
     )
-    assert not [entity for entity in read("mixed.rrd").batches if "force" in entity]
+    assert not [entity for entity in rows_of("mixed.rrd").batches if "force" in entity]
 
 
 def test_parts_are_known_without_rerun():

@@ -63,28 +63,28 @@ def recording(recorder: Slow, **how: Any) -> RunRecording:
 def test_what_is_held_back_is_written_when_nothing_comes() -> None:
     quiet = Slow()
     quiet.go.set()
-    made = recording(quiet)
-    made.put(report(stats()))
+    run = recording(quiet)
+    run.put(report(stats()))
     assert quiet.settled.wait(10 * QUIET)
     quiet.settled.clear()
-    assert made.settled()
+    assert run.settled()
     assert quiet.settled.is_set()
-    assert made.finish(timeout=10)
+    assert run.finish(timeout=10)
     assert quiet.merged is False, "the run may continue"
 
 
 def test_a_run_from_its_reports(rollout: Callable[..., Trajectory]) -> None:
     quiet = Slow()
     quiet.go.set()
-    made, shown = recording(quiet, done=3), rollout(2)
-    made.put(report(stats(4), lines=(Line(level="WARNING", text="one worker left"),)))
-    made.put(report(stats(5, return_max=2.0, best=2.0), replay=shown, replay_generation=5))
-    assert (made.done, made.end) == (5, None)
+    run, sample = recording(quiet, done=3), rollout(2)
+    run.put(report(stats(4), lines=(Line(level="WARNING", text="one worker left"),)))
+    run.put(report(stats(5, return_max=2.0, best=2.0), replay=sample, replay_generation=5))
+    assert (run.done, run.end) == (5, None)
     logging.getLogger("learner.made_up").warning("the disk is %s full", "nearly")
     lines = (Line(level="INFO", text="finished"),)
-    end = RunEnd(summary={"state": "finished"}, lines=lines, best=shown, best_generation=5, mean=shown)
-    made.put(end)
-    assert made.finish(timeout=10)
+    end = RunEnd(summary={"state": "finished"}, lines=lines, best=sample, best_generation=5, mean=sample)
+    run.put(end)
+    assert run.finish(timeout=10)
     assert [each.generation for each in quiet.generations] == [4, 5]
     assert quiet.lines == [
         ("WARNING", "one worker left"),
@@ -94,45 +94,45 @@ def test_a_run_from_its_reports(rollout: Callable[..., Trajectory]) -> None:
     ]
     best = "best rollout, generation 5"
     assert quiet.replays == [[best], [best, "mean policy after generation 5"]]
-    assert quiet.results == [{"generations": 5, "return": shown.value, "success": shown.success}, shown]
-    assert (made.end, quiet.merged) == (end, True)
+    assert quiet.results == [{"generations": 5, "return": sample.value, "success": sample.success}, sample]
+    assert (run.end, quiet.merged) == (end, True)
 
 
 def test_a_run_that_diverged_has_no_mean_policy(rollout: Callable[..., Trajectory]) -> None:
     quiet = Slow()
-    made = recording(quiet)
-    made.put(RunEnd(summary={"state": "diverged"}, lines=(), best=rollout(2), best_generation=1, mean=None))
-    assert made.finish(timeout=10)
+    run = recording(quiet)
+    run.put(RunEnd(summary={"state": "diverged"}, lines=(), best=rollout(2), best_generation=1, mean=None))
+    assert run.finish(timeout=10)
     assert (quiet.replays, quiet.results) == ([["best rollout, generation 1"]], [])
     assert quiet.merged
 
 
 def test_a_slow_recorder_loses_rollouts_but_no_statistics(rollout: Callable[..., Trajectory]) -> None:
     slow = Slow()
-    made = recording(slow, waiting=4)
+    run = recording(slow, waiting=4)
     for generation in range(1, 11):
         lines = (Line(level="INFO", text=str(generation)),)
-        made.put(report(stats(generation), rollout(2), {"best": np.zeros((15, 12), "<f4")}, lines=lines))
+        run.put(report(stats(generation), rollout(2), {"best": np.zeros((15, 12), "<f4")}, lines=lines))
     slow.go.set()
-    assert made.finish(timeout=10)
+    assert run.finish(timeout=10)
     numbers = list(range(1, 11))
     assert [each.generation for each in slow.generations] == [int(text) for _, text in slow.lines] == numbers
     whole = [each.sample is not None and bool(each.traces) for each in slow.generations]
-    assert whole.count(False) == made.dropped
-    assert made.dropped >= 7
+    assert whole.count(False) == run.dropped
+    assert run.dropped >= 7
     assert whole[0]
 
 
 def test_a_broken_recorder_ends_with_one_line(caplog: pytest.LogCaptureFixture) -> None:
     broken = Slow(fails=OSError("no space left on device"))
     broken.go.set()
-    made = recording(broken)
+    run = recording(broken)
     with caplog.at_level(logging.INFO):
         for generation in range(1, 50):
-            made.put(report(stats(generation)))
-        assert not made.settled()
-        assert not made.finish(timeout=10)
-    assert made.failed
+            run.put(report(stats(generation)))
+        assert not run.settled()
+        assert not run.finish(timeout=10)
+    assert run.failed
     assert [r.getMessage() for r in caplog.records] == [
         "the recording ends here, learning continues: no space left on device"
     ]
@@ -141,8 +141,8 @@ def test_a_broken_recorder_ends_with_one_line(caplog: pytest.LogCaptureFixture) 
 
 def test_a_recorder_that_hangs_is_left_behind(caplog: pytest.LogCaptureFixture) -> None:
     slow = Slow()
-    made = recording(slow)
-    made.put(report(stats()))
-    assert not made.finish(timeout=0.05)
+    run = recording(slow)
+    run.put(report(stats()))
+    assert not run.finish(timeout=0.05)
     assert "not complete" in caplog.text
     slow.go.set()

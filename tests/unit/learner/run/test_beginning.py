@@ -24,29 +24,31 @@ def test_a_run_that_starts_from_another(pole: str, tmp_path: Path) -> None:
     other = checkpoints.load(tmp_path / "first" / "checkpoint")
     for sigma in ("run", "fresh"):
         config = configure(pole, seed=4, init_from=str(tmp_path / "first"), init_sigma=sigma, initial_sigma=0.5)
-        found, at = setup.start(config, "second")
+        problem, at = setup.start(config, "second")
         assert at.state["mu"].tobytes() == other.state["mu"].tobytes()
         assert (at.state["sigma"].tobytes() == other.state["sigma"].tobytes()) == (sigma == "run")
         assert at.state["generation"] == 0
         for name, values in other.constants.items():
-            assert found.policy.constants[name].tobytes() == values.tobytes(), "else its parameters mean something else"
+            assert problem.policy.constants[name].tobytes() == values.tobytes(), (
+                "else its parameters mean something else"
+            )
 
 
 def test_an_mlp_starts_at_drawn_weights_which_a_run_to_start_from_replaces(pole: str, tmp_path: Path) -> None:
     mlp: dict[str, Any] = {"policy": "mlp", "layers": (3,), "algorithm": "es", "generations": 2}
     config = configure(pole, **mlp)
-    found, at = setup.start(config, "first")
-    drawn = found.policy.start(seeds.start(config.seed))
-    assert drawn is not None
-    assert at.state["mu"].tobytes() == drawn.tobytes()
+    problem, at = setup.start(config, "first")
+    weights = problem.policy.start(seeds.start(config.seed))
+    assert weights is not None
+    assert at.state["mu"].tobytes() == weights.tobytes()
     raised = setup.start(configure(pole, **mlp, initial_mu=0.5), "first")[1]
-    assert raised.state["mu"].tobytes() == (0.5 + drawn).tobytes()
+    assert raised.state["mu"].tobytes() == (0.5 + weights).tobytes()
     assert not at.constants, "workers need no start"
     learnt(config, tmp_path / "first")
-    assert load(tmp_path / "first", 0).mu.tobytes() == drawn.tobytes()
+    assert load(tmp_path / "first", 0).mu.tobytes() == weights.tobytes()
     other = checkpoints.load(tmp_path / "first" / "checkpoint").state["mu"]
-    _, taken = setup.start(configure(pole, **mlp, seed=4, init_from=str(tmp_path / "first")), "second")
-    assert taken.state["mu"].tobytes() == other.tobytes()
+    _, heir = setup.start(configure(pole, **mlp, seed=4, init_from=str(tmp_path / "first")), "second")
+    assert heir.state["mu"].tobytes() == other.tobytes()
 
 
 def test_a_run_whose_parameters_mean_something_else_is_no_beginning(pole: str, tmp_path: Path) -> None:
@@ -61,16 +63,16 @@ def test_a_run_whose_parameters_mean_something_else_is_no_beginning(pole: str, t
         setup.start(configure(pole, init_from=str(tmp_path)), "second")
 
 
-@pytest.mark.parametrize(("policy", "own"), [("kernel", {}), ("projected", {"features": 5})])
-def test_a_fitted_start(pole: str, policy: str, own: dict[str, Any]) -> None:
-    config = configure(pole, policy=policy, initial_mu=1.5, start="fitted", **own)
-    found = setup.fitted(config)
+@pytest.mark.parametrize(("policy", "settings"), [("kernel", {}), ("projected", {"features": 5})])
+def test_a_fitted_start(pole: str, policy: str, settings: dict[str, Any]) -> None:
+    config = configure(pole, policy=policy, initial_mu=1.5, start="fitted", **settings)
+    fit = setup.fitted(config)
     distance = np.hypot(1.5 - 0.2, 1.5)  # qpos and qvel at the start
-    width, sigma = found.policy_config.bandwidth, found.algorithm_config.initial_sigma  # type: ignore[attr-defined]
+    width, sigma = fit.policy_config.bandwidth, fit.algorithm_config.initial_sigma  # type: ignore[attr-defined]
     assert distance**2 / (2 * width**2) == pytest.approx(1.0)
     assert 2 * sigma**2 / (2 * width**2) == pytest.approx(1.0)
-    assert setup.fitted(found) == found, "so that config.json repeats the run"
-    state = setup.start(found, "r")[1].state
+    assert setup.fitted(fit) == fit, "so that config.json repeats the run"
+    state = setup.start(fit, "r")[1].state
     assert (state["mu"] == 1.5).all()
     assert (state["sigma"] == sigma).all()
     printed = replace(config, start="printed")
@@ -99,22 +101,24 @@ def test_a_fitted_start_begins_beside_the_observation(pole: str, tmp_path: Path)
 def test_the_finger_gaits_start_fits_every_state_base() -> None:
     sizes = {"joints": 8, "joints+contacts": 17, "tactile": 54, "joints+tactile": 62}
     for state, size in sizes.items():
-        found = setup.fitted(configure(state=state, start="fitted"))
-        width = found.policy_config.bandwidth  # type: ignore[attr-defined]
-        policy = setup.start(found, "r")[0].policy
+        fit = setup.fitted(configure(state=state, start="fitted"))
+        width = fit.policy_config.bandwidth  # type: ignore[attr-defined]
+        policy = setup.start(fit, "r")[0].policy
         assert 0.1 < width < 10.0
-        assert found.algorithm_config.initial_sigma == pytest.approx(width * np.sqrt(2 / size))  # type: ignore[attr-defined]
+        assert fit.algorithm_config.initial_sigma == pytest.approx(width * np.sqrt(2 / size))  # type: ignore[attr-defined]
         assert policy.size == 8 * size
 
 
 def test_what_workers_are_told_is_the_problem(pole: str, tmp_path: Path) -> None:
-    found, _ = setup.start(configure(pole, mass=2.0), "r")
-    spec = found.specification("r")
-    assert (spec.task, found.files) == ("pole.py:Pole", (tmp_path / "pole.py",))
-    task, policy = served(spec, found.files)
-    assert (task.config, task.sources) == (found.task.config, found.task.sources)
-    assert policy.constants.keys() == found.policy.constants.keys()
+    problem, _ = setup.start(configure(pole, mass=2.0), "r")
+    spec = problem.specification("r")
+    assert (spec.task, problem.files) == ("pole.py:Pole", (tmp_path / "pole.py",))
+    task, policy = served(spec, problem.files)
+    assert (task.config, task.sources) == (problem.task.config, problem.task.sources)
+    assert policy.constants.keys() == problem.policy.constants.keys()
     theta = np.ones((2, policy.size))
     x = np.ones((2, policy.spec.observation))
-    assert policy.act(policy.prepare(theta), x).tobytes() == found.policy.act(found.policy.prepare(theta), x).tobytes()
-    assert found.code["task"] == plugins.find("tasks", pole).digest()
+    assert (
+        policy.act(policy.prepare(theta), x).tobytes() == problem.policy.act(problem.policy.prepare(theta), x).tobytes()
+    )
+    assert problem.code["task"] == plugins.find("tasks", pole).digest()

@@ -74,13 +74,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     ids=range(4),
 )
 def test_there_and_back(tmp_path: Path, changed: dict[str, object]) -> None:
-    told = checkpoint(**changed)
-    save(tmp_path / "checkpoint", told)
+    original = checkpoint(**changed)
+    save(tmp_path / "checkpoint", original)
     back = load(tmp_path / "checkpoint")
-    assert bits(back) == bits(told)
+    assert bits(back) == bits(original)
     state = PGPE(optimiser="adam").restore(back.state)
     assert isinstance(state, PGPEState)
-    assert bits(dict(state.to_dict())) == bits(told.state)
+    assert bits(dict(state.to_dict())) == bits(original.state)
     assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"]
 
 
@@ -113,15 +113,15 @@ def test_something_appended(tmp_path: Path, whole: bytes) -> None:
 
 
 def test_of_before_there_were_statistics_of_observations(tmp_path: Path) -> None:
-    path, told = tmp_path / "checkpoint", checkpoint()
-    save(path, told)
-    body = codec.encode(told, 2)
+    path, original = tmp_path / "checkpoint", checkpoint()
+    save(path, original)
+    body = codec.encode(original, 2)
     head = path.read_bytes()[: -len(body) - hashlib.sha256().digest_size]
     plain = msgpack.unpackb(body, ext_hook=msgpack.ExtType)
     del plain["moments"], plain["steps"], plain["best"]["normaliser"]
     old = msgpack.packb(plain)
     path.write_bytes(head + hashlib.sha256(old).digest() + old)
-    assert bits(load(path)) == bits(told)
+    assert bits(load(path)) == bits(original)
 
 
 def test_of_another_version(tmp_path: Path, whole: bytes) -> None:

@@ -100,13 +100,13 @@ ODD = RunConfig(
 
 def test_what_is_left_out_is_the_tasks_first_preset(pole: str, file: Path) -> None:
     assert RunConfig() == configure() == configure("finger-gait", next(iter(presets("finger-gait"))))
-    made = RunConfig(task=pole)
-    assert (made.policy, made.algorithm) == ("direct", "pgpe")
-    assert (made.task_config.length, made.algorithm_config) == (2.0, PGPE(pairs=7))
-    assert made == configure(pole) == configure(pole, "tall")
+    config = RunConfig(task=pole)
+    assert (config.policy, config.algorithm) == ("direct", "pgpe")
+    assert (config.task_config.length, config.algorithm_config) == (2.0, PGPE(pairs=7))
+    assert config == configure(pole) == configure(pole, "tall")
     assert configure(pole, "small").policy_config.features == 3
     assert configure(pole, "small").task_config.length == 1.0
-    assert (RunConfig().generations, configure(preset="thesis").generations, made.generations) == (90, 150, 150)
+    assert (RunConfig().generations, configure(preset="thesis").generations, config.generations) == (90, 150, 150)
     general = RunConfig(task=f"{file}:Plain")
     assert general == configure(f"{file}:Plain", "default")
     assert (general.policy_config.features, general.algorithm_config.optimiser) == (50, "clipup")
@@ -137,15 +137,15 @@ class Slides(farm.Task):
     def reward(self, sim, action):
         return sim.qpos[:, 0]
 """)
-    made = RunConfig(task=f"{file}:Slides")
-    assert (made.policy, made.algorithm, made.policy_config.normalise) == (policy, "pgpe", normalise)
-    assert made.algorithm_config.initial_sigma == sigma
-    assert made == configure(f"{file}:Slides", "default")
+    config = RunConfig(task=f"{file}:Slides")
+    assert (config.policy, config.algorithm, config.policy_config.normalise) == (policy, "pgpe", normalise)
+    assert config.algorithm_config.initial_sigma == sigma
+    assert config == configure(f"{file}:Slides", "default")
 
 
 def test_settings_by_their_flags(pole: str) -> None:
-    made = configure(pole, length=3, features=9, pairs=2, seed=4)
-    assert (made.task_config.length, made.policy_config.features, made.algorithm_config.pairs, made.seed) == (
+    config = configure(pole, length=3, features=9, pairs=2, seed=4)
+    assert (config.task_config.length, config.policy_config.features, config.algorithm_config.pairs, config.seed) == (
         3,
         9,
         2,
@@ -160,15 +160,15 @@ def test_settings_by_their_flags(pole: str) -> None:
 
 def test_a_part_that_is_chosen_anew_begins_with_its_own_defaults() -> None:
     old = configure(bandwidth=2.0, policy="direct", features=9, seed=3)
-    kept = changed_by(old, {"pairs": 4})
-    assert kept == replace(old, algorithm_config=replace(old.algorithm_config, pairs=4))
+    same = changed_by(old, {"pairs": 4})
+    assert same == replace(old, algorithm_config=replace(old.algorithm_config, pairs=4))
     new = changed_by(old, {"policy": "cosine"})
     assert (new.policy_config, new.task_config, new.seed) == (Cosine.Config(), old.task_config, 3)
 
 
 def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_own(pole: str, file: Path) -> None:
-    made = configure(f"{file}:Plain", policy="kernel", algorithm=f"{file}:Walk")
-    assert (made.policy_config, made.algorithm_config.pairs) == (Kernel.Config(bandwidth=1.0), 5)
+    config = configure(f"{file}:Plain", policy="kernel", algorithm=f"{file}:Walk")
+    assert (config.policy_config, config.algorithm_config.pairs) == (Kernel.Config(bandwidth=1.0), 5)
     assert configure(pole, "small", policy="cosine").policy_config.features == 3
     assert configure(algorithm="snes").algorithm_config == SNES()
     assert configure(algorithm="snes", pairs=3).algorithm_config == SNES(pairs=3)
@@ -218,12 +218,12 @@ def test_populations_that_cannot_be(settings: dict[str, Any], words: str) -> Non
 
 
 def test_there_and_back(pole: str, tmp_path: Path) -> None:
-    made = [configure("finger-gait", name) for name in presets("finger-gait")]
-    for config in (*made, ODD, RunConfig(generations=0), configure(pole, sides=("left", "right"))):
-        said = configs.to_dict(config)
-        assert said["version"] == configs.VERSION == 2
+    variants = [configure("finger-gait", name) for name in presets("finger-gait")]
+    for config in (*variants, ODD, RunConfig(generations=0), configure(pole, sides=("left", "right"))):
+        table = configs.to_dict(config)
+        assert table["version"] == configs.VERSION == 2
         path = tmp_path / "config.json"
-        path.write_text(json.dumps(said), "utf-8")
+        path.write_text(json.dumps(table), "utf-8")
         back = configs.read(path)
         assert back == config
         assert repr(back) == repr(config), "a type changed on the way"
@@ -232,8 +232,8 @@ def test_there_and_back(pole: str, tmp_path: Path) -> None:
 
 def test_what_is_missing_of_the_settings_is_their_default() -> None:
     parts = {"task": {"name": "finger-gait"}, "policy": {"name": "direct"}, "algorithm": {"name": "pgpe"}}
-    said = configs.from_dict({"version": 2, "seed": 4, **parts}, "here")
-    assert said == RunConfig(
+    config = configs.from_dict({"version": 2, "seed": 4, **parts}, "here")
+    assert config == RunConfig(
         policy="direct", task_config=FingerGaitConfig(), policy_config=Direct.Config(), algorithm_config=PGPE(), seed=4
     )
 
@@ -272,11 +272,11 @@ REFUSED: list[tuple[tuple[str, ...], object, str]] = [
 
 @pytest.mark.parametrize(("keys", "value", "words"), REFUSED, ids=lambda value: str(value)[:40])
 def test_refused(keys: tuple[str, ...], value: object, words: str) -> None:
-    said: Any = configs.to_dict(RunConfig())
-    table = said if len(keys) == 1 else said[keys[0]]
+    contents: Any = configs.to_dict(RunConfig())
+    table = contents if len(keys) == 1 else contents[keys[0]]
     table[keys[-1]] = value
     with pytest.raises(ConfigError) as caught:
-        configs.from_dict(said, "over here")
+        configs.from_dict(contents, "over here")
     line = str(caught.value)
     assert words in line
     assert len(line.splitlines()) == 1
@@ -329,9 +329,9 @@ def test_presets_are_known_by_what_they_set(task: str, pole: str) -> None:
 
 def test_runs_of_one_second_have_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.gmtime", lambda: time.struct_time((2026, 1, 2, 3, 4, 5, 4, 2, 0)))
-    chosen, names = LearnerOptions(out=tmp_path), []
+    options, names = LearnerOptions(out=tmp_path), []
     for _ in range(3):
-        names.append(run_name(chosen, RunConfig()))
+        names.append(run_name(options, RunConfig()))
         (tmp_path / names[-1]).mkdir()
     first = "finger-gait-default-s0-20260102-030405"
     assert names == [first, f"{first}-2", f"{first}-3"]

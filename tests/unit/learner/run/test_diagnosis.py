@@ -11,11 +11,11 @@ from learner.run.diagnosis import FALLEN, REPEATED, STALE, WINDOW, Diagnosis
 def messages(returns, algorithm=None, *, one_step=False, **changed):
     """Messages by generation of a run whose mean policy returns this."""
     diagnosis = Diagnosis(algorithm or ES())
-    found = {}
+    texts = {}
     for g, value in enumerate(returns, start=1):
         for message in diagnosis.after(stats(g, mean_policy_return=value, **changed), one_step=one_step):
-            found.setdefault(g, []).append(message)
-    return found
+            texts.setdefault(g, []).append(message)
+    return texts
 
 
 def noisy(values, deviation=1.0):
@@ -31,8 +31,8 @@ def test_a_run_that_succeeds_may_stay_where_it_is():
 
 
 def test_no_improvement():
-    found = messages([*np.linspace(-100.0, -50.0, 40), *[-50.0] * 150])
-    [(generation, [message])] = found.items()
+    texts = messages([*np.linspace(-100.0, -50.0, 40), *[-50.0] * 150])
+    [(generation, [message])] = texts.items()
     assert generation == 40 + WINDOW - 1 + STALE
     assert "has not improved for 100 generations" in message
     assert "returned -50 around generation 49" in message
@@ -40,8 +40,8 @@ def test_no_improvement():
 
 
 def test_a_fall_after_a_rise():
-    found = messages(noisy([*np.linspace(-60.0, 30.0, 50), *np.linspace(30.0, -200.0, 60)]))
-    [(generation, [message])] = found.items()
+    texts = messages(noisy([*np.linspace(-60.0, 30.0, 50), *np.linspace(30.0, -200.0, 60)]))
+    [(generation, [message])] = texts.items()
     assert 50 + FALLEN < generation < 50 + 2 * FALLEN + WINDOW
     assert "has become worse" in message
     assert "smaller --learning-rate-mu" in message
@@ -53,18 +53,18 @@ def test_noise_is_no_fall():
 
 def test_sigma_at_its_floor_and_without_one():
     for algorithm in (PGPE(sigma_floor=0.01), ES(initial_sigma=10.0)):
-        found = messages(np.linspace(0.0, 1.0, 30), algorithm, sigma_max=0.01)
-        assert [(g, "sigma is down to 0.01" in each) for g, [each] in found.items()] == [(WINDOW, True)]
+        texts = messages(np.linspace(0.0, 1.0, 30), algorithm, sigma_max=0.01)
+        assert [(g, "sigma is down to 0.01" in each) for g, [each] in texts.items()] == [(WINDOW, True)]
         assert messages(np.linspace(0.0, 1.0, 30), algorithm, sigma_max=0.0101) == {}
 
 
 def test_equal_returns():
-    found = messages(np.linspace(0.0, 1.0, 30), return_min=7.0, return_max=7.0)
-    assert [(g, "returned 7: no perturbation changes the reward" in each) for g, [each] in found.items()] == [
+    texts = messages(np.linspace(0.0, 1.0, 30), return_min=7.0, return_max=7.0)
+    assert [(g, "returned 7: no perturbation changes the reward" in each) for g, [each] in texts.items()] == [
         (REPEATED, True)
     ]
 
 
 def test_rollouts_of_one_step():
-    found = messages(np.linspace(0.0, 1.0, 30), one_step=True, return_min=7.0, return_max=7.0)
-    assert [(g, "ended in their first step" in each) for g, [each] in found.items()] == [(REPEATED, True)]
+    texts = messages(np.linspace(0.0, 1.0, 30), one_step=True, return_min=7.0, return_max=7.0)
+    assert [(g, "ended in their first step" in each) for g, [each] in texts.items()] == [(REPEATED, True)]

@@ -125,15 +125,15 @@ def test_means_that_are_not_stored_are_not_averaged(
     assert "lacks means of generations 9 to 11: the average is of 1 instead of 2" in caplog.text
 
 
-@pytest.mark.parametrize(("limit", "kept"), [(880, 1), (879, 2), (440, 2), (439, 3), (87, 11)])
+@pytest.mark.parametrize(("limit", "every"), [(880, 1), (879, 2), (440, 2), (439, 3), (87, 11)])
 def test_beyond_the_limit_every_kth_is_kept(
-    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, limit: int, kept: int
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, limit: int, every: int
 ) -> None:
     monkeypatch.setattr(files, "PARAMETERS_LIMIT", limit)  # ten rows of 88 bytes
-    assert folder.parameters.every(P, 10) == kept
+    assert folder.parameters.every(P, 10) == every
     fill(folder, 10)
-    assert folder.parameters.every(P, 10) == kept
-    assert_holds(folder, list(range(kept, 11, kept)))
+    assert folder.parameters.every(P, 10) == every
+    assert_holds(folder, list(range(every, 11, every)))
     assert folder.parameters.rows().nbytes <= limit
 
 
@@ -149,8 +149,8 @@ def test_torn_ends_are_not_read(folder: RunFolder) -> None:
     fill(folder, 4)
     lines, parameters = folder.path / "progress.jsonl", folder.path / "parameters"
     whole, bytes_ = lines.read_bytes(), parameters.read_bytes()
-    begin = whole.rindex(b"\n", 0, -1) + 1
-    for cut in range(begin, len(whole) - 1, 9):
+    start = whole.rindex(b"\n", 0, -1) + 1
+    for cut in range(start, len(whole) - 1, 9):
         lines.write_bytes(whole[:cut])
         assert [p.generation for p in folder.progress()] == [1, 2, 3]
     for cut in (1, 8, 44, 87):
@@ -195,9 +195,9 @@ def test_a_damaged_line_costs_no_other(folder: RunFolder, caplog: pytest.LogCapt
     assert folder.progress() == rest[:-1]
     copy = folder.path / "progress.jsonl.damaged"
     assert copy.read_bytes() == content
-    (said,) = caplog.messages
-    assert "1 damaged line(s) dropped (line 4), 5 kept" in said or "(line 3), 5 kept" in said
-    assert str(copy) in said
+    (message,) = caplog.messages
+    assert "1 damaged line(s) dropped (line 4), 5 kept" in message or "(line 3), 5 kept" in message
+    assert str(copy) in message
 
     content = damage(folder, (2, b"{}\n"), (3, b"}\n"))
     folder.rewind(checkpoint(6))
@@ -368,13 +368,13 @@ def test_a_new_run_can_be_discarded(folder: RunFolder) -> None:
 
 
 def test_normalisers_are_kept_where_there_are_some(folder: RunFolder) -> None:
-    seen = np.random.default_rng(0).uniform(size=(4, 2, 3))
+    normalisers = np.random.default_rng(0).uniform(size=(4, 2, 3))
     for generation in (1, 2, 3):
-        folder.append(progress(generation), *ROWS[generation], 10, seen[generation])
+        folder.append(progress(generation), *ROWS[generation], 10, normalisers[generation])
     rows = folder.parameters.rows()
-    assert rows["normaliser"].tobytes() == seen[1:].tobytes()
+    assert rows["normaliser"].tobytes() == normalisers[1:].tobytes()
     mu, normaliser = folder.parameters.mean(2)
-    assert (mu.tobytes(), normaliser.tobytes()) == (ROWS[2][0].tobytes(), seen[2].tobytes())
+    assert (mu.tobytes(), normaliser.tobytes()) == (ROWS[2][0].tobytes(), normalisers[2].tobytes())
     assert "normaliser" in (folder.path / "parameters").read_bytes().partition(b"\n")[0].decode()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alone import POLE, begun, learnt, state, taken_up
+from alone import POLE, learnt, new_run, state, taken_up
 
 from farm import seeds
 from farm.errors import ConfigError, RunError
@@ -25,12 +25,12 @@ pytestmark = pytest.mark.usefixtures("grips_found_once")
 
 @pytest.mark.parametrize("traces", ["extremes", "all", "none"])
 def test_a_generation_and_what_is_kept_of_it(pole: str, tmp_path: Path, traces: str) -> None:
-    learner, alone = begun(configure(pole, traces=traces), tmp_path / "r")
+    learner, alone = new_run(configure(pole, traces=traces), tmp_path / "r")
     reports = list(learner.learn(alone))  # type: ignore[arg-type]
     assert [report.progress.generation for report in reports] == [1, 2, 3]
     assert learner.folder.progress() == [report.progress for report in reports]
-    for report, (generation, jobs, wanted) in zip(reports, alone.rounds, strict=True):
-        assert wanted == traces
+    for report, (generation, jobs, kind) in zip(reports, alone.rounds, strict=True):
+        assert kind == traces
         assert report.progress.generation == generation + 1
         assert report.progress.rollouts == 8 * (generation + 1)
         assert jobs.rollouts.tolist()[:5] == [2, 2, 2, 2, 1]
@@ -55,17 +55,17 @@ def test_a_generation_and_what_is_kept_of_it(pole: str, tmp_path: Path, traces: 
 
 
 def test_the_best_is_shown_again_now_and_then(pole: str, tmp_path: Path) -> None:
-    learner, alone = begun(configure(pole, generations=2 * REPLAY_EVERY + 1), tmp_path / "r")
-    shown = [r.progress.generation - 1 for r in learner.learn(alone) if r.replay is not None]  # type: ignore[arg-type]
-    assert shown, "once in a while"
-    assert all(generation % REPLAY_EVERY == 0 for generation in shown)
-    seen = [generation for generation, jobs, _ in alone.rounds if jobs.physics.any()]
-    assert seen == shown
+    learner, alone = new_run(configure(pole, generations=2 * REPLAY_EVERY + 1), tmp_path / "r")
+    replays = [r.progress.generation - 1 for r in learner.learn(alone) if r.replay is not None]  # type: ignore[arg-type]
+    assert replays, "once in a while"
+    assert all(generation % REPLAY_EVERY == 0 for generation in replays)
+    rounds = [generation for generation, jobs, _ in alone.rounds if jobs.physics.any()]
+    assert rounds == replays
 
 
 def test_pairs_share_a_start_unless_there_is_but_one(pole: str, tmp_path: Path) -> None:
     for perturb in (True, False):
-        learner, alone = begun(configure(pole, perturb=perturb, generations=1), tmp_path / str(perturb))
+        learner, alone = new_run(configure(pole, perturb=perturb, generations=1), tmp_path / str(perturb))
         list(learner.learn(alone))  # type: ignore[arg-type]
         seeds = alone.rounds[0][1].seeds()
         assert seeds[0:8:2] == seeds[1:8:2]
@@ -76,24 +76,24 @@ def test_pairs_share_a_start_unless_there_is_but_one(pole: str, tmp_path: Path) 
 @pytest.mark.parametrize("settings", [{}, {"algorithm": "cma-es", "policy": "linear", "population": 5}], ids=str)
 def test_the_mean_return_of_several_episodes_counts(settings: dict[str, Any], pole: str, tmp_path: Path) -> None:
     config = configure(pole, episodes=3, **settings)
-    learner, alone = begun(config, tmp_path / "r")
+    learner, alone = new_run(config, tmp_path / "r")
     before, algorithm = learner.state, config.algorithm_config
     reports = list(learner.learn(alone))  # type: ignore[arg-type]
     jobs, signs = alone.rounds[0][1], len(algorithm.signs())
     rows = len(jobs.eps) // 3
-    drawn = [seeds.training(0, 0, episode) for episode in range(3)]
-    assert jobs.seeds()[: 3 * rows * signs] == [seed for seed in drawn for _ in range(rows * signs)]
+    starts = [seeds.training(0, 0, episode) for episode in range(3)]
+    assert jobs.seeds()[: 3 * rows * signs] == [seed for seed in starts for _ in range(rows * signs)]
     theta = jobs.theta(before.mu)[: 3 * rows * signs]
     each = alone.returns(theta, jobs.seeds()[: len(theta)]).reshape(3, rows, signs)
-    told = (each[0] + each[1] + each[2]) / 3
-    after = algorithm.tell(before, algorithm.ask(before, seeds.exploration(0, 0)), told)
-    learner, alone = begun(replace(config, generations=1), tmp_path / "one")
+    means = (each[0] + each[1] + each[2]) / 3
+    after = algorithm.tell(before, algorithm.ask(before, seeds.exploration(0, 0)), means)
+    learner, alone = new_run(replace(config, generations=1), tmp_path / "one")
     (first,) = learner.learn(alone)  # type: ignore[arg-type]
     assert learner.state.mu.tobytes() == after.mu.tobytes()
     assert first.progress == replace(reports[0].progress, seconds=first.progress.seconds)
-    assert (first.progress.rollouts, first.progress.best) == (each.size, told.max())
+    assert (first.progress.rollouts, first.progress.best) == (each.size, means.max())
     assert (first.progress.return_max, first.progress.return_mean) == (each.max(), each.mean())
-    row, column = np.unravel_index(told.argmax(), told.shape)
+    row, column = np.unravel_index(means.argmax(), means.shape)
     evaluation = learner.evaluate(alone)  # type: ignore[arg-type]
     assert evaluation.replay is not None
     assert evaluation.replay.value == each[:, row, column].max(), "the best episode of the best"
@@ -111,14 +111,14 @@ def test_a_run_of_several_episodes_is_resumed(pole: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "reason"),
     [
         ({"episodes": 0}, "episodes is 0; expected 1 to 1000"),
         ({"episodes": 2, "perturb": False}, "--episodes 2 and --no-perturb exclude each other: unperturbed rollouts"),
     ],
 )
-def test_episodes_that_cannot_be(changed: dict[str, Any], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_episodes_that_cannot_be(changed: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
         configure(**changed)
 
 
@@ -171,8 +171,8 @@ def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path
     falling.write_text(POLE + "\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.1\n")
     config = configure(f"{falling}:Pole", gamma=0.5, generations=1)
     plain, shifted = (
-        begun(config, tmp_path / "plain"),
-        begun(replace(config, task_config=replace(config.task_config, reward_offset=3.0)), tmp_path / "shifted"),
+        new_run(config, tmp_path / "plain"),
+        new_run(replace(config, task_config=replace(config.task_config, reward_offset=3.0)), tmp_path / "shifted"),
     )
     (first,), (second,) = (list(learner.learn(alone)) for learner, alone in (plain, shifted))  # type: ignore[arg-type]
     assert second.progress.return_mean == first.progress.return_mean
@@ -180,8 +180,8 @@ def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path
     learner, alone = shifted
     steps, returns = alone.collect().steps[:8], alone.collect().returns[:8]
     assert len(set(steps.tolist())) > 1
-    told = returns + 3.0 * (1.0 - 0.5**steps) / 0.5
-    assert learner.state.best == pytest.approx(told.max())
+    values = returns + 3.0 * (1.0 - 0.5**steps) / 0.5
+    assert learner.state.best == pytest.approx(values.max())
     assert state(tmp_path / "plain") != state(tmp_path / "shifted")
 
 
@@ -199,7 +199,7 @@ def test_physics_that_always_blows_up_is_said_once(
 
 
 def test_a_full_disk_leaves_the_last_generation(pole: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learner, alone = begun(configure(pole), tmp_path / "r")
+    learner, alone = new_run(configure(pole), tmp_path / "r")
     reports: Iterator[Report] = learner.learn(alone)  # type: ignore[arg-type]
     next(reports)
     before = state(tmp_path / "r")

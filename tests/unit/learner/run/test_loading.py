@@ -37,12 +37,12 @@ def test_a_policy_under_other_settings_keeps_the_runs_texts(pole: str, tmp_path:
     at = checkpoints.load(tmp_path / "r" / "checkpoint")
     texts = at.files | {"model.xml": at.files["model.xml"].replace("0.1", "0.7")}
     checkpoints.save(tmp_path / "r" / "checkpoint", replace(at, files=texts))
-    own, heavy = load(tmp_path / "r"), load(tmp_path / "r", mass=5.0)
-    assert own.problem.task.sources == heavy.problem.task.sources == texts
-    assert (own.problem.task.model.body_mass[1], heavy.problem.task.model.body_mass[1]) == (1.0, 5.0)
-    assert own.rollout().trajectory.value != heavy.rollout().trajectory.value
+    light, heavy = load(tmp_path / "r"), load(tmp_path / "r", mass=5.0)
+    assert light.problem.task.sources == heavy.problem.task.sources == texts
+    assert (light.problem.task.model.body_mass[1], heavy.problem.task.model.body_mass[1]) == (1.0, 5.0)
+    assert light.rollout().trajectory.value != heavy.rollout().trajectory.value
     copied = shutil.copytree(tmp_path / "r", tmp_path / "copy")
-    assert load(copied).rollout().trajectory.value == own.rollout().trajectory.value
+    assert load(copied).rollout().trajectory.value == light.rollout().trajectory.value
 
 
 def test_another_object_in_the_hand_of_the_run(tmp_path: Path) -> None:
@@ -53,8 +53,8 @@ def test_another_object_in_the_hand_of_the_run(tmp_path: Path) -> None:
     texts = at.files | {"hand.xml": at.files["hand.xml"].replace("<mujoco", "<!-- the run's -->\n<mujoco", 1)}
     assert texts != at.files
     checkpoints.save(folder.checkpoint, replace(at, files=texts))
-    found = load(folder.path, object="cylinder").problem.task
-    assert found.sources["hand.xml"] == texts["hand.xml"]
-    assert found.sources["object.xml"] != texts["object.xml"]
-    assert found.config.object == "cylinder"
+    task = load(folder.path, object="cylinder").problem.task
+    assert task.sources["hand.xml"] == texts["hand.xml"]
+    assert task.sources["object.xml"] != texts["object.xml"]
+    assert task.config.object == "cylinder"
     assert load(folder.path).problem.task.sources == texts

@@ -38,8 +38,8 @@ def robust(task: str, policy: str, folder: Path, **changed: object) -> float:
     config = configure(
         task, policy=policy, algorithm="snes", pairs=15, generations=60, initial_sigma=0.5, episodes=4, **changed
     )
-    found, at = setup.start(config, "r")
-    learner, alone = Learner(found, RunFolder.create(folder, config), at), Alone(found)
+    problem, at = setup.start(config, "r")
+    learner, alone = Learner(problem, RunFolder.create(folder, config), at), Alone(problem)
     for _ in learner.learn(alone):  # type: ignore[arg-type]
         pass
     return learner.evaluate(alone).robust_return  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alone import Alone, begun, learnt, state, taken_up
+from alone import Alone, learnt, new_run, state, taken_up
 
 from farm.errors import CheckpointError, ConfigError
 from farm.moments import normaliser
@@ -25,25 +25,25 @@ pytestmark = pytest.mark.usefixtures("grips_found_once")
 NORMALISED: dict[str, Any] = {"policy": "linear", "normalise": True, "initial_sigma": 0.5}
 
 
-def observed(found: setup.Problem, rounds: list[tuple[int, Jobs, str]], mus: list[np.ndarray]) -> np.ndarray:
+def observed(problem: setup.Problem, rounds: list[tuple[int, Jobs, str]], mus: list[np.ndarray]) -> np.ndarray:
     """What the exploring rollouts of a run saw, one by one, each generation normalised by those before it."""
-    parts, seen = [], [np.zeros((0, 2))]
-    runner = found.runner()
+    parts, history = [], [np.zeros((0, 2))]
+    runner = problem.runner()
     for (_, jobs, _), mu in zip(rounds, mus, strict=True):
-        before = np.concatenate(seen)
+        before = np.concatenate(history)
         mean, deviation = (before.mean(axis=0), before.std(axis=0)) if len(before) else (np.zeros(2), np.ones(2))
-        runner.policy = Normalised(found.policy, np.stack([mean, deviation]))
+        runner.policy = Normalised(problem.policy, np.stack([mean, deviation]))
         for theta, seed in zip(jobs.theta(mu)[:8], jobs.seeds(), strict=False):
             rollouts = runner.rollouts(theta[None], [seed])
             qpos = np.concatenate([rollouts.start["qpos"], rollouts.frames["qpos"][0, :-1]])
             velocity = np.diff(np.concatenate([qpos[:1], qpos]), axis=0) / 0.02  # Euler's, from rest
             parts.append(np.concatenate([qpos, velocity], axis=1))
-        seen = list(parts)
+        history = list(parts)
     return np.concatenate(parts)
 
 
 def test_observations_are_normalised_by_all_generations_before(pole: str, tmp_path: Path) -> None:
-    learner, alone = begun(configure(pole, **NORMALISED), tmp_path / "r")
+    learner, alone = new_run(configure(pole, **NORMALISED), tmp_path / "r")
     mus = []
     for _ in learner.learn(alone):  # type: ignore[arg-type]
         mus.append(np.array(RunFolder.open(tmp_path / "r").parameters.rows()["mu"][-1]))
@@ -52,11 +52,11 @@ def test_observations_are_normalised_by_all_generations_before(pole: str, tmp_pa
     assert at.moments[0] == len(x) == 3 * 8 * 4, "exploring rollouts alone count"
     np.testing.assert_allclose(at.moments[1:3], x.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(at.moments[3:], x.var(axis=0) * len(x), rtol=1e-6)
-    wanted = [normaliser(np.zeros(5)), *learner.folder.parameters.rows()["normaliser"]]
-    for (_, jobs, _), sent, own in zip(alone.rounds, alone.normalisers, wanted, strict=False):
-        assert sent[0].tobytes() == own.tobytes()
+    expected = [normaliser(np.zeros(5)), *learner.folder.parameters.rows()["normaliser"]]
+    for (_, jobs, _), normalisers, row in zip(alone.rounds, alone.normalisers, expected, strict=False):
+        assert normalisers[0].tobytes() == row.tobytes()
         assert jobs.rollouts.sum() >= 9
-    assert wanted[-1].tobytes() == normaliser(at.moments).tobytes()
+    assert expected[-1].tobytes() == normaliser(at.moments).tobytes()
 
 
 def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(pole: str, tmp_path: Path) -> None:
@@ -66,9 +66,9 @@ def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(pole: str,
         return (*state(path), at.moments.tobytes(), at.best.normaliser.tobytes())
 
     learnt(configure(pole, **NORMALISED, generations=6), tmp_path / "whole")
-    found, at = setup.start(configure(pole, **NORMALISED, generations=6), "other")
-    folder = RunFolder.create(tmp_path / "other", found.config)
-    list(Learner(found, folder, at).learn(Alone(found, seed=5)))  # type: ignore[arg-type]
+    problem, at = setup.start(configure(pole, **NORMALISED, generations=6), "other")
+    folder = RunFolder.create(tmp_path / "other", problem.config)
+    list(Learner(problem, folder, at).learn(Alone(problem, seed=5)))  # type: ignore[arg-type]
     learnt(configure(pole, **NORMALISED, generations=3), tmp_path / "r")
     learner, alone = taken_up(tmp_path / "r", generations=6)
     list(learner.learn(alone))  # type: ignore[arg-type]
@@ -82,9 +82,9 @@ def test_every_policy_of_a_normalised_run_is_seen_as_it_was(pole: str, tmp_path:
     for generation in (0, 1, 5, REPLAY_EVERY + 1):
         earlier = load(tmp_path / "r", generation)
         assert earlier.rollout().trajectory.value == reports[generation].progress.mean_policy_return
-    shown = [report for report in reports if report.replay is not None]
-    assert shown
-    for report in shown:  # the best rollout so far, in a round whose observations are normalised otherwise
+    replays = [report for report in reports if report.replay is not None]
+    assert replays
+    for report in replays:  # the best rollout so far, in a round whose observations are normalised otherwise
         assert report.replay is not None
         assert report.replay.value == reports[report.progress.generation - 2].progress.best
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from alone import POLE, begun, learnt, state, taken_up
+from alone import POLE, learnt, new_run, state, taken_up
 
 from farm.errors import CheckpointError, RunError
 from learner.again.replay import load
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("grips_found_once")
 
 
 def test_a_folder_that_was_removed_is_not_to_be_resumed(pole: str, tmp_path: Path) -> None:
-    learner, alone = begun(configure(pole, generations=3), tmp_path / "r")
+    learner, alone = new_run(configure(pole, generations=3), tmp_path / "r")
     reports = learner.learn(alone)  # type: ignore[arg-type]
     next(reports)
     shutil.rmtree(tmp_path / "r")

@@ -44,9 +44,9 @@ def learnt(folder: Path, name: str, policy: str, **settings: Any) -> tuple[bytes
     config = configure(
         f"{folder}/pole.py:Pole", policy=f"{folder}/{name}.py:Own", initial_mu=0.0, initial_sigma=0.3, **settings
     )
-    found, at = setup.start(config, name)
-    learner = Learner(found, RunFolder.create(folder / name, config), at)
-    for _ in learner.learn(Alone(found)):  # type: ignore[arg-type]
+    problem, at = setup.start(config, name)
+    learner = Learner(problem, RunFolder.create(folder / name, config), at)
+    for _ in learner.learn(Alone(problem)):  # type: ignore[arg-type]
         pass
     at = checkpoints.load(folder / name / "checkpoint")
     return at.state["mu"].tobytes(), at.state["sigma"].tobytes()
@@ -56,8 +56,8 @@ def learnt(folder: Path, name: str, policy: str, **settings: Any) -> tuple[bytes
 def test_every_algorithm_searches_in_units_of_the_scale(settings: dict[str, Any], tmp_path: Path) -> None:
     plain = POLICY.format(divided="", times="")
     scaled = learnt(tmp_path, "scaled", plain + f"\n    scale = {SCALE}\n", **settings)
-    own = learnt(tmp_path, "own", POLICY.format(divided=f" / {SCALE}", times=f" * {SCALE}"), **settings)
-    assert scaled == own != learnt(tmp_path, "plain", plain, **settings)
+    manual = learnt(tmp_path, "own", POLICY.format(divided=f" / {SCALE}", times=f" * {SCALE}"), **settings)
+    assert scaled == manual != learnt(tmp_path, "plain", plain, **settings)
     policy = load(tmp_path / "scaled")
     assert policy.parameters.tolist() == (policy.mu * [0.25, 1.0, 4.0]).tolist()
     assert load(tmp_path / "scaled", 0).parameters.tolist() == [0.5, -1.0, 8.0]
@@ -72,7 +72,7 @@ def test_a_scale_of_ones_is_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"),
+    ("scale", "reason"),
     [
         ("np.ones(2)", r"gave an array of float64 \(2,\); expected 3 finite numbers of float64, or None"),
         ("np.array([1.0, np.nan, 1.0])", r"gave an array of float64 \(3,\); expected 3 finite numbers"),
@@ -81,6 +81,6 @@ def test_a_scale_of_ones_is_none(tmp_path: Path) -> None:
         ("np.array([1.0, -3.0, 2.0])", "has -3.0; expected positive numbers"),
     ],
 )
-def test_a_scale_that_cannot_be_is_named(scale: str, said: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=f"^scale of own.py:Own {said}"):
+def test_a_scale_that_cannot_be_is_named(scale: str, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"^scale of own.py:Own {reason}"):
         learnt(tmp_path, "own", POLICY.format(divided="", times="") + f"\n    scale = {scale}\n")

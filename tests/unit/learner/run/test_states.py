@@ -38,13 +38,13 @@ def test_a_bounded_number_is_kept_among_them_the_first(tmp_path: Path) -> None:
     states = States(tmp_path / "states")
     for generation in range(3 * MOST):
         states.keep(at(generation))
-    kept = sorted(int(each.name) for each in states.path.iterdir())
-    assert len(kept) == MOST
-    assert (kept[0], kept[-1]) == (0, 3 * MOST - 1)
-    assert max(later - earlier for earlier, later in zip(kept, kept[1:], strict=False)) <= 8
-    for wanted in (0, 5, 3 * MOST - 1):
-        back = states.without(at(200, first={"liar": wanted}, expelled={"liar": "why"}))
-        assert back.state["generation"] == max(each for each in kept if each <= wanted)
+    generations = sorted(int(each.name) for each in states.path.iterdir())
+    assert len(generations) == MOST
+    assert (generations[0], generations[-1]) == (0, 3 * MOST - 1)
+    assert max(later - earlier for earlier, later in zip(generations, generations[1:], strict=False)) <= 8
+    for first in (0, 5, 3 * MOST - 1):
+        back = states.without(at(200, first={"liar": first}, expelled={"liar": "why"}))
+        assert back.state["generation"] == max(each for each in generations if each <= first)
     states.forget_after(5)
     assert all(int(each.name) <= 5 for each in states.path.iterdir())
 

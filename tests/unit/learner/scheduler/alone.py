@@ -58,10 +58,10 @@ class Pole(farm.Task):
 class Alone:
     """Instead of the dispatcher: does a round's jobs at once, several together, in any order."""
 
-    def __init__(self, found: setup.Problem, seed: int = 0) -> None:
+    def __init__(self, problem: setup.Problem, seed: int = 0) -> None:
         self.admission, self.workers, self.reissued = SimpleNamespace(canary="c", expelled={}), ("w/1",), 0
         self.hosts = ["w"]
-        self.problem, self._runner, self._rng = found, found.runner(), np.random.default_rng(seed)
+        self.problem, self._runner, self._rng = problem, problem.runner(), np.random.default_rng(seed)
         self.rounds: list[tuple[int, Jobs, str]] = []
         self.normalisers: list[np.ndarray] = []
 
@@ -76,13 +76,13 @@ class Alone:
         self.rounds.append((generation, jobs, traces))
         self.normalisers.append(normaliser)
         self._round = RoundResults(jobs, traces, self.problem.shapes(), observed=normaliser.shape[-1] > 0)
-        for some in np.array_split(self._rng.permutation(len(jobs)), 3):
-            part = jobs.take(sorted(some.tolist()))
-            given = self._runner.run(mu, part, traces, normaliser)
-            said = Results.carrying(given, part, 0.0, run="r", incarnation="i", round=0, worker="w/1")
-            place = self._round.place(said)
+        for indices in np.array_split(self._rng.permutation(len(jobs)), 3):
+            part = jobs.take(sorted(indices.tolist()))
+            simulated = self._runner.run(mu, part, traces, normaliser)
+            results = Results.carrying(simulated, part, 0.0, run="r", incarnation="i", round=0, worker="w/1")
+            place = self._round.place(results)
             assert place is not None
-            self._round.put(said, place, np.ones(len(part), bool))
+            self._round.put(results, place, np.ones(len(part), bool))
 
     def returns(self, theta: np.ndarray, seeds: list[tuple[int, ...] | None]) -> np.ndarray:
         """Returns of parameters (S, P) on the starts for these seeds, (S,)."""
@@ -103,23 +103,23 @@ class Alone:
         pass
 
 
-def begun(config: RunConfig, path: Path) -> tuple[Learner, Alone]:
-    found, at = setup.start(config, path.name)
-    return Learner(found, RunFolder.create(path, config), at), Alone(found)
+def new_run(config: RunConfig, path: Path) -> tuple[Learner, Alone]:
+    problem, at = setup.start(config, path.name)
+    return Learner(problem, RunFolder.create(path, config), at), Alone(problem)
 
 
 def learnt(config: RunConfig, path: Path) -> list[Report]:
-    learner, alone = begun(config, path)
+    learner, alone = new_run(config, path)
     return list(learner.learn(alone))  # type: ignore[arg-type]
 
 
 def taken_up(path: Path, *, mixed: bool = False, **changed: Any) -> tuple[Learner, Alone]:
     folder = RunFolder.open(path)
     config = replace(folder.read_config(), **changed)
-    found, at = setup.resumed(folder, config, mixed=mixed)
+    problem, at = setup.resumed(folder, config, mixed=mixed)
     folder.rewind(at)
     folder.write_config(config)
-    return Learner(found, folder, at), Alone(found, 1)
+    return Learner(problem, folder, at), Alone(problem, 1)
 
 
 def state(path: Path) -> tuple[bytes, bytes]:

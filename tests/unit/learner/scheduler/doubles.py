@@ -70,11 +70,11 @@ class Worker:
 
     def results(self, chunk: Chunk, *indices: int, value: float | None = None) -> Results:
         """Of all jobs of a chunk, or of these."""
-        chosen = sorted(indices or chunk.indices.tolist())
-        returns = np.repeat(np.array(chosen, dtype=float) if value is None else value, 2)
+        numbers = sorted(indices or chunk.indices.tolist())
+        returns = np.repeat(np.array(numbers, dtype=float) if value is None else value, 2)
         traces = np.zeros((len(rows_with_trace("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4")
         return Results(
-            **head(chunk), worker=self.name, jobs=np.array(chosen), returns=returns,
+            **head(chunk), worker=self.name, jobs=np.array(numbers), returns=returns,
             flags=np.zeros((len(returns), 4), bool), steps=np.ones(len(returns), "<i8"), traces=traces, trajectories=(),
         )  # fmt: skip
 
@@ -141,6 +141,6 @@ class Learner:
 Hire = Callable[..., Any]
 
 
-def done(found: RoundResults) -> list[float]:
+def done(results: RoundResults) -> list[float]:
     """The returns of each job's first rollout."""
-    return found.returns[::2].tolist()
+    return results.returns[::2].tolist()

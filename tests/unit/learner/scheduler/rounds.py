@@ -18,7 +18,7 @@ def started(jobs, workers=(), *, credits=4, seconds=None, **config):
     return scheduler
 
 
-def given(chunks):
+def by_worker(chunks):
     """Return the jobs by worker."""
     jobs = {}
     for worker, indices in chunks:

@@ -22,39 +22,39 @@ def test_the_time_per_job_is_the_median_over_answers():
 def test_chunks_do_not_shrink_into_the_overhead():
     """A chunk of n jobs takes 30 ms + 3 ms n, here and there 1 s more: it has at least 90 ms of work."""
     times = [(n, 0.03 + 0.003 * n + (1.0 if i % 9 == 0 else 0.0)) for i, n in enumerate([1, 2, 3, 5, 8, 12, 20] * 6, 1)]
-    seen = learnt(times)
-    assert seen.chunk(40, 4, 2) == 2, "a worker's share"
-    assert seen.chunk(400, 40, 2) == pytest.approx(20, rel=0.4), "30 + 3 x 20 ms, more than half a share"
+    chunking = learnt(times)
+    assert chunking.chunk(40, 4, 2) == 2, "a worker's share"
+    assert chunking.chunk(400, 40, 2) == pytest.approx(20, rel=0.4), "30 + 3 x 20 ms, more than half a share"
     free = learnt(times, least_overheads=0.0, least_seconds=1e-6)
     assert free.chunk(400, 4, 2) == 1, "down to half a share"
 
 
 def test_the_overhead_is_kept_while_all_chunks_are_alike():
-    seen = learnt([(n, 0.03 + 0.003 * n) for n in [1, 20] * 32])
-    assert seen.chunk(400, 60, 2) == 20
+    chunking = learnt([(n, 0.03 + 0.003 * n) for n in [1, 20] * 32])
+    assert chunking.chunk(400, 60, 2) == 20
     for _ in range(64):
-        seen.learn(20, 0.09)
-    assert seen.chunk(400, 60, 2) == 20, "not half a share, which is 15"
+        chunking.learn(20, 0.09)
+    assert chunking.chunk(400, 60, 2) == 20, "not half a share, which is 15"
 
 
 def test_a_task_that_is_mostly_overhead_is_not_cut_in_its_second_round():
     """A two-link arm: 60 ms for one job, 62 ms for two, 88 ms for a worker's share of 15."""
-    seen = learnt([(n, 0.058 + 0.002 * n) for n in [1, 1, 1, 2, 2, 2]])
-    assert seen.chunk(30, 30, 2) == 4, "twice what is known"
-    seen.learn(4, 0.066)
-    seen.learn(4, 0.066)
-    assert seen.chunk(30, 30, 2) == 15
+    chunking = learnt([(n, 0.058 + 0.002 * n) for n in [1, 1, 1, 2, 2, 2]])
+    assert chunking.chunk(30, 30, 2) == 4, "twice what is known"
+    chunking.learn(4, 0.066)
+    chunking.learn(4, 0.066)
+    assert chunking.chunk(30, 30, 2) == 15
 
 
 def test_a_line_through_small_chunks_is_not_believed_far_beyond_them():
-    seen = learnt([(n, 0.003) for n in [1, 2] * 8])
-    assert seen.chunk(10_000, 10_000, 2) == 89, "0.2 s by the median, 2.25 ms; by the line any number of jobs"
+    chunking = learnt([(n, 0.003) for n in [1, 2] * 8])
+    assert chunking.chunk(10_000, 10_000, 2) == 89, "0.2 s by the median, 2.25 ms; by the line any number of jobs"
 
 
 def test_work_without_overhead_is_split_as_before():
-    seen = learnt([(n, 0.004 * n) for n in [1, 2, 5, 10] * 8])
-    assert seen.chunk(400, 10, 2) == 3, "15 ms are three jobs, half a share as well"
-    assert seen.chunk(400, 400, 2) == 50, "0.2 s"
+    chunking = learnt([(n, 0.004 * n) for n in [1, 2, 5, 10] * 8])
+    assert chunking.chunk(400, 10, 2) == 3, "15 ms are three jobs, half a share as well"
+    assert chunking.chunk(400, 400, 2) == 50, "0.2 s"
 
 
 def test_a_worker_that_others_use_too_gets_no_smaller_chunks() -> None:
@@ -67,6 +67,6 @@ def test_a_worker_that_others_use_too_gets_no_smaller_chunks() -> None:
 
 
 def test_an_account_that_exceeds_the_wait_does_not_count() -> None:
-    told = Chunking(SchedulerConfig())
-    told.learn(2, 0.1, 1e9)
-    assert told.median == pytest.approx(0.05)
+    chunking = Chunking(SchedulerConfig())
+    chunking.learn(2, 0.1, 1e9)
+    assert chunking.median == pytest.approx(0.05)

@@ -76,10 +76,10 @@ def test_chunks_grow_with_the_farm_and_so_does_patience():
 def test_what_is_left_after_the_first_chunks_is_dealt_evenly():
     names = [f"w{i:02}" for i in range(64)]
     scheduler = started(1001, names, credits=128, seconds=0.02, chunk_seconds=0.2)
-    held = Counter[str]()
+    load = Counter[str]()
     for chunk in scheduler.assign(0.0):
-        held[chunk.worker] += len(chunk.indices)
-    assert Counter(held.values()) == {16: 41, 15: 23}
+        load[chunk.worker] += len(chunk.indices)
+    assert Counter(load.values()) == {16: 41, 15: 23}
     scheduler = started(17, ["a", "b"], credits=128, seconds=0.004, least_seconds=0.015)
     assert [(chunk.worker, len(chunk.indices)) for chunk in scheduler.assign(0.0)] == [
         ("a", 5),

@@ -1,14 +1,14 @@
 """The scheduler's rules: jobs of late workers, which others do as well."""
 
 import pytest
-from rounds import given, started
+from rounds import by_worker, started
 
 from learner.scheduler.scheduler import Assignment
 
 
 def test_a_straggler_is_copied_to_another_worker():
     scheduler = started(1, ["a"], seconds=0.001)
-    assert given(scheduler.assign(0.0)) == {"a": [0]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0]}
     scheduler.want("b", 1, 0.1)
     assert scheduler.assign(0.1) == []
     assert scheduler.next_deadline(0.1) == pytest.approx(0.9)
@@ -62,38 +62,38 @@ def test_nothing_is_copied_while_jobs_are_pending():
     scheduler = started(9, ["a"], credits=2)
     scheduler.assign(0.0)
     scheduler.want("b", 2, 5.0)
-    assert given(scheduler.assign(5.0)) == {"b": [2, 3]}
+    assert by_worker(scheduler.assign(5.0)) == {"b": [2, 3]}
 
 
 def test_a_worker_that_hung_at_the_end_of_a_round_is_not_waited_for_again():
     scheduler = started(2, ["a", "b"], credits=1)
-    assert given(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
     scheduler.results("b", [1], 0.1)
-    assert given(scheduler.assign(1.0)) == {"b": [0]}  # a is late
+    assert by_worker(scheduler.assign(1.0)) == {"b": [0]}  # a is late
     scheduler.results("b", [0], 1.1)
     scheduler.begin(2)
-    assert given(scheduler.assign(1.1)) == {"b": [0]}
+    assert by_worker(scheduler.assign(1.1)) == {"b": [0]}
     scheduler.results("b", [0], 1.2)
-    assert given(scheduler.assign(1.2)) == {"b": [1]}
+    assert by_worker(scheduler.assign(1.2)) == {"b": [1]}
     assert scheduler.unread("a") == "stale", "results of the round gone by: it lives"
     scheduler.begin(2)
-    assert given(scheduler.assign(1.4)) == {"a": [0], "b": [1]}
+    assert by_worker(scheduler.assign(1.4)) == {"a": [0], "b": [1]}
 
 
 def test_no_copy_goes_to_a_worker_that_is_late_and_has_never_answered():
     scheduler = started(3, ["a", "s1", "s2"], credits=1)
-    assert given(scheduler.assign(0.0)) == {"a": [0], "s1": [1], "s2": [2]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0], "s1": [1], "s2": [2]}
     scheduler.results("a", [0], 0.1)
     for silent in ("s1", "s2"):
         scheduler.want(silent, 9, 0.2)
-    assert given(scheduler.assign(1.0)) == {"a": [1]}
+    assert by_worker(scheduler.assign(1.0)) == {"a": [1]}
     assert scheduler.assign(1.05) == [], "a has no room, the silent ones have"
     scheduler.results("a", [1], 1.1)
-    assert given(scheduler.assign(1.1)) == {"a": [2]}
+    assert by_worker(scheduler.assign(1.1)) == {"a": [2]}
 
 
 def test_the_last_worker_is_asked_again():
     scheduler = started(1, ["a"])
     scheduler.assign(0.0)
     scheduler.error("a", 0, 5.0)
-    assert given(scheduler.assign(5.0)) == {"a": [0]}
+    assert by_worker(scheduler.assign(5.0)) == {"a": [0]}

@@ -44,8 +44,8 @@ def test_results_come_in_the_jobs_order(learner: Learner, hire: Hire) -> None:
     for _ in range(3):
         collected = learner.collect(jobs(20))
         worker.work(20)
-        found = collected.result(WAIT)
-        assert found.returns.tolist() == [i for i in range(20) for _ in range(2)]
+        results = collected.result(WAIT)
+        assert results.returns.tolist() == [i for i in range(20) for _ in range(2)]
     assert dispatcher.workers == ("a/1",)
     assert dispatcher.reissued == 0
     assert not dispatcher.notices.ignored
@@ -55,11 +55,17 @@ def test_a_round_is_announced(learner: Learner, hire: Hire) -> None:
     dispatcher = learner.show()
     worker = hire("a/1")
     dispatcher.begin(7, np.array([1.0, 2.0]), jobs(1), "all")
-    said = codec.decode(worker.next("generation"), RoundHeader)
-    assert (said.run, said.round, said.generation, said.mu.tolist(), said.traces) == (RUN, 1, 7, [1, 2], "all")
-    asked = worker.session.ask(keys.generation(FARM, RUN), WAIT)
-    assert asked is not None
-    assert codec.decode(asked, RoundHeader).incarnation == said.incarnation
+    header = codec.decode(worker.next("generation"), RoundHeader)
+    assert (header.run, header.round, header.generation, header.mu.tolist(), header.traces) == (
+        RUN,
+        1,
+        7,
+        [1, 2],
+        "all",
+    )
+    reply = worker.session.ask(keys.generation(FARM, RUN), WAIT)
+    assert reply is not None
+    assert codec.decode(reply, RoundHeader).incarnation == header.incarnation
     assert worker.session.ask(keys.spec(FARM, RUN), WAIT) == codec.encode(SPEC)
 
 
@@ -68,14 +74,14 @@ def test_no_more_than_a_worker_wants(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     worker.want(3)
     collected = learner.collect(jobs(30))
-    held: list[int] = []
+    load: list[int] = []
     count = 0
     while count < 30:
         chunk = worker.chunk()
-        held += chunk.indices.tolist()
-        assert len(held) <= 3
-        while held and (len(held) > 1 or count == 29):
-            worker.answer(worker.results(chunk, held.pop(0)))
+        load += chunk.indices.tolist()
+        assert len(load) <= 3
+        while load and (len(load) > 1 or count == 29):
+            worker.answer(worker.results(chunk, load.pop(0)))
             count += 1
     assert done(collected.result(WAIT)) == list(range(30))
 
@@ -122,16 +128,16 @@ def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
     good = Trajectory(value=0.5, success=False, times=np.zeros(1), channels=angle, **arrays)
     wrong = [(), (replace(good, bodies=np.zeros((1, 3, 7), "<f4")),), (replace(good, channels={}),), (good, good)]
     chunk = worker.chunk()
-    said = Results(
+    answer = Results(
         **head(chunk), worker="a/1", jobs=np.zeros(1, "<i8"), returns=np.ones(1), flags=np.zeros((1, 4), bool),
         steps=np.ones(1, "<i8"), traces=np.zeros((0, *TRACE), "<f4"), trajectories=(good,),
     )  # fmt: skip
-    for shown in wrong:
-        worker.answer(replace(said, trajectories=shown))
-    worker.answer(said)
-    found = collected.result(WAIT).trajectory(0)
-    assert found is not None
-    assert (found.value, found.channels["angle"].tolist()) == (0.5, [[1.0]])
+    for trajectories in wrong:
+        worker.answer(replace(answer, trajectories=trajectories))
+    worker.answer(answer)
+    trajectory = collected.result(WAIT).trajectory(0)
+    assert trajectory is not None
+    assert (trajectory.value, trajectory.channels["angle"].tolist()) == (0.5, [[1.0]])
     assert dispatcher.notices.ignored == {"bad": 4}
 
 
@@ -176,11 +182,11 @@ def test_a_worker_that_is_gone(endpoint: str, learner: Learner, hire: Hire, capl
     caplog.set_level(logging.INFO)
     dispatcher = learner.show()
     with connect((endpoint,), WAIT, lambda: False) as session:
-        lost = Worker(session, "a/1")
-        lost.want(4)
+        worker = Worker(session, "a/1")
+        worker.want(4)
         collected = learner.collect(jobs(8))
         for _ in range(2):
-            lost.chunk()
+            worker.chunk()
     other = hire("b/1")
     other.want(4)
     assert sorted(other.work(8)) == list(range(8))
@@ -339,10 +345,10 @@ def test_a_status_query_is_answered(learner: Learner, hire: Hire, monkeypatch: p
         return codec.decode(payload, RunStatus)
 
     until = time.monotonic() + WAIT
-    while (said := status()).open != 1:
+    while (reply := status()).open != 1:
         assert time.monotonic() < until
-    assert (said.run, said.generation, said.generations, said.refused) == (RUN, 0, 9, 1)
-    assert [(one.worker, one.rollouts, one.canary) for one in said.workers] == [("a/1", 4, "c")]
+    assert (reply.run, reply.generation, reply.generations, reply.refused) == (RUN, 0, 9, 1)
+    assert [(one.worker, one.rollouts, one.canary) for one in reply.workers] == [("a/1", 4, "c")]
     learner.stop.set()
     with pytest.raises(Stopped):
         collected.result(WAIT)
@@ -357,8 +363,8 @@ def test_missing_workers_are_reported_once(
     learner.show(stopped=lambda: next(looks, True))
     with pytest.raises(Stopped):
         learner.collect(jobs(1)).result(WAIT)
-    said = [line for line in caplog.messages if "no workers" in line]
-    assert said == ["no workers; start some with: farm worker --connect here"]
+    lines = [line for line in caplog.messages if "no workers" in line]
+    assert lines == ["no workers; start some with: farm worker --connect here"]
 
 
 def test_stopped_within_a_second(learner: Learner, hire: Hire) -> None:
@@ -367,11 +373,11 @@ def test_stopped_within_a_second(learner: Learner, hire: Hire) -> None:
     worker.want(1)
     collected = learner.collect(jobs(1))
     worker.chunk()
-    begun = time.monotonic()
+    start = time.monotonic()
     learner.stop.set()
     with pytest.raises(Stopped):
         collected.result(WAIT)
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - start < 1.0
 
 
 def test_a_run_whose_own_workers_are_all_refused_ends(

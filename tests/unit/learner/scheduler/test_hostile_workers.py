@@ -37,8 +37,8 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     worker.answer(honest)
     worker.answer(worker.results(first, 0, value=7.0))
     worker.work(3)
-    found = collected.result(WAIT)
-    assert done(found) == list(range(4))
+    results = collected.result(WAIT)
+    assert done(results) == list(range(4))
     assert dispatcher.notices.ignored == {
         "bad": 2 + 8,
         "version": 1 + 2,

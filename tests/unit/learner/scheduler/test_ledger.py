@@ -22,7 +22,7 @@ def results(worker: str, *indices: int, value: float = 1.0) -> Results:
     )  # fmt: skip
 
 
-def begun(count: int, *workers: str, config: SchedulerConfig = PATIENT) -> Ledger:
+def ledger_of(count: int, *workers: str, config: SchedulerConfig = PATIENT) -> Ledger:
     """A round of pairs, and workers that each take two jobs."""
     ledger = Ledger(config, None, np.random.default_rng(0))
     assert not ledger.over
@@ -32,7 +32,7 @@ def begun(count: int, *workers: str, config: SchedulerConfig = PATIENT) -> Ledge
     return ledger
 
 
-def given(ledger: Ledger, now: float) -> dict[str, list[int]]:
+def by_worker(ledger: Ledger, now: float) -> dict[str, list[int]]:
     out: dict[str, list[int]] = {}
     for worker, indices in ledger.due(now):
         out.setdefault(worker, []).extend(indices)
@@ -40,8 +40,8 @@ def given(ledger: Ledger, now: float) -> dict[str, list[int]]:
 
 
 def test_a_round_is_over_when_every_job_is_done() -> None:
-    ledger = begun(2, "a/1")
-    assert given(ledger, 0.0) == {"a/1": [0, 1]}
+    ledger = ledger_of(2, "a/1")
+    assert by_worker(ledger, 0.0) == {"a/1": [0, 1]}
     assert ledger.put(results("a/1", 0), 1.0) == (["new"], {})
     assert not ledger.over
     assert ledger.put(results("a/1", 0, 1, value=2.0), 2.0) == (["doubled", "new"], {})
@@ -51,26 +51,26 @@ def test_a_round_is_over_when_every_job_is_done() -> None:
 
 
 def test_results_that_do_not_fit_have_no_verdict() -> None:
-    ledger = begun(1, "a/1")
+    ledger = ledger_of(1, "a/1")
     ledger.due(0.0)
     assert ledger.put(results("a/1", 5), 1.0) == ([], {})
     assert ledger.put(results("b/1", 0), 1.0) == (["unasked"], {})
 
 
 def test_jobs_of_a_worker_that_left_are_due_again() -> None:
-    ledger = begun(2, "a/1")
+    ledger = ledger_of(2, "a/1")
     ledger.due(0.0)
     assert ledger.lost("a/1") == 2
     ledger.scheduler.want("b/1", 2, 1.0)
-    assert given(ledger, 1.0) == {"b/1": [0, 1]}
+    assert by_worker(ledger, 1.0) == {"b/1": [0, 1]}
 
 
 def test_a_host_with_other_numbers_than_two_others_is_named_and_its_jobs_are_repeated() -> None:
-    ledger = begun(2, "a/1", "b/1", "c/1", config=AUDITED)
+    ledger = ledger_of(2, "a/1", "b/1", "c/1", config=AUDITED)
     value = {"a/1": 9.0, "b/1": 1.0, "c/1": 1.0}
     wrong: dict[str, int] = {}
     for now in range(20):
-        for worker, indices in given(ledger, float(now)).items():
+        for worker, indices in by_worker(ledger, float(now)).items():
             for index in indices:
                 _, liars = ledger.put(results(worker, index, value=value[worker]), now + 0.5)
                 wrong |= liars
@@ -80,7 +80,7 @@ def test_a_host_with_other_numbers_than_two_others_is_named_and_its_jobs_are_rep
     ledger.lost("a/1")
     assert ledger.expel("a") > 0
     for now in range(20, 40):
-        for worker, indices in given(ledger, float(now)).items():
+        for worker, indices in by_worker(ledger, float(now)).items():
             for index in indices:
                 ledger.put(results(worker, index, value=value[worker]), now + 0.5)
     assert ledger.over

@@ -24,10 +24,10 @@ def test_only_machines_with_the_runs_numbers_are_admitted() -> None:
     for reference in ("bits", "bi"):
         admission = Admission(reference)
         assert admission.refusal(want()) is None
-        said = str(admission.refusal(want(canary="others")))
-        assert f"(numbers others, the run's are {reference}:" in said
-        assert "--numbers others" in said
-        assert "--mixed" in said
+        reason = str(admission.refusal(want(canary="others")))
+        assert f"(numbers others, the run's are {reference}:" in reason
+        assert "--numbers others" in reason
+        assert "--mixed" in reason
 
 
 def test_mixed_machines_on_request() -> None:
@@ -40,64 +40,64 @@ def test_mixed_machines_on_request() -> None:
 
 
 def test_a_worker_is_present_while_its_token_is() -> None:
-    known = Attendance()
-    assert known.came("a/1") is None
-    assert known.asked(want("a/1"), 0.0)
-    known.left("a/1")
-    assert not known.asked(want("a/1"), 0.0)
+    attendance = Attendance()
+    assert attendance.came("a/1") is None
+    assert attendance.asked(want("a/1"), 0.0)
+    attendance.left("a/1")
+    assert not attendance.asked(want("a/1"), 0.0)
 
 
 def test_a_question_ahead_of_its_token_is_heard_once_it_comes() -> None:
-    known = Attendance()
-    assert not known.asked(want("a/1", 4), 0.0)
-    assert not known.asked(want("a/1", 5), 1.0)
-    assert known.came("a/1") == want("a/1", 5)
-    assert known.came("a/1") is None
-    assert known.absent(100.0) == []
+    attendance = Attendance()
+    assert not attendance.asked(want("a/1", 4), 0.0)
+    assert not attendance.asked(want("a/1", 5), 1.0)
+    assert attendance.came("a/1") == want("a/1", 5)
+    assert attendance.came("a/1") is None
+    assert attendance.absent(100.0) == []
 
 
 def test_a_worker_that_never_comes_is_forgotten() -> None:
-    known = Attendance()
-    known.asked(want("a/1"), 0.0)
-    known.asked(want("b/1"), 2.0)
-    known.asked(want("a/1"), 2.9)
-    assert known.absent(3.0) == []
-    assert known.absent(4.0) == ["a/1"]
-    assert known.came("a/1") is None
-    assert known.came("b/1") == want("b/1")
+    attendance = Attendance()
+    attendance.asked(want("a/1"), 0.0)
+    attendance.asked(want("b/1"), 2.0)
+    attendance.asked(want("a/1"), 2.9)
+    assert attendance.absent(3.0) == []
+    assert attendance.absent(4.0) == ["a/1"]
+    assert attendance.came("a/1") is None
+    assert attendance.came("b/1") == want("b/1")
 
 
 def test_early_requests_are_checked_in_turn() -> None:
-    known = Attendance()
+    attendance = Attendance()
     for name in ("a/1", "b/1", "c/1"):
-        known.asked(want(name), 0.0)
-    assert [known.early(2) for _ in range(3)] == [["a/1", "b/1"], ["c/1", "a/1"], ["b/1", "c/1"]]
+        attendance.asked(want(name), 0.0)
+    assert [attendance.early(2) for _ in range(3)] == [["a/1", "b/1"], ["c/1", "a/1"], ["b/1", "c/1"]]
 
 
 def test_many_tokens_of_one_name_do_not_exclude_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = Attendance(2)
+    attendance = Attendance(2)
     for i in range(2):
-        known.came(f"many/{i}")
+        attendance.came(f"many/{i}")
     with pytest.raises(MessageError, match="of its name"):
-        known.came("many/2")
-    assert known.came("honest/1") is None
-    known.left("many/0")
-    known.came("many/2")
+        attendance.came("many/2")
+    assert attendance.came("honest/1") is None
+    attendance.left("many/0")
+    attendance.came("many/2")
 
 
 def test_names_and_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membership, "_MOST", 2)
     monkeypatch.setattr(membership, "_ASKING", 2)
-    known = Attendance()
+    attendance = Attendance()
     for name in ("a/1", "b/1"):
-        known.came(name)
+        attendance.came(name)
     with pytest.raises(MessageError, match="there are already 2 workers, or 500 of its name"):
-        known.came("c/1")
-    known.came("b/1")
+        attendance.came("c/1")
+    attendance.came("b/1")
     for name in ("d/1", "e/1"):
-        known.asked(want(name), 0.0)
+        attendance.asked(want(name), 0.0)
     with pytest.raises(MessageError, match="2 requests of workers"):
-        known.asked(want("f/1"), 0.0)
-    assert not known.asked(want("d/1", 9), 0.0)
-    known.left("a/1")
-    assert known.came("c/1") is None
+        attendance.asked(want("f/1"), 0.0)
+    assert not attendance.asked(want("d/1", 9), 0.0)
+    attendance.left("a/1")
+    assert attendance.came("c/1") is None

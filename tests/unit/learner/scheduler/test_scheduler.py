@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from rounds import given, started
+from rounds import by_worker, started
 
 from farm.errors import ConfigError
 from learner.scheduler.scheduler import Scheduler, SchedulerConfig
@@ -12,7 +12,7 @@ from learner.scheduler.scheduler import Scheduler, SchedulerConfig
 def test_a_round_from_begin_to_complete():
     scheduler = started(3, ["a"], seconds=0.01)
     assert not scheduler.complete
-    assert given(scheduler.assign(0.0)) == {"a": [0, 1, 2]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0, 1, 2]}
     assert (scheduler.remaining, scheduler.workers) == (3, {"a"})
     assert scheduler.results("a", [1, 0], 0.02) == ["new", "new"]
     assert scheduler.remaining == 1
@@ -46,7 +46,7 @@ def test_doubled_and_stale_results_do_not_count():
 
 def test_results_count_of_workers_that_were_given_the_job_only():
     scheduler = started(2, ["a", "b"], credits=1)
-    assert given(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0], "b": [1]}
     assert scheduler.results("stranger", [0, 1], 0.1) == ["unasked", "unasked"]
     assert scheduler.results("b", [0], 0.1) == ["unasked"]
     assert not scheduler.error("b", 0, 0.1)
@@ -56,7 +56,7 @@ def test_results_count_of_workers_that_were_given_the_job_only():
 
 def test_results_of_a_worker_that_was_given_nothing_may_be_of_an_earlier_round():
     scheduler = started(1, ["a", "b"])
-    assert given(scheduler.assign(0.0)) == {"a": [0]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0]}
     assert (scheduler.unread("a"), scheduler.unread("b")) == (None, "unasked")
     for _ in range(2):
         scheduler.begin(1)
@@ -67,11 +67,11 @@ def test_results_of_a_worker_that_was_given_nothing_may_be_of_an_earlier_round()
 
 def test_a_worker_that_left_after_its_result_still_counts_and_the_job_is_not_sent_any_more():
     scheduler = started(2, ["a"], credits=1)
-    assert given(scheduler.assign(0.0)) == {"a": [0]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0]}
     assert scheduler.lost("a") == 1
     assert scheduler.results("a", [0], 0.1) == ["new"]
     scheduler.want("b", 4, 0.1)
-    assert given(scheduler.assign(0.1)) == {"b": [1]}
+    assert by_worker(scheduler.assign(0.1)) == {"b": [1]}
 
 
 def test_jobs_that_are_reopened_are_done_again_by_others():
@@ -84,20 +84,20 @@ def test_jobs_that_are_reopened_are_done_again_by_others():
     assert not scheduler.complete
     assert scheduler.results("a", [1], 0.2) == ["unasked"]
     scheduler.want("b", 2, 0.2)
-    assert given(scheduler.assign(0.2)) == {"b": [1]}
+    assert by_worker(scheduler.assign(0.2)) == {"b": [1]}
     assert scheduler.results("b", [1], 0.3) == ["new"]
     assert scheduler.complete
 
 
 def test_a_lost_worker_s_jobs_go_back_in_order():
     scheduler = started(6, ["a"], seconds=0.001)
-    assert given(scheduler.assign(0.0)) == {"a": [0, 1, 2, 3]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0, 1, 2, 3]}
     scheduler.results("a", [1], 0.001)
     assert scheduler.lost("a") == 3
     assert scheduler.lost("a") == 0
     assert (scheduler.workers, scheduler.reissued) == (set(), 3)
     scheduler.want("b", 6, 0.2)
-    assert given(scheduler.assign(0.2)) == {"b": [0, 2, 3, 4, 5]}
+    assert by_worker(scheduler.assign(0.2)) == {"b": [0, 2, 3, 4, 5]}
 
 
 def test_an_idle_worker_gets_its_jobs_again():
@@ -105,7 +105,7 @@ def test_an_idle_worker_gets_its_jobs_again():
     scheduler.assign(0.0)
     assert scheduler.assign(0.5) == []
     scheduler.want("a", 4, 1.0, idle=True)
-    assert given(scheduler.assign(1.0)) == {"a": [0, 1, 2, 3]}
+    assert by_worker(scheduler.assign(1.0)) == {"a": [0, 1, 2, 3]}
     assert scheduler.reissued == 4
 
 
@@ -113,7 +113,7 @@ def test_a_new_round_forgets_the_old_one_but_no_credits():
     scheduler = started(4, ["a"], seconds=0.001)
     scheduler.assign(0.0)
     scheduler.begin(3)
-    assert given(scheduler.assign(0.1)) == {"a": [0, 1, 2]}
+    assert by_worker(scheduler.assign(0.1)) == {"a": [0, 1, 2]}
     assert scheduler.lost("a") == 3
 
 
@@ -129,7 +129,7 @@ def test_seconds_per_job_count_from_when_the_worker_could_begin():
 def test_a_job_that_is_repeated_counts_as_work_of_its_worker():
     scheduler = started(8, ["a", "b"], seconds=0.01, short_seconds=1.0, credits=8)
     scheduler.begin(6)
-    assert given(scheduler.assign(0.0)) == {"a": [0, 1, 2], "b": [3, 4, 5]}
+    assert by_worker(scheduler.assign(0.0)) == {"a": [0, 1, 2], "b": [3, 4, 5]}
     assert not scheduler.half_done
     assert scheduler.results("a", [0, 1, 2], 0.03) == ["new"] * 3
     assert scheduler.half_done

@@ -142,14 +142,14 @@ class Farm:
             assert name in self.live
             assert indices
             assert len(set(indices)) == len(indices)
-            held = self.held.setdefault(name, {})
-            tried = name not in self.answered and bool(self.answered)
-            for index in () if tried else indices:
+            jobs = self.held.setdefault(name, {})
+            newcomer = name not in self.answered and bool(self.answered)
+            for index in () if newcomer else indices:
                 assert not self.counted[index]
-                assert held.get(index, -math.inf) <= self.given_up()
-                held[index] = self.now
+                assert jobs.get(index, -math.inf) <= self.given_up()
+                jobs[index] = self.now
                 self.check_copies(index)
-            assert len(held) <= self.workers[name].credits
+            assert len(jobs) <= self.workers[name].credits
             self.send(self.on_chunk, self.workers[name], self.round, indices)
 
     def given_up(self):

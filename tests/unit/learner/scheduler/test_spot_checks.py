@@ -105,13 +105,13 @@ def test_checks_are_handed_out_before_the_round_ends(learner: Learner, hire: Hir
     dispatcher._ledger.audit._late = False  # as in three of four rounds
     slow, quick = hire("slow/1", Host), hire("quick/1", Host)
     slow.want(1)
-    own = slow.chunk()
+    share = slow.chunk()
     quick.want(4)
     others = quick.work(7)
     check = slow.chunk()
-    assert len(own) == 1
+    assert len(share) == 1
     assert set(check.indices.tolist()) <= set(others), "jobs of the other host, while its own is not done"
-    for chunk in (own, check):
+    for chunk in (share, check):
         slow.answer(slow.results(chunk))
     while not result.done():
         slow.serve(learner)
@@ -143,15 +143,15 @@ def checked(audit: Audit, returns: FloatArray, hosts: str = "ab") -> set[int]:
     audit.begin(len(returns))
     for index in range(len(returns)):
         audit.counted(f"{hosts[index % len(hosts)]}/1", np.array([index]))
-    results, asked, workers = filled(returns), set(), [f"{host}/1" for host in hosts]
+    results, checks, workers = filled(returns), set(), [f"{host}/1" for host in hosts]
     while not audit.passed(results, workers):
         for worker, indices in audit.assign(workers, 0.0, 1.0).items():
             for index in indices:
                 assert hosts[index % len(hosts)] != worker[0]
-                asked.add(index)
+                checks.add(index)
                 assert audit.answered(worker, index, results.answer(index), results.answer(index))
         assert not audit.settle()
-    return asked
+    return checks
 
 
 def secret(seed: int = 0) -> np.random.Generator:
@@ -194,7 +194,9 @@ def test_a_new_host_is_checked_in_each_round_and_a_trusted_one_every_twenty() ->
     assert sum(map(len, rounds)) == 9, "and no more often than that"
 
 
-def found(audit: Audit, lies: Callable[[np.ndarray, np.ndarray], np.ndarray], jobs: int, most: int) -> int | None:
+def answers_until_found(
+    audit: Audit, lies: Callable[[np.ndarray, np.ndarray], np.ndarray], jobs: int, most: int
+) -> int | None:
     """The answers of host b until it is found; None if that takes more than so many. `lies` says which are lies."""
     rng, answers = np.random.default_rng(audit._rng.integers(2**32)), 0
     while answers < most:
@@ -207,13 +209,15 @@ def found(audit: Audit, lies: Callable[[np.ndarray, np.ndarray], np.ndarray], jo
 
 
 def test_a_liar_in_one_of_fifty_jobs_is_found_within_three_thousand_answers() -> None:
-    times = [found(Audit(0.02, secret(i)), lambda at, _: at % 50 == 7, 100, 3000) for i in range(100)]
+    times = [answers_until_found(Audit(0.02, secret(i)), lambda at, _: at % 50 == 7, 100, 3000) for i in range(100)]
     assert sum(time is None for time in times) <= 2, "1 % of cases on average"
 
 
 def test_a_liar_in_all_but_its_best_is_found_within_two_rounds_of_thirty() -> None:
     for i in range(200):
-        assert found(Audit(0.02, secret(i)), lambda _, returns: returns < returns.max(), 30, 30) is not None
+        assert (
+            answers_until_found(Audit(0.02, secret(i)), lambda _, returns: returns < returns.max(), 30, 30) is not None
+        )
 
 
 def test_what_is_checked_cannot_be_told_from_the_round() -> None:
@@ -236,7 +240,7 @@ def test_early_and_late_jobs_are_checked_alike() -> None:
     audit, half, counts = trusted(0.1), 10, np.zeros(20)
     for _ in range(2000):
         audit.begin(2 * half)
-        asked = set()
+        checks = set()
         for part in (range(half), range(half, 2 * half)):
             for index in part:
                 audit.counted("ab"[index % 2] + "/1", np.array([index]))
@@ -244,11 +248,11 @@ def test_early_and_late_jobs_are_checked_alike() -> None:
             audit.choose(results, ("a/1", "b/1"), end=part.stop > half)
             for worker, indices in audit.assign(("a/1", "b/1"), 0.0, 1.0).items():
                 for index in indices:
-                    asked.add(index)
+                    checks.add(index)
                     audit.answered(worker, index, results.answer(index), results.answer(index))
             assert not audit.settle()
         assert audit.passed(results, ("a/1", "b/1"))
-        counts[list(asked)] += 1
+        counts[list(checks)] += 1
     early, late = counts[:half].mean() / 2000, counts[half:].mean() / 2000
     assert early == pytest.approx(0.1, rel=0.1)
     assert late == pytest.approx(0.1, rel=0.1)
@@ -307,10 +311,10 @@ def test_two_against_one_decide_and_nobody_else_does() -> None:
 
 
 def test_a_judge_decides_alone_and_against_any_number() -> None:
-    asked = []
+    questions = []
 
     def judge(index: int, canary: str) -> bytes:
-        asked.append((index, canary))
+        questions.append((index, canary))
         return b"right"
 
     assert disputed(Audit(1.0, np.random.default_rng(0)), b"right", b"wrong", judge=judge) == {"b": 0}
@@ -320,17 +324,17 @@ def test_a_judge_decides_alone_and_against_any_number() -> None:
         "d": 0,
     }
     assert disputed(Audit(1.0, np.random.default_rng(0)), b"wrong", b"worse", judge=judge) == {"a": 0, "b": 0}
-    assert asked == [(0, "one")] * 3
+    assert questions == [(0, "one")] * 3
     assert disputed(Audit(1.0, np.random.default_rng(0)), b"right", b"right", judge=judge) == {}
-    assert len(asked) == 3, "only a dispute is worth its time"
+    assert len(questions) == 3, "only a dispute is worth its time"
 
 
 def test_a_judge_that_cannot_simulate_is_asked_once() -> None:
-    asked, audit = [], Audit(1.0, np.random.default_rng(0))
-    judge = lambda index, _: asked.append(index)  # noqa: E731
+    questions, audit = [], Audit(1.0, np.random.default_rng(0))
+    judge = lambda index, _: questions.append(index)  # noqa: E731
     assert disputed(audit, b"right", b"wrong", judge=judge) == {}
     assert audit.settle(judge) == {}
-    assert asked == [0]
+    assert questions == [0]
 
 
 def test_none_are_checked_on_request() -> None:
@@ -346,9 +350,9 @@ def test_only_machines_whose_numbers_are_of_one_kind_are_compared() -> None:
     for index in range(8):
         audit.counted(list(KINDS)[index % 4], np.array([index]))
     assert not audit.passed(results, list(KINDS))
-    asked = audit.assign(list(KINDS), 0.0, 1.0)
-    assert {worker: sorted(indices) for worker, indices in asked.items()} == {"b/1": [0, 4], "a/1": [1, 5]}
-    for worker, indices in asked.items():
+    checks = audit.assign(list(KINDS), 0.0, 1.0)
+    assert {worker: sorted(indices) for worker, indices in checks.items()} == {"b/1": [0, 4], "a/1": [1, 5]}
+    for worker, indices in checks.items():
         for index in indices:
             assert audit.answered(worker, index, results.answer(index), results.answer(index))
     assert audit.settle() == {}

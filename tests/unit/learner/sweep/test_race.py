@@ -64,8 +64,8 @@ def test_the_winner_ends_with_the_average_of_its_last_tenth(tmp_path):
     [config] = last.values()
     assert (config.generations, config.average) == (60, 6)
     assert not list(configs.other(first[tmp_path / "a-s0"], config)), "its run is resumed"
-    own = replace(a, config=replace(a.config, average=9))
-    [config] = raced(tmp_path, own, b, scores=scores).runs(1).values()
+    smooth = replace(a, config=replace(a.config, average=9))
+    [config] = raced(tmp_path, smooth, b, scores=scores).runs(1).values()
     assert config.average == 9
 
 
@@ -76,8 +76,8 @@ def test_an_entry_that_still_gains_may_go_on_before_a_better_one_that_does_not(t
     assert flat.winner is a
     scores[1]["b"] = -30.0
     assert raced(tmp_path, a, b, c, d, scores=scores).winner is b
-    for lost in (None, float("nan")):
-        scores[1]["b"] = lost
+    for score in (None, float("nan")):
+        scores[1]["b"] = score
         assert raced(tmp_path, a, b, c, d, scores=scores).winner is a, "what has diverged gains nothing"
 
 
@@ -104,8 +104,8 @@ def test_who_runs_follows_from_the_scores_alone(tmp_path):
 def test_a_race_continues_in_its_folder_and_in_no_other(tmp_path):
     a, b = entry("a"), entry("b", "constant")
     raced(tmp_path / "r", a, b).prepare()
-    told = json.loads((tmp_path / "r/race.json").read_text())
-    (tmp_path / "r/race.json").write_text(json.dumps({**told, "scores": [{"a": 1.0, "b": 2.0}]}))
+    contents = json.loads((tmp_path / "r/race.json").read_text())
+    (tmp_path / "r/race.json").write_text(json.dumps({**contents, "scores": [{"a": 1.0, "b": 2.0}]}))
     again = raced(tmp_path / "r", a, b)
     again.prepare()
     assert again.scores == [{"a": 1.0, "b": 2.0}]
@@ -126,9 +126,9 @@ def test_a_race_continues_in_its_folder_and_in_no_other(tmp_path):
 @pytest.mark.parametrize("text", ["", "[]", '{"version": 2}', '{"version": 1, "rollouts": "8", "entries": {}}'])
 def test_a_damaged_file_is_one_line(tmp_path, text):
     (tmp_path / "race.json").write_text(text)
-    with pytest.raises(ConfigError, match=r"race\.json") as said:
+    with pytest.raises(ConfigError, match=r"race\.json") as error:
         raced(tmp_path, entry("a")).prepare()
-    assert "\n" not in str(said.value)
+    assert "\n" not in str(error.value)
 
 
 def test_races_that_cannot_be_run(tmp_path):
@@ -139,9 +139,9 @@ def test_races_that_cannot_be_run(tmp_path):
         race.check(raced(tmp_path, a, rollouts=100_000_001))
     with pytest.raises(ConfigError, match="a and b are the same settings"):
         race.check(raced(tmp_path, a, replace(a, name="b")))
-    with pytest.raises(ConfigError, match=r"79 rollouts are .* give --rollouts \d+ or more") as said:
+    with pytest.raises(ConfigError, match=r"79 rollouts are .* give --rollouts \d+ or more") as error:
         race.check(raced(tmp_path, a, entry("b", sigma=0.2), rollouts=79))
-    enough = int(str(said.value).split("--rollouts ")[1].split()[0])
+    enough = int(str(error.value).split("--rollouts ")[1].split()[0])
     race.check(raced(tmp_path, a, entry("b", sigma=0.2), rollouts=enough))
 
 
@@ -151,9 +151,9 @@ def test_races_that_cannot_be_run(tmp_path):
 def test_the_flags_of_every_entry_give_its_settings(tmp_path):
     file = pole(tmp_path)
     base = replace(RunConfig(task=f"{file}:Pole"), seed=3)
-    found = race.entries_of(base, portfolio("general"))
-    assert [each.name for each in found] == list(General.entries)
-    for each in found:
+    entries = race.entries_of(base, portfolio("general"))
+    assert [each.name for each in entries] == list(General.entries)
+    for each in entries:
         config = replace(each.config, generations=7)
         assert parse(RunCommand, configs.flags(config), "farm run")[0].run == config, each.name
         assert each.generations(1001) * each.per_generation >= 1001 > (each.generations(1001) - 1) * each.per_generation
@@ -225,16 +225,16 @@ def test_the_list_has_the_flags_of_each_entry(tmp_path, capsys, monkeypatch):
 def test_mistakes_are_one_line(tmp_path, monkeypatch, words, why):
     monkeypatch.chdir(tmp_path)
     pole(tmp_path)
-    with pytest.raises(ConfigError, match=why) as said:
+    with pytest.raises(ConfigError, match=why) as error:
         command.main(["pole.py:Pole", *words])
-    assert "\n" not in str(said.value)
+    assert "\n" not in str(error.value)
     assert not (tmp_path / "tunes").exists()
 
 
 def test_minutes_become_rollouts_once(tmp_path, monkeypatch):
     base = RunConfig(task=f"{pole(tmp_path, POLE)}:Pole")
-    found = race.entries_of(base, {"a": {}})
-    few, many = race.affordable(found, 1.0, 1), race.affordable(found, 100.0, 1)
+    entries = race.entries_of(base, {"a": {}})
+    few, many = race.affordable(entries, 1.0, 1), race.affordable(entries, 100.0, 1)
     assert 0 < few < many
 
 
@@ -250,6 +250,6 @@ def test_the_page_has_the_table_the_command_and_the_winner(tmp_path):
     assert "mean policy returned -1." in page
     assert "farm run --policy linear --algorithm ars" in page
     assert "(figure.svg)" in page
-    shown = result.curves(done)
-    assert [curve.label for curve in shown] == ["a", "b"]
-    assert shown[0].returns.tolist() == [[-1.0, -2.0, -3.0]]
+    curves = result.curves(done)
+    assert [curve.label for curve in curves] == ["a", "b"]
+    assert curves[0].returns.tolist() == [[-1.0, -2.0, -3.0]]

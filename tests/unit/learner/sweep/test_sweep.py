@@ -17,7 +17,7 @@ from learner.sweep.grid import Setting, Sweep
 from learner.sweep.runs import todo
 
 
-def made(path, *sigmas, seeds=(0, 1), **common):
+def sweep_of(path, *sigmas, seeds=(0, 1), **common):
     values = [{"initial_sigma": sigma} for sigma in sigmas]
     settings = [Setting(v, configure(initial_sigma=float(v["initial_sigma"]), **common)) for v in values]
     return Sweep(path, tuple(settings), seeds)
@@ -44,8 +44,8 @@ def test_seeds_and_values_are_read_as_they_are_written():
     assert grid.parse_seeds("1-2,5") == (1, 2, 5)
     vary = grid.parse_vary(["initial-sigma=0.05,0.1", "policy=direct, kernel"])
     assert vary == {"initial_sigma": ["0.05", "0.1"], "policy": ["direct", "kernel"]}
-    found = grid.combinations(vary, 5)
-    assert [tuple(each.values()) for each in found] == [
+    combinations = grid.combinations(vary, 5)
+    assert [tuple(each.values()) for each in combinations] == [
         ("0.05", "direct"), ("0.05", "kernel"), ("0.1", "direct"), ("0.1", "kernel"),
     ]  # fmt: skip
     assert grid.combinations({}, 5) == [{}]
@@ -53,9 +53,9 @@ def test_seeds_and_values_are_read_as_they_are_written():
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1,1", "0-2,2", "-1", "4294967296", "0-4294967295", "1,,2", "1.5"])
 def test_seeds_that_make_no_sense(text):
-    with pytest.raises(ConfigError, match="--seeds") as said:
+    with pytest.raises(ConfigError, match="--seeds") as error:
         grid.parse_seeds(text)
-    assert "\n" not in str(said.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("words", [["a"], ["a="], ["=1"], ["a=1,,2"], ["a=1", "a=2"], ["a-b=1", "a_b=2"], ["a=1,1"],
@@ -71,7 +71,7 @@ def test_too_many_runs():
 
 
 def test_runs_are_named_by_what_is_varied_and_begin_seed_by_seed(tmp_path):
-    runs = made(tmp_path, "0.1", "0.2").runs
+    runs = sweep_of(tmp_path, "0.1", "0.2").runs
     assert [path.name for path in runs] == [f"initial_sigma-{v}-s{seed}" for seed in (0, 1) for v in ("0.1", "0.2")]
     assert [(c.seed, c.algorithm_config.initial_sigma) for c in runs.values()] == [
         (0, 0.1),
@@ -93,7 +93,7 @@ def test_values_that_make_no_name_are_numbered(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reason"),
     [
         (("--vary", "foo=1,2"), "--vary foo=1: no such setting; known are task, policy, algorithm"),
         (("--vary", "out=a,b"), "no such setting"),
@@ -110,11 +110,11 @@ def test_values_that_make_no_name_are_numbered(tmp_path):
         (("--parallel", "0"), "parallel is 0; expected 1 to 256"),
     ],
 )
-def test_mistakes_are_one_line_and_nothing_is_begun(tmp_path, monkeypatch, words, said):
+def test_mistakes_are_one_line_and_nothing_is_begun(tmp_path, monkeypatch, words, reason):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError) as error:
         command.main(words)
-    assert said in str(error.value)
+    assert reason in str(error.value)
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == []
 
@@ -137,18 +137,21 @@ def test_a_setting_is_what_farm_run_would_take():
 
 def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
     out = tmp_path / "out"
-    made(out, "0.1", "0.2").prepare()
-    made(out, "0.1", "0.2", seeds=(0, 1, 2)).prepare()
+    sweep_of(out, "0.1", "0.2").prepare()
+    sweep_of(out, "0.1", "0.2", seeds=(0, 1, 2)).prepare()
     assert json.loads((out / "sweep.json").read_text())["seeds"] == [0, 1, 2]
-    for other, said in (
-        (made(out, "0.1", "0.2"), "has seeds 2 as well"),
-        (made(out, "0.1", seeds=(0, 1, 2)), "varies initial_sigma=0.1,0.2; here it is initial_sigma=0.1:"),
-        (made(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was started with --pairs 5; here it is 3"),
-        (made(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3), "was started with --generations 90; here it is 3"),
+    for other, reason in (
+        (sweep_of(out, "0.1", "0.2"), "has seeds 2 as well"),
+        (sweep_of(out, "0.1", seeds=(0, 1, 2)), "varies initial_sigma=0.1,0.2; here it is initial_sigma=0.1:"),
+        (sweep_of(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was started with --pairs 5; here it is 3"),
+        (
+            sweep_of(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3),
+            "was started with --generations 90; here it is 3",
+        ),
     ):
         with pytest.raises(ConfigError, match="a different --out") as error:
             other.prepare()
-        assert said in str(error.value)
+        assert reason in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -168,25 +171,25 @@ def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
 )
 def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "sweep.json").write_text(text)
-    with pytest.raises(ConfigError) as said:
-        made(tmp_path, "0.1").prepare()
-    assert "\n" not in str(said.value)
-    assert "cannot write" not in str(said.value)  # the file is at fault, and not the disk
+    with pytest.raises(ConfigError) as error:
+        sweep_of(tmp_path, "0.1").prepare()
+    assert "\n" not in str(error.value)
+    assert "cannot write" not in str(error.value)  # the file is at fault, and not the disk
 
 
 def test_other_things_are_not_written_into(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(ConfigError, match="holds something else"):
-        made(tmp_path, "0.1").prepare()
+        sweep_of(tmp_path, "0.1").prepare()
     with pytest.raises(ConfigError, match="cannot write to"):
-        made(tmp_path / "thesis.tex", "0.1").prepare()
+        sweep_of(tmp_path / "thesis.tex", "0.1").prepare()
 
 
 # ---------------------------------------------------------------- what came out
 
 
 def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path):
-    sweep = made(tmp_path, "0.1", "0.2")
+    sweep = sweep_of(tmp_path, "0.1", "0.2")
     paths = list(sweep.runs)
     ran(paths[0], RunConfig(), [-5.0, -4.0], final=-3.0)
     ran(paths[2], RunConfig(seed=1), [-5.0, -3.0], final=-1.0)
@@ -195,13 +198,13 @@ def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path
     table = outcomes.rows(sweep)
     outcomes.write_csv(tmp_path / "table.csv", sweep, table)
     with (tmp_path / "table.csv").open() as file:
-        read = list(csv.DictReader(file))
-    assert list(read[0]) == ["initial_sigma", *outcomes.COLUMNS]
-    assert [(r["initial_sigma"], r["seed"], r["state"]) for r in read] == [
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["initial_sigma", *outcomes.COLUMNS]
+    assert [(r["initial_sigma"], r["seed"], r["state"]) for r in rows] == [
         ("0.1", "0", "finished"), ("0.1", "1", "finished"), ("0.2", "0", "diverged"), ("0.2", "1", "not begun"),
     ]  # fmt: skip
-    assert (read[0]["generations"], read[0]["rollouts"], read[0]["seconds"]) == ("2", "60", "4.0")
-    assert (read[0]["first_mean_policy_return"], read[2]["mean_policy_return"]) == ("-5.0", "")
+    assert (rows[0]["generations"], rows[0]["rollouts"], rows[0]["seconds"]) == ("2", "60", "4.0")
+    assert (rows[0]["first_mean_policy_return"], rows[2]["mean_policy_return"]) == ("-5.0", "")
     parquet = pytest.importorskip("pyarrow.parquet")
     outcomes.write_parquet(tmp_path / "table.parquet", sweep, table)
     assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == table, "typed, and None where nothing is known"
@@ -210,16 +213,16 @@ def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path
 
 
 def test_the_printed_table_has_a_line_a_setting(tmp_path, capsys):
-    sweep = made(tmp_path, "0.1", "0.2")
+    sweep = sweep_of(tmp_path, "0.1", "0.2")
     ran(next(iter(sweep.runs)), RunConfig(), [-5.0, -4.0], final=-3.0)
     command._print(sweep, outcomes.rows(sweep))
-    said = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert said[0] == "initial_sigma runs untrained return robust success minutes"
-    assert said[1:3] == ["0.1 1 of 2 -5.000 ± 0.000 -3.000 ± 0.000 50% ± 0% 0.1", "0.2 0 of 2 0.0"]
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == "initial_sigma runs untrained return robust success minutes"
+    assert lines[1:3] == ["0.1 1 of 2 -5.000 ± 0.000 -3.000 ± 0.000 50% ± 0% 0.1", "0.2 0 of 2 0.0"]
 
 
 def test_a_curve_is_over_the_rollouts_behind_each_mean_policy(tmp_path):
-    sweep = made(tmp_path, "0.1", "0.2")
+    sweep = sweep_of(tmp_path, "0.1", "0.2")
     paths = list(sweep.runs)
     ran(paths[0], RunConfig(), [-5.0, -4.0, -4.0], final=-3.0)
     ran(paths[2], RunConfig(), [-5.0, RETURN_FLOOR], state="interrupted")
@@ -236,12 +239,12 @@ def test_the_figure_names_every_setting_and_is_the_same_again(tmp_path):
     curves = [outcomes.Curve(f"sigma {i}", np.arange(4.0), np.random.default_rng(i).random((3, 4))) for i in range(9)]
     figure.draw(curves, tmp_path / "a.svg")
     figure.draw(curves, tmp_path / "b.svg")
-    said = (tmp_path / "a.svg").read_text()
-    assert all(f"sigma {i}" in said for i in range(9))
-    assert said == (tmp_path / "b.svg").read_text()
+    svg = (tmp_path / "a.svg").read_text()
+    assert all(f"sigma {i}" in svg for i in range(9))
+    assert svg == (tmp_path / "b.svg").read_text()
 
 
 def test_without_matplotlib_one_line_says_how_to_get_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(figure, "available", lambda: False)
-    command._draw(made(tmp_path, "0.1"))
+    command._draw(sweep_of(tmp_path, "0.1"))
     assert capsys.readouterr().out == "no figure: figures need matplotlib: pip install matplotlib\n"

@@ -30,9 +30,9 @@ def report(generation: int, **changed: Any) -> Report:
 
 
 def test_a_report_there_and_back() -> None:
-    made = report(3, replay=SHOWN, replay_generation=2)
-    back = codec.decode(codec.encode(made), Report)
-    assert (back.progress, back.rate, back.replay_generation) == (made.progress, 5.0, 2)
+    original = report(3, replay=SHOWN, replay_generation=2)
+    back = codec.decode(codec.encode(original), Report)
+    assert (back.progress, back.rate, back.replay_generation) == (original.progress, 5.0, 2)
     assert {name: values.shape for name, values in back.traces.items()} == {"best": (3, 2), "all": (4, 3, 2)}
     assert back.sample is not None
     assert back.sample.channels["angle"].tolist() == [[1.0]]
@@ -41,8 +41,8 @@ def test_a_report_there_and_back() -> None:
 @pytest.fixture
 def link() -> Iterator[tuple[Session, Session]]:
     endpoint = free_endpoint()
-    with session.listen(endpoint, "farm") as own, session.connect((endpoint,), 10, lambda: False) as other:
-        yield own, other
+    with session.listen(endpoint, "farm") as listener, session.connect((endpoint,), 10, lambda: False) as other:
+        yield listener, other
 
 
 @pytest.fixture
@@ -53,9 +53,9 @@ def publisher(link: tuple[Session, Session]) -> Iterator[Publisher]:
         state=SimpleNamespace(generation=2), undone=0,
         problem=SimpleNamespace(task=SimpleNamespace(sources={"model.xml": "<mujoco/>"})),
     )  # fmt: skip
-    made = Publisher(link[0], "farm", "i", learner)  # type: ignore[arg-type]
-    yield made
-    made.close()
+    service = Publisher(link[0], "farm", "i", learner)  # type: ignore[arg-type]
+    yield service
+    service.close()
 
 
 def page(other: Session, first: object) -> RunHistory:
@@ -66,11 +66,16 @@ def page(other: Session, first: object) -> RunHistory:
 
 def test_a_late_subscriber_receives_everything(publisher: Publisher, link: tuple[Session, Session]) -> None:
     publisher.generation(report(3))
-    said = page(link[1], 1)
-    assert (said.run, said.recording, said.generation, said.files) == ("r", "first", 3, {"model.xml": "<mujoco/>"})
-    assert [one.generation for one in said.reports] == [1, 2, 3]
-    assert [one.rate for one in said.reports] == [15.0, 15.0, 5.0]
-    assert [one.sample is None for one in said.reports] == [True, True, False]
+    history = page(link[1], 1)
+    assert (history.run, history.recording, history.generation, history.files) == (
+        "r",
+        "first",
+        3,
+        {"model.xml": "<mujoco/>"},
+    )
+    assert [one.generation for one in history.reports] == [1, 2, 3]
+    assert [one.rate for one in history.reports] == [15.0, 15.0, 5.0]
+    assert [one.sample is None for one in history.reports] == [True, True, False]
     assert [one.generation for one in page(link[1], 3).reports] == [3]
     for nonsense in ("-1", "many", "", "9" * 50):
         assert page(link[1], nonsense).generation == 3
@@ -98,5 +103,5 @@ def test_traces_that_are_too_large_stay_behind(
 ) -> None:
     monkeypatch.setattr(publishers, "_TRACES", 50)
     publisher.generation(report(3))
-    [said] = page(link[1], 3).reports
-    assert list(said.traces) == ["best"]
+    [last] = page(link[1], 3).reports
+    assert list(last.traces) == ["best"]

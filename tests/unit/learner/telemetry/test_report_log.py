@@ -26,17 +26,17 @@ def filled(generations: int, memory: int, page: int) -> ReportLog:
     return history
 
 
-def read(history: ReportLog, begin: int = 1) -> list[list[Report]]:
+def pages_of(history: ReportLog, first: int = 1) -> list[list[Report]]:
     """Pages, as a recorder asks for them."""
     pages = []
-    while page := history.page(begin):
+    while page := history.page(first):
         pages.append(list(page))
-        begin = page[-1].generation + 1
+        first = page[-1].generation + 1
     return pages
 
 
 def test_every_generation_once_and_in_order() -> None:
-    pages = read(filled(100, memory=1 << 20, page=10_000))
+    pages = pages_of(filled(100, memory=1 << 20, page=10_000))
     assert [r.generation for page in pages for r in page] == list(range(1, 101))
     assert len(pages) > 10
     assert max(len(codec.encode(tuple_of(page))) for page in pages) < 3 * 10_000
@@ -49,23 +49,23 @@ def tuple_of(page: list[Report]) -> object:
 
 
 def test_the_oldest_rollouts_go_and_no_statistics() -> None:
-    kept = list(itertools.chain(*read(filled(50, memory=10 * TRACE, page=1 << 20))))
-    assert [r.generation for r in kept] == list(range(1, 51))
-    assert [r.generation for r in kept if r.traces] == list(range(41, 51))
-    assert all(r.progress == stats(r.generation) for r in kept)
+    reports = list(itertools.chain(*pages_of(filled(50, memory=10 * TRACE, page=1 << 20))))
+    assert [r.generation for r in reports] == list(range(1, 51))
+    assert [r.generation for r in reports if r.traces] == list(range(41, 51))
+    assert all(r.progress == stats(r.generation) for r in reports)
 
 
 def test_one_report_larger_than_everything() -> None:
     history = filled(3, memory=10 * TRACE, page=TRACE)
     history.add(report(4, rollouts=100))
-    assert [r.generation for page in read(history) for r in page] == [1, 2, 3, 4]
+    assert [r.generation for page in pages_of(history) for r in page] == [1, 2, 3, 4]
     assert not history.page(4)[0].traces
     assert len(ReportLog(0, 0).page(1)) == 0
 
 
-@pytest.mark.parametrize("begin", [-5, 0, 1])
-def test_from_the_start(begin: int) -> None:
-    assert [r.generation for r in filled(3, 1 << 20, 1 << 20).page(begin)] == [1, 2, 3]
+@pytest.mark.parametrize("first", [-5, 0, 1])
+def test_from_the_start(first: int) -> None:
+    assert [r.generation for r in filled(3, 1 << 20, 1 << 20).page(first)] == [1, 2, 3]
 
 
 def test_generations_that_a_folder_lost() -> None:

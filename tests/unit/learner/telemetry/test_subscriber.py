@@ -19,7 +19,7 @@ from learner.telemetry.report_log import ReportLog
 from learner.telemetry.subscriber import Subscriber, find_run, localised
 
 
-class Told:
+class LearnerSide:
     """A learner's side: what it published, and what it answers."""
 
     def __init__(self, link: Session) -> None:
@@ -33,19 +33,19 @@ class Told:
         """Done once, behind the next answer."""
         link.answer_asked(keys.history("farm", "r"), self._answer)
 
-    def _answer(self, asked: str) -> bytes:
-        first = int(asked.removeprefix("from="))
+    def _answer(self, query: str) -> bytes:
+        first = int(query.removeprefix("from="))
         self.asked.append(first)
         reply = codec.encode(replace(self.page, reports=self.history.page(first)))
         after, self.after = self.after, lambda: None
         after()
         return reply
 
-    def report(self, generation: int, *, lost: bool = False) -> None:
+    def report(self, generation: int, *, silent: bool = False) -> None:
         report = Report(incarnation=self.page.incarnation, progress=stats(generation), rate=1.0)
         self.history.add(report)
         self.page = replace(self.page, generation=generation)
-        if not lost:
+        if not silent:
             self.again(report)
 
     def again(self, report: Report) -> None:
@@ -57,10 +57,10 @@ class Told:
 
 
 @pytest.fixture
-def told() -> Iterator[tuple[Told, Subscriber]]:
+def pair() -> Iterator[tuple[LearnerSide, Subscriber]]:
     endpoint = free_endpoint()
     with session.listen(endpoint, "farm") as link, session.connect((endpoint,), 10, lambda: False) as other:
-        learner = Told(link)
+        learner = LearnerSide(link)
         follower = Subscriber(other, "farm", "r")
         assert follower.begin(lambda: False) == ("r", RunConfig(), {"model.xml": "<mujoco/>"})
         yield learner, follower
@@ -72,50 +72,50 @@ def take(reports: Iterator[Report | RunEnd], count: int) -> list[int]:
     ]
 
 
-def test_in_order_and_each_once(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_in_order_and_each_once(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     for generation in range(1, 11):
-        learner.report(generation, lost=generation <= 6)
+        learner.report(generation, silent=generation <= 6)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 10) == list(range(1, 11))
-    asked = len(learner.asked)
+    queries = len(learner.asked)
     learner.report(11)
     learner.again(learner.history.page(11)[0])
     learner.report(12)
     assert take(reports, 2) == [11, 12]
-    assert len(learner.asked) <= asked + 1, "what comes as it should is not asked for"
-    learner.report(13, lost=True)
+    assert len(learner.asked) <= queries + 1, "what comes as it should is not asked for"
+    learner.report(13, silent=True)
     learner.report(14)
     assert take(reports, 2) == [13, 14]
-    learner.report(15, lost=True)
+    learner.report(15, silent=True)
     learner.end()
     assert take(reports, 1) == [15]
     assert isinstance(next(reports), RunEnd)
     assert next(reports, None) is None
 
 
-def test_from_where_a_file_ends(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_from_where_a_file_ends(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     for generation in range(1, 6):
-        learner.report(generation, lost=True)
+        learner.report(generation, silent=True)
     assert take(follower.follow(3, lambda: False), 2) == [4, 5]
 
 
 def test_the_last_report_is_lost_and_nothing_follows(
-    told: tuple[Told, Subscriber], monkeypatch: pytest.MonkeyPatch
+    pair: tuple[LearnerSide, Subscriber], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learner, follower = told
+    learner, follower = pair
     monkeypatch.setattr(subscribers, "_QUIET", 0.1)
     learner.report(1)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 1) == [1]
-    learner.after = lambda: learner.report(2, lost=True)  # just when the follower has heard that there is none
+    learner.after = lambda: learner.report(2, silent=True)  # just when the follower has heard that there is none
     assert take(reports, 1) == [2]
     assert learner.asked[-2:] == [2, 2]
 
 
-def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_generations_rolled_back_are_not_told_twice(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     for generation in range(1, 6):
         learner.report(generation)
     reports = follower.follow(0, lambda: False)
@@ -129,10 +129,10 @@ def test_generations_rolled_back_are_not_told_twice(told: tuple[Told, Subscriber
     assert take(reports, 2) == [6, 7]
 
 
-def test_what_a_folder_lost_is_not_waited_for(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_what_a_folder_lost_is_not_waited_for(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     learner.page = replace(learner.page, generation=4)
-    learner.report(5, lost=True)
+    learner.report(5, silent=True)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 1) == [5]
     learner.page = replace(learner.page, generation=9)
@@ -140,8 +140,8 @@ def test_what_a_folder_lost_is_not_waited_for(told: tuple[Told, Subscriber]) -> 
     assert isinstance(next(reports), RunEnd)
 
 
-def test_another_run_of_the_same_name(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_another_run_of_the_same_name(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     learner.report(1)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 1) == [1]
@@ -153,28 +153,28 @@ def test_another_run_of_the_same_name(told: tuple[Told, Subscriber]) -> None:
         next(reports)
 
 
-def test_a_learner_of_another_version(told: tuple[Told, Subscriber], monkeypatch: pytest.MonkeyPatch) -> None:
-    learner, follower = told
+def test_a_learner_of_another_version(pair: tuple[LearnerSide, Subscriber], monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, follower = pair
     monkeypatch.setattr(learner, "page", replace(learner.page, generation="many"))
     with pytest.raises(RunError, match="the learner of run r cannot be understood: RunHistory.generation"):
         next(follower.follow(0, lambda: False))
 
 
-def test_stopped(told: tuple[Told, Subscriber]) -> None:
-    _, follower = told
+def test_stopped(pair: tuple[LearnerSide, Subscriber]) -> None:
+    _, follower = pair
     assert list(follower.follow(0, lambda: True)) == []
 
 
-def test_stopped_before_anybody_is_there(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_stopped_before_anybody_is_there(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     with pytest.raises(Interrupted, match="stopped before run r was there"):
         follower.begin(lambda: True)
     with pytest.raises(Interrupted):
         find_run(learner.link, "farm", lambda: True)
 
 
-def test_the_only_run_of_a_farm_is_found(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_the_only_run_of_a_farm_is_found(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     learner.link.token(keys.learner_token("farm", "r"))
     assert find_run(learner.link, "farm", lambda: False) == "r"
     learner.link.token(keys.learner_token("farm", "s"))
@@ -187,8 +187,8 @@ def test_classes_in_files_are_those_of_this_machine(tmp_path: Path) -> None:
     assert localised(config, ()) == config
     config["task"]["name"] = "/somewhere/else/pole.py:Pole"
     here = tmp_path / "pole.py"
-    found = localised(config, (tmp_path / "other.py", here))
-    assert found["task"] == {**config["task"], "name": f"{here}:Pole"}
+    local = localised(config, (tmp_path / "other.py", here))
+    assert local["task"] == {**config["task"], "name": f"{here}:Pole"}
     assert config["task"]["name"].startswith("/somewhere"), "the configuration is left alone"
     with pytest.raises(
         ConfigError, match=r"the run's task is a class in pole\.py: copy it here, and give --allow-file"
@@ -196,8 +196,8 @@ def test_classes_in_files_are_those_of_this_machine(tmp_path: Path) -> None:
         localised(config, (tmp_path / "other.py",))
 
 
-def test_a_run_that_went_back_is_another_recording(told: tuple[Told, Subscriber]) -> None:
-    learner, follower = told
+def test_a_run_that_went_back_is_another_recording(pair: tuple[LearnerSide, Subscriber]) -> None:
+    learner, follower = pair
     for generation in range(1, 7):
         learner.report(generation)
     reports = follower.follow(0, lambda: False)
