@@ -34,15 +34,15 @@ class Browser:
         """Start it; `home` is for its profile."""
         self.errors: list[str] = []
         """What the console called an error, and exceptions that nobody caught."""
-        theirs, self._write = os.pipe()
+        input_end, self._write = os.pipe()
         self._read, ours = os.pipe()
         command = [need_chromium(), *_FLAGS, f"--user-data-dir={home}", "about:blank"]
         # The browser reads commands from descriptor 3 and writes to 4, whichever numbers the pipes have here.
-        shell = ["bash", "-c", f'exec 3<&{theirs} 4>&{ours} "$0" "$@"', *command]
+        shell = ["bash", "-c", f'exec 3<&{input_end} 4>&{ours} "$0" "$@"', *command]
         self._process = subprocess.Popen(
-            shell, pass_fds=(theirs, ours), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            shell, pass_fds=(input_end, ours), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
-        os.close(theirs)
+        os.close(input_end)
         os.close(ours)
         self._waiting, self._number, self._session = b"", 0, ""
         pages = self.call("Target.getTargets")["targetInfos"]
@@ -91,22 +91,22 @@ class Browser:
         until = time.monotonic() + 60
         while b"\0" not in self._waiting:
             assert select.select([self._read], [], [], max(0.0, until - time.monotonic()))[0], "the browser is silent"
-            read = os.read(self._read, 1 << 20)
-            assert read, "the browser has ended"
-            self._waiting += read
+            data = os.read(self._read, 1 << 20)
+            assert data, "the browser has ended"
+            self._waiting += data
         message, _, self._waiting = self._waiting.partition(b"\0")
         return json.loads(message)
 
     def _note(self, event: dict[str, Any]) -> None:
-        known = event.get("params", {})
-        if event.get("method") == "Runtime.consoleAPICalled" and known["type"] in ("error", "assert"):
-            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in known["args"]))
+        params = event.get("params", {})
+        if event.get("method") == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
+            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in params["args"]))
         elif event.get("method") == "Runtime.exceptionThrown":
-            self.errors.append(str(known["exceptionDetails"]))
-        elif event.get("method") == "Log.entryAdded" and known["entry"]["level"] == "error":
-            self.errors.append(known["entry"]["text"])
+            self.errors.append(str(params["exceptionDetails"]))
+        elif event.get("method") == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.errors.append(params["entry"]["text"])
         elif event.get("method") == "Fetch.requestPaused":
             # The viewer asks its maker's machines for news: they answer nothing, with internet and without.
             anybody = [{"name": f"Access-Control-Allow-{what}", "value": "*"} for what in ("Origin", "Headers")]
             answer = {"responseCode": 200, "responseHeaders": anybody, "body": base64.b64encode(b"{}").decode()}
-            self._post("Fetch.fulfillRequest", requestId=known["requestId"], **answer)
+            self._post("Fetch.fulfillRequest", requestId=params["requestId"], **answer)

@@ -44,7 +44,7 @@ def say(done: Farm, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
 
     def call(*words: str, status: int = 0) -> str:
         assert main(words) == status
-        said = capsys.readouterr()
-        return said.out + said.err
+        output = capsys.readouterr()
+        return output.out + output.err
 
     return call

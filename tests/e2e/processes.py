@@ -59,9 +59,9 @@ class Farm:
 
     def call(self, *words: str, status: int = 0, timeout: float = 120) -> str:
         process = self.start(*words)
-        said, _ = process.communicate(timeout=timeout)
-        assert process.returncode == status, said
-        return said
+        output, _ = process.communicate(timeout=timeout)
+        assert process.returncode == status, output
+        return output
 
     def summary(self, run: str) -> dict[str, Any]:
         return self.json(f"runs/{run}/summary.json")

@@ -19,7 +19,7 @@ def read(path: Path) -> dict[str, list[Any]]:
 
 def rows(batches: list[Any], name: str) -> dict[int, Any]:
     """A column's values by generation."""
-    found: dict[int, Any] = {}
+    by_generation: dict[int, Any] = {}
     for batch in batches:
         columns = [n for n in batch.schema.names if n == name or n.endswith(f":{name}")]
         if columns and "generation" in batch.schema.names:
@@ -27,18 +27,18 @@ def rows(batches: list[Any], name: str) -> dict[int, Any]:
             generations = batch.column("generation").cast("int64").to_pylist()
             for generation, value in zip(generations, values, strict=True):
                 if value is not None:
-                    assert generation not in found, "a generation is recorded twice"
-                    found[generation] = value
-    return found
+                    assert generation not in by_generation, "a generation is recorded twice"
+                    by_generation[generation] = value
+    return by_generation
 
 
 def texts(path: Path, entity: str) -> list[str]:
     """Every text of an entity, in order."""
-    found: list[str] = []
+    out: list[str] = []
     for batch in read(path)[entity]:
         (name,) = [n for n in batch.schema.names if n.endswith(":text")]
-        found += [text for row in batch.column(name).to_pylist() for text in row or []]
-    return found
+        out += [text for row in batch.column(name).to_pylist() for text in row or []]
+    return out
 
 
 def generations(path: Path) -> list[int]:
@@ -48,12 +48,12 @@ def generations(path: Path) -> list[int]:
 
 def content(path: Path) -> dict[tuple[Any, ...], list[Any]]:
     """Every value of a recording but the time of day, by entity, column, generation and time in the simulation."""
-    found: dict[tuple[Any, ...], list[Any]] = defaultdict(list)
+    values: dict[tuple[Any, ...], list[Any]] = defaultdict(list)
     for entity, batches in read(path).items():
         for batch in (b for b in batches if "generation" in b.schema.names):
             at = [batch.column(name).cast("int64").to_pylist() for name in _TIMES[:2]]
             for name in (n for n in batch.schema.names if n not in _TIMES and "RowId" not in n):
                 for generation, time, value in zip(*at, batch.column(name).to_pylist(), strict=True):
                     if value is not None:
-                        found[entity, name, generation, time].append(value)
-    return found
+                        values[entity, name, generation, time].append(value)
+    return values

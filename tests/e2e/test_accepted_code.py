@@ -65,7 +65,7 @@ def learner(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> A
     return farm.start("learner", *words, *FEW, *flags)
 
 
-def ended(process: Any) -> str:
+def output_of(process: Any) -> str:
     process.terminate()
     return process.communicate(timeout=20)[0]
 
@@ -81,17 +81,17 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
         process = learner(farm, router, certs, f"r{i}", "--json")
         for line in process.stdout:
             if '"event": "run"' in line:
-                begun = time.monotonic()
+                start = time.monotonic()
             if '"event": "generation"' in line:
-                took.append(time.monotonic() - begun)
+                took.append(time.monotonic() - start)
                 break
         process.communicate(timeout=60)
         assert process.returncode == 0
     assert max(took) < 2.0, "from the run's announcement to a whole generation [s]"
-    said = "".join(map(ended, workers))
+    output = "".join(map(output_of, workers))
     for i, text in enumerate(texts):
-        sent = hashlib.sha256(text.encode()).hexdigest()
-        assert f"run r{i}: received pole.py (SHA-256 {sent}) from its learner" in said
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        assert f"run r{i}: received pole.py (SHA-256 {digest}) from its learner" in output
     assert len({farm.summary(f"r{i}")["mean_policy_return"] for i in range(3)}) == 3, "each is another task"
     farm.call("run", "--task", "pole.py:Pole", "--name", "here", *FEW)
     assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
@@ -110,15 +110,15 @@ def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(farm: Farm, c
     try:
         farm.call("learner", *words, *flags, "--name", "there")
     finally:
-        said = ended(worker)
-    assert "run there: received reach.py" in said
+        output = output_of(worker)
+    assert "run there: received reach.py" in output
     assert not list(empty.iterdir())
     farm.call("run", *flags, "--name", "here")
-    there = farm.summary("there")
-    assert there["parameters_sha256"] == farm.summary("here")["parameters_sha256"]
+    summary = farm.summary("there")
+    assert summary["parameters_sha256"] == farm.summary("here")["parameters_sha256"]
     shutil.rmtree(farm.folder / "robot")
     run = farm.folder / "runs/there"
-    assert load(run).rollout().trajectory.value == there["mean_policy_return"]
+    assert load(run).rollout().trajectory.value == summary["mean_policy_return"]
     for line in farm.progress("there"):
         assert rewind(run, line["generation"]).returns.max() == line["return_max"]
 
@@ -140,13 +140,13 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
             task.write_text(text)
             words = ("--task", "pole.py:Pole", "--name", name, "--generations", "20", "--pairs", "20", "--no-record")
             process = farm.start("learner", *join, "certs/learner", *words, host=network.hosts[0])
-            said, _ = process.communicate(timeout=60)
-            assert process.returncode == 0, said
+            output, _ = process.communicate(timeout=60)
+            assert process.returncode == 0, output
         for worker in workers:
-            said = ended(worker)
+            output = output_of(worker)
             for name in ("first", "second"):
-                assert f"run {name}: received pole.py" in said
-                assert f"serving run {name}" in said
+                assert f"run {name}: received pole.py" in output
+                assert f"serving run {name}" in output
 
 
 def test_a_worker_without_accept_code_says_which_flag(farm: Farm, certs: Path, router: str, task: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_worker_without_accept_code_says_which_flag(farm: Farm, certs: Path, r
     hire(farm, router, certs, "w2", "--accept-code")
     process.communicate(timeout=60)
     assert process.returncode == 0, "others serve it"
-    assert words in ended(plain)
+    assert words in output_of(plain)
 
 
 def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
@@ -166,16 +166,16 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
     worker = hire(farm, router, certs, "w1", "--accept-code")
     task.write_text("import os\ndef look():\n    os.environ['PYTEST_CURRENT_TEST']\nlook()\n" + made.POLE)
     process = learner(farm, router, certs, "broken")
-    said = []
+    lines = []
     for line in process.stdout:
-        said.append(line.rstrip())
+        lines.append(line.rstrip())
         if "KeyError" in line and "cannot be imported" not in line:
             break
-    [first] = [i for i, line in enumerate(said) if "does not serve this run" in line]
-    assert "pole.py cannot be imported: line 3: KeyError: 'PYTEST_CURRENT_TEST'" in said[first]
-    assert '  File "pole.py", line 4, in <module>' in said[first + 1]
-    assert '  File "pole.py", line 3, in look' in "\n".join(said[first:])
-    ended(process)
+    [first] = [i for i, line in enumerate(lines) if "does not serve this run" in line]
+    assert "pole.py cannot be imported: line 3: KeyError: 'PYTEST_CURRENT_TEST'" in lines[first]
+    assert '  File "pole.py", line 4, in <module>' in lines[first + 1]
+    assert '  File "pole.py", line 3, in look' in "\n".join(lines[first:])
+    output_of(process)
     task.write_text(made.POLE)
     repaired = learner(farm, router, certs, "repaired")
     repaired.communicate(timeout=60)
@@ -196,22 +196,22 @@ def test_a_worker_that_lacks_a_file_ends_nothing_and_a_good_one_learns(
     assert "worker w1/" in refused
     assert "limits.txt" in refused
     good = hire(farm, router, certs, "w2", "--allow-file", "pole.py")
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == 0, said
-    assert "failed wherever" not in said
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, output
+    assert "failed wherever" not in output
     assert farm.summary("r")["state"] == "finished"
-    assert "cannot serve run r" in ended(bad)
-    assert "cannot serve" not in ended(good)
+    assert "cannot serve run r" in output_of(bad)
+    assert "cannot serve" not in output_of(good)
 
 
 def test_what_is_refused_at_the_start(farm: Farm, certs: Path, task: Path) -> None:
-    said = farm.call("worker", "--accept-code", "--processes", "1", status=2)
-    assert said == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
+    output = farm.call("worker", "--accept-code", "--processes", "1", status=2)
+    assert output == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
     task.write_text(made.POLE + "#" * 1_000_000)
     tls = ("--listen", free_endpoint().replace("tcp/", "tls/"), "--tls", str(certs / "own"))
-    said = farm.call("learner", "--task", "pole.py:Pole", "--name", "large", *FEW, *tls, status=2)
-    assert "a class's file travels to workers and has at most 1000000" in said
-    assert len(said.splitlines()) == 1
+    output = farm.call("learner", "--task", "pole.py:Pole", "--name", "large", *FEW, *tls, status=2)
+    assert "a class's file travels to workers and has at most 1000000" in output
+    assert len(output.splitlines()) == 1
     assert not (farm.folder / "runs").exists()
 
 
@@ -226,11 +226,11 @@ def pose(opened: Session, worker: str, run: str) -> None:
         run=run, incarnation="i", round=1, generation=0, spec=hashlib.sha256(spec).hexdigest(), traces="none",
         mu=np.zeros(2),
     )  # fmt: skip
-    for key, said in (
+    for key, payload in (
         (keys.spec("farm", run), spec), (keys.generation("farm", run), codec.encode(header)),
         (keys.code("farm", run, digest), EVIL), ("farm/**", EVIL),
     ):  # fmt: skip
-        opened.answer(key, lambda said=said: said)
+        opened.answer(key, lambda payload=payload: payload)
     opened.token(keys.learner_token("farm", run))
     opened.publish(keys.generation("farm", run), codec.encode(header))
     opened.publish(keys.inbox("farm", worker), b"")
@@ -243,13 +243,13 @@ def holding(endpoint: str, bundle: Bundle) -> Iterator[Session]:
 
 
 def test_a_workers_or_a_viewers_certificate_sends_no_code(farm: Farm, certs: Path, router: str, task: Path) -> None:
-    own = certs / "own"
+    folder = certs / "own"
     evil, honest = hashlib.sha256(EVIL).hexdigest(), hashlib.sha256(task.read_bytes()).hexdigest()
     with (
-        holding(router, find(own, "worker", "w2")) as w2,
-        holding(router, find(own, "viewer", "eva")) as eva,
-        holding(router, find(own, "viewer", "eva")) as looking,
-        holding(router, find(own, "learner")) as witness,
+        holding(router, find(folder, "worker", "w2")) as w2,
+        holding(router, find(folder, "viewer", "eva")) as eva,
+        holding(router, find(folder, "viewer", "eva")) as looking,
+        holding(router, find(folder, "learner")) as witness,
     ):
         for liar, run in ((w2, "fake"), (eva, "false")):
             pose(liar, "w1/1", run)
@@ -263,9 +263,9 @@ def test_a_workers_or_a_viewers_certificate_sends_no_code(farm: Farm, certs: Pat
             assert not witness.present(keys.learner_token("farm", run), 0.5)
             assert witness.ask(keys.code("farm", run, evil), 0.5) is None
     assert process.returncode == 0
-    said = ended(worker)
-    assert "pole.py" in said
-    assert not {"evil", "fake", "false"} & set(said.replace(":", " ").split())
+    output = output_of(worker)
+    assert "pole.py" in output
+    assert not {"evil", "fake", "false"} & set(output.replace(":", " ").split())
 
 
 class Posing(Bundle):
@@ -291,5 +291,5 @@ def test_a_foreign_learner_does_not_reach_the_router(farm: Farm, certs: Path, ro
     words = ("--connect", router, "--tls", str(certs / "foreign"), "--task", "pole.py:Pole", "--name", "foreign", *FEW)
     foreign = farm.start("learner", *words)
     assert any("its certificate is of another authority" in line for line in foreign.stdout)
-    ended(foreign)
-    assert "foreign" not in ended(worker)
+    output_of(foreign)
+    assert "foreign" not in output_of(worker)

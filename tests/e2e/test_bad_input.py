@@ -109,15 +109,15 @@ def test_mistakes(
     """In this process: separate programs would take as long as all other tests together."""
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
-    said = "".join(capfd.readouterr())
-    assert line.lower() in said.lower()
-    assert len(said.strip().splitlines()) == 1
+    output = "".join(capfd.readouterr())
+    assert line.lower() in output.lower()
+    assert len(output.strip().splitlines()) == 1
     assert not (tmp_path / "runs").exists()
 
 
 def test_a_mistake_of_a_program(farm: Farm) -> None:
-    said = farm.call("run", "--seed", "-1", status=2, timeout=60)
-    assert said == "farm: seed is -1; expected 0 to 4294967295\n"
+    output = farm.call("run", "--seed", "-1", status=2, timeout=60)
+    assert output == "farm: seed is -1; expected 0 to 4294967295\n"
 
 
 SHELL = [
@@ -140,10 +140,10 @@ SHELL = [
 @pytest.mark.parametrize(("line", "status", "words"), SHELL, ids=[line for line, _, _ in SHELL])
 def test_a_place_where_little_is_possible(line: str, status: int, words: str, farm: Farm) -> None:
     process = farm.start_program("bash", "-c", line.format(farm=f"{sys.executable} -P -m farm"))
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == status, said
-    assert len(said.splitlines()) == bool(words), said
-    assert re.search(words, said), said
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == status, output
+    assert len(output.splitlines()) == bool(words), output
+    assert re.search(words, output), output
     assert not (farm.folder / "runs").exists()
 
 
@@ -169,57 +169,57 @@ def test_ended_among_imports(module: str, number: int, farm: Farm) -> None:
     """Send the signal when this module is being imported; the command itself imports the last one."""
     code = INTERRUPTED.replace("MODULE", repr(module)).replace("NUMBER", str(int(number)))
     process = farm.start_python("-P", "-c", code, "tasks")
-    said, _ = process.communicate(timeout=60)
-    assert (said, process.returncode) in [("", -number), ("farm: stopped before the end\n", 130)]
+    output, _ = process.communicate(timeout=60)
+    assert (output, process.returncode) in [("", -number), ("farm: stopped before the end\n", 130)]
 
 
 @pytest.mark.slow
 def test_a_port_in_use(farm: Farm) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        said = farm.call("learner", "--listen", endpoint, *SMALL, status=2)
-    assert f"cannot listen on {endpoint}" in said
-    assert "Traceback" not in said
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        output = farm.call("learner", "--listen", endpoint, *SMALL, status=2)
+    assert f"cannot listen on {endpoint}" in output
+    assert "Traceback" not in output
     assert not (farm.folder / "runs").exists()
 
 
 @pytest.mark.slow
 def test_no_answer(farm: Farm) -> None:
     endpoint = free_endpoint()
-    said = farm.call("worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1)
-    assert f"no answer from {endpoint} yet, trying again" in said
-    assert f"no answer from {endpoint} after 4 s: nothing listens on port" in said
-    assert "start a learner there, or check --connect" in said
-    assert "Traceback" not in said
+    output = farm.call("worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1)
+    assert f"no answer from {endpoint} yet, trying again" in output
+    assert f"no answer from {endpoint} after 4 s: nothing listens on port" in output
+    assert "start a learner there, or check --connect" in output
+    assert "Traceback" not in output
 
 
 @pytest.mark.slow
 def test_run_folders_and_checkpoints(farm: Farm) -> None:
     farm.call("run", "--name", "r", "--generations", "2", *SMALL)
     runs = farm.folder / "runs"
-    kept = (runs / "r" / "checkpoint").read_bytes()
+    checkpoint = (runs / "r" / "checkpoint").read_bytes()
 
     assert "exists and is never overwritten" in farm.call("run", "--name", "r", *SMALL, status=2)
     assert "--seed is 0 in the run and 4 here" in farm.call("run", "--resume", "runs/r", "--seed", "4", status=2)
     assert "the run has already done 2" in farm.call("run", "--resume", "runs/r", "--generations", "1", status=2)
-    said = farm.call("run", "--init-from", "runs/r", "--policy", "cosine", "--features", "9", status=2)
-    assert "its parameters mean something else" in said
+    output = farm.call("run", "--init-from", "runs/r", "--policy", "cosine", "--features", "9", status=2)
+    assert "its parameters mean something else" in output
 
     def refused(content: bytes, expected: str) -> None:
         shutil.rmtree(runs / "broken", ignore_errors=True)
         shutil.copytree(runs / "r", runs / "broken")
         (runs / "broken" / "checkpoint").write_bytes(content)
         for words in (("run", "--resume", "runs/broken", "--generations", "5"), ("evaluate", "runs/broken")):
-            said = farm.call(*words, status=2)
-            assert expected in said
-            assert len(said.strip().splitlines()) == 1
+            output = farm.call(*words, status=2)
+            assert expected in output
+            assert len(output.strip().splitlines()) == 1
 
-    refused(kept[:-10], "is truncated or damaged")
+    refused(checkpoint[:-10], "is truncated or damaged")
     refused(b"", "is not a checkpoint")
-    refused(kept.replace(b"checkpoint 2", b"checkpoint 9"), "is a checkpoint of another version")
-    assert (runs / "r" / "checkpoint").read_bytes() == kept
+    refused(checkpoint.replace(b"checkpoint 2", b"checkpoint 9"), "is a checkpoint of another version")
+    assert (runs / "r" / "checkpoint").read_bytes() == checkpoint
 
     config = json.loads((runs / "r" / "config.json").read_text())
     (farm.folder / "c.json").write_text(json.dumps({**config, "version": 99}))
@@ -236,8 +236,8 @@ def test_a_checkpoint_of_another_configuration(farm: Farm) -> None:
     farm.call("run", "--name", "b", "--generations", "1", "--seed", "3", *SMALL)
     runs = farm.folder / "runs"
     shutil.copy(runs / "a" / "checkpoint", runs / "b" / "checkpoint")
-    said = farm.call("run", "--resume", "runs/b", "--generations", "2", status=2)
-    assert "is of another configuration: --seed is 0 there and 3 in config.json" in said
+    output = farm.call("run", "--resume", "runs/b", "--generations", "2", status=2)
+    assert "is of another configuration: --seed is 0 there and 3 in config.json" in output
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ pytestmark = pytest.mark.slow
 def test_a_run_that_starts_from_another(farm: Farm) -> None:
     flags = ("--policy", "projected", "--features", "40", *SMALL)
     farm.call("run", "--name", "a", "--generations", "3", *flags)
-    begin = ("--generations", "0", "--init-from", "runs/a", "--init-sigma")
-    farm.call("run", "--name", "b", *begin, "run", *flags)
-    farm.call("run", "--name", "fresh", *begin, "fresh", *flags)
+    words = ("--generations", "0", "--init-from", "runs/a", "--init-sigma")
+    farm.call("run", "--name", "b", *words, "run", *flags)
+    farm.call("run", "--name", "fresh", *words, "fresh", *flags)
     farm.call("run", "--name", "c", "--generations", "1", "--seed", "7", "--init-from", "runs/a", *flags)
     names = ("a", "b", "fresh", "c")
     a, b, fresh, c = (checkpoints.load(RunFolder(farm.folder / "runs" / name).checkpoint) for name in names)
@@ -32,8 +32,8 @@ def test_a_run_that_starts_from_another(farm: Farm) -> None:
 
 def test_runs_that_begin_together_have_folders_of_their_own(farm: Farm) -> None:
     processes = [farm.start("run", "--generations", "1", *SMALL) for _ in range(3)]
-    said = [process.communicate(timeout=100)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0] * 3, said
+    outputs = [process.communicate(timeout=100)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0] * 3, outputs
     assert len(list((farm.folder / "runs").iterdir())) == 3
 
 
@@ -51,15 +51,15 @@ def test_a_run_that_is_begun_once_and_gone_on_with_later(farm: Farm) -> None:
     farm.call("run", "--name", "whole", "--generations", "6", *SMALL)
     once = ("run", "--name", "r", "--resume-existing", *SMALL)
     farm.call(*once, "--generations", "2")
-    said = farm.call(*once, "--generations", "6")
-    assert "continuing after generation 2" in said
+    output = farm.call(*once, "--generations", "6")
+    assert "continuing after generation 2" in output
     farm.call(*once, "--generations", "6")  # over already: evaluated again, nothing else
     assert len(farm.progress("r")) == 6
     assert farm.summary("r")["parameters_sha256"] == farm.summary("whole")["parameters_sha256"]
-    said = farm.call(*once, "--generations", "6", "--seed", "1", status=2)
-    assert "a resumed run keeps its settings: --seed is 0 in the run and 1 here" in said
-    said = farm.call("run", "--resume-existing", *SMALL, status=2)
-    assert "--resume-existing needs --name" in said
+    output = farm.call(*once, "--generations", "6", "--seed", "1", status=2)
+    assert "a resumed run keeps its settings: --seed is 0 in the run and 1 here" in output
+    output = farm.call("run", "--resume-existing", *SMALL, status=2)
+    assert "--resume-existing needs --name" in output
 
 
 @pytest.mark.parametrize(
@@ -83,8 +83,8 @@ def test_a_run_that_does_not_learn_says_so(farm: Farm, reward: str, flags: tuple
         text + "\n    def ended(self, sim):\n        return np.full(len(sim), True)\n" if ends else text
     )
     words = [word for word in flags if word != "--task-ends"]
-    said = farm.call("run", "--task", "pole.py:Pole", "--policy", "constant", "--name", "r", *words, *SMALL)
-    assert said.count(why) == 1
+    output = farm.call("run", "--task", "pole.py:Pole", "--policy", "constant", "--name", "r", *words, *SMALL)
+    assert output.count(why) == 1
     assert (farm.folder / "runs/r/log.txt").read_text().count(why) == 1
-    said = farm.call("run", "--resume", "runs/r", "--generations", "130", "--no-record")
-    assert why not in said, "once is enough"
+    output = farm.call("run", "--resume", "runs/r", "--generations", "130", "--no-record")
+    assert why not in output, "once is enough"

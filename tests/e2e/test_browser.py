@@ -34,17 +34,17 @@ def test_the_page_draws_the_hand(tmp_path: Path) -> None:
         process = farm.start("view", "runs/r", "--web")
         assert process.stdout
         line = process.stdout.readline()
-        found = re.fullmatch(r"open (http://127\.0\.0\.1:\d+/\?url=\S+)   \(from elsewhere: ssh -L .* first\)\n", line)
-        assert found, line
+        match = re.fullmatch(r"open (http://127\.0\.0\.1:\d+/\?url=\S+)   \(from elsewhere: ssh -L .* first\)\n", line)
+        assert match, line
         with Browser(tmp_path / "profile") as browser:
-            browser.open(found[1])
+            browser.open(match[1])
             farm.wait_for(lambda: _orange(browser.picture()) > 0.005, seconds=300)
             assert browser.errors == [], browser.errors
-            if wanted := os.environ.get("FARM_PICTURE"):
-                Path(wanted).write_bytes(browser.picture())
+            if picture := os.environ.get("FARM_PICTURE"):
+                Path(picture).write_bytes(browser.picture())
         process.terminate()
-        said, _ = process.communicate(timeout=20)
-        assert "http" not in said, "one line says where"
+        output, _ = process.communicate(timeout=20)
+        assert "http" not in output, "one line says where"
     finally:
         farm.close()
 

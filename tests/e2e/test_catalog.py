@@ -20,16 +20,16 @@ def test_each_recorded_run_is_a_segment_of_the_folders_data_set(farm: Farm) -> N
     farm.call("run", "--name", "c", "--no-record", "--workers", "1", "--pairs", "2", "--generations", "1")
     process = farm.start("runs", "--serve", free_endpoint().rpartition(":")[2])
     assert process.stdout
-    said = process.stdout.readline()
-    assert said.startswith("2 recordings at rerun+http://127.0.0.1:")
-    address = said.split()[3].rstrip(":")
+    announcement = process.stdout.readline()
+    assert announcement.startswith("2 recordings at rerun+http://127.0.0.1:")
+    address = announcement.split()[3].rstrip(":")
     (runs,) = [each for each in catalog.CatalogClient(address).datasets() if each.name == "runs"]
     assert sorted(runs.segment_ids()) == ["a", "b"]
     rows = runs.filter_contents(["/learning/return"]).reader(index="generation").to_pandas()
     for name in ("a", "b"):
-        found = rows[rows["rerun_segment_id"] == name].sort_values("generation")["/learning/return:Scalars:scalars"]
-        wanted = [line["return_mean"] for line in farm.progress(name)]
-        np.testing.assert_allclose([value[0] for value in found.dropna()], wanted, rtol=1e-6)
+        returns = rows[rows["rerun_segment_id"] == name].sort_values("generation")["/learning/return:Scalars:scalars"]
+        expected = [line["return_mean"] for line in farm.progress(name)]
+        np.testing.assert_allclose([value[0] for value in returns.dropna()], expected, rtol=1e-6)
     process.send_signal(signal.SIGINT)
     assert process.wait(20) == 130
 
@@ -40,6 +40,6 @@ def test_a_port_in_use_is_one_line(farm: Farm) -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        said = farm.call("runs", "--serve", str(port), status=2)
-    assert "take another port" in said
-    assert said.count("\n") == 1
+        output = farm.call("runs", "--serve", str(port), status=2)
+    assert "take another port" in output
+    assert output.count("\n") == 1

@@ -17,18 +17,18 @@ def test_four_gaits_go_round(farm: Farm) -> None:
         farm.call("run", "--preset", gait, "--name", gait, *flags)
         assert farm.summary(gait)["robust_success_rate"] >= 0.95
     runs = [f"runs/{gait}" for gait in GAITS]
-    found = json.loads(farm.call("chain", *runs, "--starts", "5", "--steps", "100", "--json"))
-    assert (found["starts"], found["steps"]) == (5, 100)
-    assert found["cycles_at_least"]["1"] == 1.0
-    assert found["changes_min"] >= 4
+    results = json.loads(farm.call("chain", *runs, "--starts", "5", "--steps", "100", "--json"))
+    assert (results["starts"], results["steps"]) == (5, 100)
+    assert results["cycles_at_least"]["1"] == 1.0
+    assert results["changes_min"] >= 4
     again = json.loads(farm.call("chain", *runs, "--starts", "5", "--steps", "100", "--json"))
-    assert again == found
-    said = farm.call("chain", *runs, "--starts", "2", "--steps", "30", "--shown", "20", "--video", "film.gif")
-    assert "4 policies in turn, 2 perturbed starts" in " ".join(said.split())
-    assert "written to chain.rrd" in said
+    assert again == results
+    output = farm.call("chain", *runs, "--starts", "2", "--steps", "30", "--shown", "20", "--video", "film.gif")
+    assert "4 policies in turn, 2 perturbed starts" in " ".join(output.split())
+    assert "written to chain.rrd" in output
     assert (farm.folder / "film.gif").stat().st_size > 10_000
-    shown = read(farm.folder / "chain.rrd")
-    assert any("tactile" in str(entity) for entity in shown), "what was felt is in the recording"
+    entities = read(farm.folder / "chain.rrd")
+    assert any("tactile" in str(entity) for entity in entities), "what was felt is in the recording"
 
 
 def test_gaits_that_do_not_fit_are_named(farm: Farm) -> None:
@@ -36,8 +36,8 @@ def test_gaits_that_do_not_fit_are_named(farm: Farm) -> None:
     farm.call("run", "--preset", "middle-on", "--name", "a", *flags)
     farm.call("run", "--preset", "index-on", "--name", "b", *flags)
     farm.call("run", "--preset", "middle-off", "--pose", "opposed", "--name", "c", *flags)
-    said = farm.call("chain", "runs/a", "runs/b", status=2)
-    assert "a policy that ends in index+middle+thumb is not followed by one from middle+thumb: give runs of" in said
-    assert len(said.splitlines()) == 1
-    said = farm.call("chain", "runs/a", "runs/c", status=2)
-    assert "simulate different models: learn both on the same one" in " ".join(said.split())
+    output = farm.call("chain", "runs/a", "runs/b", status=2)
+    assert "a policy that ends in index+middle+thumb is not followed by one from middle+thumb: give runs of" in output
+    assert len(output.splitlines()) == 1
+    output = farm.call("chain", "runs/a", "runs/c", status=2)
+    assert "simulate different models: learn both on the same one" in " ".join(output.split())

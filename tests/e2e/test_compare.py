@@ -16,8 +16,8 @@ pytestmark = pytest.mark.usefixtures("grips_found_once")
 
 
 def test_a_comparison_holds_each_runs_numbers(done: Farm, say: Say) -> None:
-    said = say("compare", "runs/a", "runs/b", "--to", "c.rrd")
-    assert "written to c.rrd; look at it with: farm view c.rrd" in said
+    output = say("compare", "runs/a", "runs/b", "--to", "c.rrd")
+    assert "written to c.rrd; look at it with: farm view c.rrd" in output
     path = done.folder / "c.rrd"
     (recording,) = RrdReader(path).recordings()
     assert (recording.application_id, recording.recording_id) == ("rolloutfarm comparison", "comparison")
@@ -51,18 +51,18 @@ def test_a_summary_that_is_not_there_yet(done: Farm, tmp_path: Path) -> None:
 
 
 def test_a_recording_has_its_runs_properties(done: Farm) -> None:
-    found = {}
+    values = {}
     for entity, batches in read(folder(done).recording).items():
         if entity.startswith("/__properties/"):
             for batch in batches:
                 for name in batch.schema.names:
-                    found[f"{entity.rpartition('/')[2]} {name.rpartition(':')[2]}"] = batch.column(name).to_pylist()[0]
+                    values[f"{entity.rpartition('/')[2]} {name.rpartition(':')[2]}"] = batch.column(name).to_pylist()[0]
     summary = done.summary("a")
-    assert found["run seed"] == [0]
-    assert found["run policy"] == ["kernel"]
-    assert found["run preset"] == ["own"]
-    assert found["result return"] == [summary["mean_policy_return"]]
-    assert found["result success"] == [summary["mean_policy_success"]]
+    assert values["run seed"] == [0]
+    assert values["run policy"] == ["kernel"]
+    assert values["run preset"] == ["own"]
+    assert values["result return"] == [summary["mean_policy_return"]]
+    assert values["result success"] == [summary["mean_policy_success"]]
 
 
 @pytest.mark.slow
@@ -82,21 +82,21 @@ def test_several_recordings_are_a_table_in_the_viewer(done: Farm, tmp_path: Path
     with (tmp_path / "viewer.log").open("w+") as log:
         viewer = subprocess.Popen(command, env={**os.environ, **home}, stdout=log, stderr=log)
         try:
-            shown = once_loaded(port, lambda: viewer.poll() is not None, show_table)
+            success = once_loaded(port, lambda: viewer.poll() is not None, show_table)
             if viewer.poll() is not None:
                 log.seek(0)
                 pytest.skip(f"the viewer needs Vulkan (Debian: mesa-vulkan-drivers libvulkan1): {log.read()[-200:]}")
-            assert shown
+            assert success
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             columns: set[str] = set()
 
-            def drawn() -> bool:
+            def draws() -> bool:
                 client.take_screenshot()  # a viewer without a window draws when it is asked
                 with contextlib.suppress(ConnectionError):  # not drawn yet
                     columns.update(column.name for column in client.get_table_schema())
                 return bool(columns)
 
-            done.wait_for(drawn)
+            done.wait_for(draws)
         finally:
             viewer.terminate()
             viewer.wait(20)

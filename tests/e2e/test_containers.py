@@ -73,8 +73,8 @@ class Stack:
         return self.compose("ps", "--all", "--quiet", service).split()
 
     def container(self, service: str) -> str:
-        (found,) = self.containers(service)
-        return found
+        (name,) = self.containers(service)
+        return name
 
     def read(self, name: str, folder: Path) -> str:
         """A file of the run; empty if it does not exist yet."""
@@ -130,8 +130,8 @@ def stack(images: Stack) -> Iterator[Stack]:
 
 def outside(farm: Farm, **settings: str) -> str:
     """The hash of the same run without containers."""
-    given = [name for name in ("TASK", "SEED", "GENERATIONS", "PAIRS") if name in settings]
-    flags = [word for name in given for word in (f"--{name.lower()}", settings[name])]
+    variables = [name for name in ("TASK", "SEED", "GENERATIONS", "PAIRS") if name in settings]
+    flags = [word for name in variables for word in (f"--{name.lower()}", settings[name])]
     farm.call("run", "--name", settings["RUN"], "--no-record", *flags, timeout=300)
     return str(farm.summary(settings["RUN"])["parameters_sha256"])
 

@@ -55,7 +55,7 @@ def run(farm: Farm) -> Farm:
     return farm
 
 
-def begin(farm: Farm, out: str, *words: str) -> tuple[str, ...]:
+def words_of(farm: Farm, out: str, *words: str) -> tuple[str, ...]:
     return ("dataset", "runs/r", "--episodes", str(EPISODES), "--out", out, *words)
 
 
@@ -69,59 +69,61 @@ def parts(folder: Path) -> int:
 
 
 def test_killed_workers_and_learners_change_no_byte(run: Farm) -> None:
-    assert f"{EPISODES} episodes in a" in run.call(*begin(run, "a", "--workers", "2"))
+    assert f"{EPISODES} episodes in a" in run.call(*words_of(run, "a", "--workers", "2"))
     whole = files(run.folder / "a")
     assert len([name for name in whole if name.startswith("data/")]) == 6
-    making = run.start(*begin(run, "b", "--workers", "2"))
+    making = run.start(*words_of(run, "b", "--workers", "2"))
     run.wait_for(lambda: parts(run.folder / "b") >= 1)
     os.kill(children(making.pid)[0], signal.SIGKILL)
     run.wait_for(lambda: parts(run.folder / "b") >= 2)
     making.kill()
     making.wait()
     assert "files" not in run.json("b/manifest.json")
-    making = run.start(*begin(run, "b", "--workers", "1"))
+    making = run.start(*words_of(run, "b", "--workers", "1"))
     run.wait_for(lambda: parts(run.folder / "b") >= 3)
     making.send_signal(signal.SIGINT)
-    said, _ = making.communicate(timeout=60)
-    assert (making.returncode, "the same command continues" in said) == (130, True)
-    run.call(*begin(run, "b", "--workers", "3"))
+    output, _ = making.communicate(timeout=60)
+    assert (making.returncode, "the same command continues" in output) == (130, True)
+    run.call(*words_of(run, "b", "--workers", "3"))
     assert files(run.folder / "b") == whole
-    assert "is complete" in run.call(*begin(run, "b"))
+    assert "is complete" in run.call(*words_of(run, "b"))
     (run.folder / "runs").rename(run.folder / "elsewhere")  # the manifest's folder has what is needed
-    said = run.call("dataset", "--from", "a/manifest.json", "--out", "c", "--workers", "1")
-    assert "the same bytes as a/manifest.json says" in said
+    output = run.call("dataset", "--from", "a/manifest.json", "--out", "c", "--workers", "1")
+    assert "the same bytes as a/manifest.json says" in output
     assert files(run.folder / "c") == whole
 
 
 def test_the_rows_are_those_of_the_policys_rollouts(run: Farm) -> None:
-    run.call(*begin(run, "a", "--workers", "2"))
+    run.call(*words_of(run, "a", "--workers", "2"))
     policy = package.load(run.folder / "runs/r")
     starts = [seeds.trial(1, i) for i in range(EPISODES)]
     rollouts = policy.runner.rollouts(np.repeat(policy.mu[None], EPISODES, axis=0), starts)
     data, about = run.folder / "a/data/chunk-000", run.folder / "a/meta/episodes/chunk-000"
     info, first = run.json("a/meta/info.json"), 0
     for path in sorted(data.iterdir()):
-        told = parquet.read(about / path.name, ["episode_index", "length", "return", "success", "dataset_from_index"])
+        episodes = parquet.read(
+            about / path.name, ["episode_index", "length", "return", "success", "dataset_from_index"]
+        )
         rows = parquet.read(path, list(info["features"]))
-        for at, episode in enumerate(told["episode_index"]):
+        for at, episode in enumerate(episodes["episode_index"]):
             steps = int(rollouts.steps[episode])
-            assert (told["length"][at], told["dataset_from_index"][at]) == (steps, first)
-            assert told["return"][at] == rollouts.returns[episode]
-            assert told["success"][at] == rollouts.success[episode]
-            begun = told["dataset_from_index"][at] - told["dataset_from_index"][0]
-            own = {name: np.array(values[begun : begun + steps]) for name, values in rows.items()}
+            assert (episodes["length"][at], episodes["dataset_from_index"][at]) == (steps, first)
+            assert episodes["return"][at] == rollouts.returns[episode]
+            assert episodes["success"][at] == rollouts.success[episode]
+            row = episodes["dataset_from_index"][at] - episodes["dataset_from_index"][0]
+            columns = {name: np.array(values[row : row + steps]) for name, values in rows.items()}
             start, qpos = rollouts.start["qpos"][episode], rollouts.frames["qpos"][episode, :steps]
             before = np.concatenate([start[None], qpos[:-1]])
-            np.testing.assert_array_equal(own["observation.state"][:, 0], before[:, 0].astype("<f4"))
-            np.testing.assert_array_equal(own["action"], rollouts.actions[episode, :steps, 0].astype("<f4"))
+            np.testing.assert_array_equal(columns["observation.state"][:, 0], before[:, 0].astype("<f4"))
+            np.testing.assert_array_equal(columns["action"], rollouts.actions[episode, :steps, 0].astype("<f4"))
             terms = rollouts.terms[episode, :steps].astype("<f4")
-            np.testing.assert_array_equal(own["next.reward_terms"], terms)
-            np.testing.assert_array_equal(own["next.reward"], terms.sum(axis=1, dtype=float).astype("<f4"))
-            assert own["next.seen"].shape == (steps, 1, 2, 3)
-            np.testing.assert_array_equal(own["next.seen"][:, 0, 1, 2], qpos[:, 0].astype("<f4"))
-            assert own["next.wide.lot"].shape == (steps, 900)
-            assert own["next.done"].tolist() == [False] * (steps - 1) + [True]
-            assert own["index"].tolist() == list(range(first, first + steps))
+            np.testing.assert_array_equal(columns["next.reward_terms"], terms)
+            np.testing.assert_array_equal(columns["next.reward"], terms.sum(axis=1, dtype=float).astype("<f4"))
+            assert columns["next.seen"].shape == (steps, 1, 2, 3)
+            np.testing.assert_array_equal(columns["next.seen"][:, 0, 1, 2], qpos[:, 0].astype("<f4"))
+            assert columns["next.wide.lot"].shape == (steps, 900)
+            assert columns["next.done"].tolist() == [False] * (steps - 1) + [True]
+            assert columns["index"].tolist() == list(range(first, first + steps))
             first += steps
     assert info["total_frames"] == first == rollouts.steps.sum()
     assert (rollouts.steps < 400).any()
@@ -133,10 +135,12 @@ def test_what_differs_from_a_manifest_is_said(run: Farm) -> None:
     altered = run.json("a/manifest.json") | {"numbers_sha256": "0" * 64}
     altered["files"]["data/chunk-000/file-000.parquet"] = "0" * 64
     (run.folder / "a/manifest.json").write_text(json.dumps(altered))
-    said = run.call("dataset", "--from", "a/manifest.json", "--out", "b", "--workers", "1", status=1)
-    assert "b differs from a/manifest.json: data/chunk-000/file-000.parquet and 0 more files have other numbers" in said
+    output = run.call("dataset", "--from", "a/manifest.json", "--out", "b", "--workers", "1", status=1)
+    assert (
+        "b differs from a/manifest.json: data/chunk-000/file-000.parquet and 0 more files have other numbers" in output
+    )
     assert "expected the folder of a run, or --from" in run.call("dataset", "--out", "c", status=2)
     (run.folder / "full").mkdir()
     (run.folder / "full/mine.txt").write_text("")
-    said = run.call("dataset", "runs/r", "--episodes", "3", "--out", "full", status=2)
-    assert "full is not empty, and has no manifest.json" in said
+    output = run.call("dataset", "runs/r", "--episodes", "3", "--out", "full", status=2)
+    assert "full is not empty, and has no manifest.json" in output

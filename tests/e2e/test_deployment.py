@@ -33,7 +33,7 @@ def place(farm: Farm) -> Place:
     """A free endpoint, and a function that replaces the files' addresses and folders by those of this test."""
     endpoint, certs = free_endpoint().replace("tcp", "tls"), farm.folder / "certs"
     certificates.main(["new", str(certs), "--learner", "127.0.0.1", "--worker", "w", "--viewer", "v"])
-    there = {
+    paths = {
         "/opt/rolloutfarm/bin/farm": "farm",
         "${FARM_ROUTER}": endpoint,
         "tls/farm-router:7447": endpoint,
@@ -44,7 +44,7 @@ def place(farm: Farm) -> Place:
         **{f"{folder}/worker": str(certs / "worker-w") for folder in ("/certs", "/etc/rolloutfarm")},
         "/certs/health": str(certs / "viewer-v"),
     }
-    return endpoint, lambda word: there.get(word.replace("%i", "first"), word.replace("%i", "first"))
+    return endpoint, lambda word: paths.get(word.replace("%i", "first"), word.replace("%i", "first"))
 
 
 def learn(farm: Farm, router: list[str], worker: list[str], learner: list[str], *settings: str) -> None:
@@ -59,13 +59,13 @@ def learn(farm: Farm, router: list[str], worker: list[str], learner: list[str], 
 
 
 def container(name: str) -> dict[str, Any]:
-    (found,) = (
+    (settings,) = (
         container
         for part in MANIFEST
         for container in part["spec"].get("template", {}).get("spec", {}).get("containers", ())
         if container["name"] == name
     )
-    return found
+    return settings
 
 
 @pytest.mark.parametrize("release", RELEASES)

@@ -34,26 +34,26 @@ def end(process: "subprocess.Popen[str]", number: signal.Signals, record: Callab
     """Send a signal, and check that the program ends quickly and leaves no process behind."""
     workers = children(process.pid)
     assert workers
-    begun = time.monotonic()
+    start = time.monotonic()
     process.send_signal(number)
-    said, _ = process.communicate(timeout=60)
-    took = time.monotonic() - begun
+    output, _ = process.communicate(timeout=60)
+    took = time.monotonic() - start
     record("seconds", round(took, 2))
     print(f"ended after {took:.2f} s by {number.name}")  # noqa: T201
     assert took < SOON
     assert alive(workers) == []
-    assert "Traceback" not in said
-    return said
+    assert "Traceback" not in output
+    return output
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_run_with_recording(farm: Farm, number: signal.Signals, record_property) -> None:
     process = farm.start("run", "--name", "r", "--generations", "100000", "--pairs", "6")
     farm.wait_for(lambda: len(farm.progress("r")) >= 12)
-    said = end(process, number, record_property)
+    output = end(process, number, record_property)
     assert process.returncode == 130
-    assert f"{'Ctrl-C' if number == signal.SIGINT else 'SIGTERM'}: saving and ending" in said
-    assert "continue with: farm run --resume runs/r" in said
+    assert f"{'Ctrl-C' if number == signal.SIGINT else 'SIGTERM'}: saving and ending" in output
+    assert "continue with: farm run --resume runs/r" in output
     assert farm.summary("r")["state"] == "interrupted"
     assert farm.summary("r")["generations"] == len(farm.progress("r"))
 
@@ -83,20 +83,20 @@ def test_a_learner_that_finds_no_router(farm: Farm) -> None:
     while "no answer from" not in learner.stdout.readline():
         pass
     learner.send_signal(signal.SIGINT)
-    said, _ = learner.communicate(timeout=SOON)
+    output, _ = learner.communicate(timeout=SOON)
     assert learner.returncode == 130
-    assert "Traceback" not in said
+    assert "Traceback" not in output
     assert not (farm.folder / "runs").exists()
 
 
 def test_a_run_that_diverges(farm: Farm) -> None:
     rate = ("--policy", "direct", "--features", "5", "--learning-rate-mu", "1e308")
-    said = farm.call("run", "--name", "r", "--generations", "50", *rate, *SMALL, status=1)
-    (line,) = [line for line in said.splitlines() if line.startswith("farm: ")]
+    output = farm.call("run", "--name", "r", "--generations", "50", *rate, *SMALL, status=1)
+    (line,) = [line for line in output.splitlines() if line.startswith("farm: ")]
     assert line.startswith("farm: the run diverged: the update after generation ")
     assert line.endswith("is not finite; everything before is saved")
-    assert "Traceback" not in said
-    assert "Warning" not in said
+    assert "Traceback" not in output
+    assert "Warning" not in output
     summary = farm.summary("r")
     assert summary["state"] == "diverged"
     assert summary["generations"] == len(farm.progress("r"))
@@ -105,19 +105,19 @@ def test_a_run_that_diverges(farm: Farm) -> None:
 def test_one_process_a_run(farm: Farm) -> None:
     process = farm.start("run", "--name", "r", "--generations", "100000", *SMALL)
     farm.wait_for(lambda: farm.progress("r"))
-    said = farm.call("run", "--resume", "runs/r", "--no-record", status=2)
-    assert "another process is working on the run in runs/r" in said
+    output = farm.call("run", "--resume", "runs/r", "--no-record", status=2)
+    assert "another process is working on the run in runs/r" in output
     assert process.poll() is None
-    seen = len(farm.progress("r"))
-    farm.wait_for(lambda: len(farm.progress("r")) > seen)
+    count = len(farm.progress("r"))
+    farm.wait_for(lambda: len(farm.progress("r")) > count)
 
 
 def test_a_folder_whose_name_is_no_name(farm: Farm) -> None:
     farm.call("run", "--name", "r", "--generations", "1", *SMALL)
     (farm.folder / "runs" / "r").rename(farm.folder / "runs" / "r (copy) #1")
-    said = farm.call("run", "--resume", "runs/r (copy) #1", "--no-record", status=2)
-    assert "run 'r (copy) #1' is not a name" in said
-    assert len(said.strip().splitlines()) == 1
+    output = farm.call("run", "--resume", "runs/r (copy) #1", "--no-record", status=2)
+    assert "run 'r (copy) #1' is not a name" in output
+    assert len(output.strip().splitlines()) == 1
 
 
 def test_workers_that_cannot_work(farm: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,8 +129,8 @@ def test_workers_that_cannot_work(farm: Farm, monkeypatch: pytest.MonkeyPatch) -
         "os.register_at_fork(after_in_child=lambda: os._exit(1))\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(broken))
-    said = farm.call("run", "--name", "r", "--generations", "1", *SMALL, status=1)
-    assert "farm: no local worker keeps running; see their messages above" in said
+    output = farm.call("run", "--name", "r", "--generations", "1", *SMALL, status=1)
+    assert "farm: no local worker keeps running; see their messages above" in output
     assert farm.summary("r")["state"] == "failed"
 
 
@@ -150,19 +150,19 @@ def small_disk(farm: Farm) -> Iterator[Path]:
 
 
 def test_a_full_disk(farm: Farm, small_disk: Path) -> None:
-    said = farm.call("run", "--name", "r", "--generations", "40", *SMALL, status=1)
-    (line,) = [line for line in said.splitlines() if line.startswith("farm: ")]
+    output = farm.call("run", "--name", "r", "--generations", "40", *SMALL, status=1)
+    (line,) = [line for line in output.splitlines() if line.startswith("farm: ")]
     assert "cannot write to runs/r: No space left on device; the run is saved up to generation " in line
     assert line.endswith(": make room and --resume it")
-    assert "Traceback" not in said
-    assert "Logging error" not in said
+    assert "Traceback" not in output
+    assert "Logging error" not in output
     assert not list(small_disk.glob("r/*.new"))
     saved = int(line.partition("up to generation ")[2].partition(":")[0])
     assert 0 < saved < 40
 
-    said = farm.call("run", "--resume", "runs/r", "--no-record", status=1)
-    assert "No space left on device" in said
-    assert "Traceback" not in said
+    output = farm.call("run", "--resume", "runs/r", "--no-record", status=1)
+    assert "No space left on device" in output
+    assert "Traceback" not in output
 
     subprocess.run(["mount", "-o", "remount,size=10m", str(small_disk)], check=True)
     farm.call("run", "--resume", "runs/r", "--no-record")

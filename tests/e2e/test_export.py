@@ -28,20 +28,20 @@ def bare(farm: Farm, path: Path) -> str:
         f"runpy.run_path({str(PLAY_POLICY)!r}, run_name='__main__')\n"
     )
     command = [sys.executable, "-I", "-S", "-c", code]
-    ended = subprocess.run(command, cwd=farm.folder, capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
+    process = subprocess.run(command, cwd=farm.folder, capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
-def returned(said: str) -> float:
-    return float(said.splitlines()[-1].removeprefix("return "))
+def returned(output: str) -> float:
+    return float(output.splitlines()[-1].removeprefix("return "))
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, say: Say, name: str) -> None:
     path = done.folder / f"{name}.npz"
-    said = say("export", f"runs/{name}", str(path))
-    assert f"written to {path}" in said
+    output = say("export", f"runs/{name}", str(path))
+    assert f"written to {path}" in output
     with np.load(path, allow_pickle=False) as file:
         assert file["mu"].tobytes() == stored(done, name).mu.tobytes()
         assert "file=" not in str(file["mjcf"])
@@ -64,13 +64,13 @@ def test_an_exported_policy_in_an_environment_of_its_own(done: Farm, tmp_path: P
     done.call("export", "runs/a", str(tmp_path / "p.npz"))
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
     python = tmp_path / "venv" / "bin" / "python"
-    wanted = [f"{name}=={importlib.metadata.version(name)}" for name in ("mujoco", "numpy")]
+    requirements = [f"{name}=={importlib.metadata.version(name)}" for name in ("mujoco", "numpy")]
     quiet = ("--quiet", "--disable-pip-version-check")
-    subprocess.run([python, "-m", "pip", "install", *quiet, *wanted], check=True, timeout=170)
+    subprocess.run([python, "-m", "pip", "install", *quiet, *requirements], check=True, timeout=170)
     assert subprocess.run([python, "-c", "import farm"], cwd=tmp_path, capture_output=True, check=False).returncode == 1
     command = [python, PLAY_POLICY, tmp_path / "p.npz"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True).stdout
-    assert returned(said) == done.summary("a")["mean_policy_return"]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True).stdout
+    assert returned(output) == done.summary("a")["mean_policy_return"]
 
 
 def test_the_exported_numbers_are_plain(done: Farm) -> None:

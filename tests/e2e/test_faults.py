@@ -41,7 +41,7 @@ def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check
     """
 
     def done(
-        what: str, allowed: float, away: float = 0.0, *, least: float = 0.0, reissued: int = 0, said: str = ""
+        what: str, allowed: float, away: float = 0.0, *, least: float = 0.0, reissued: int = 0, log: str = ""
     ) -> None:
         lines = farm.progress("r")
         assert [line["generation"] for line in lines] == list(range(1, GENERATIONS + 1))
@@ -55,23 +55,23 @@ def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check
                 file.write(f"| {what} | {lines[-1]['reissued']} | {still:.1f} | {allowed:g} |\n")
         assert least <= still <= allowed
         assert lines[-1]["reissued"] >= reissued
-        assert said in (farm.folder / "runs/r/log.txt").read_text()
+        assert log in (farm.folder / "runs/r/log.txt").read_text()
 
     return done
 
 
 def finish(process: "subprocess.Popen[str]") -> None:
-    said, _ = process.communicate(timeout=150)
-    assert process.returncode == 0, said
+    output, _ = process.communicate(timeout=150)
+    assert process.returncode == 0, output
 
 
 def resume(farm: Farm, *flags: str) -> float:
     """Start a killed learner again and see it finish; how long until its first generation [s]."""
-    done, begun = len(farm.progress("r")), time.monotonic()
+    done, before = len(farm.progress("r")), time.monotonic()
     assert done < GENERATIONS
     learner = farm.start("learner", "--resume", "runs/r", "--no-record", *flags)
     farm.wait_for(lambda: len(farm.progress("r")) > done)
-    away = time.monotonic() - begun
+    away = time.monotonic() - before
     finish(learner)
     return away
 
@@ -95,7 +95,7 @@ def test_a_worker_killed(farm: Farm, check: Check) -> None:
     running(farm)
     os.kill(children(workers.pid)[0], signal.SIGKILL)
     finish(learner)
-    check("worker killed", 5, said=" left")
+    check("worker killed", 5, log=" left")
 
 
 def test_a_worker_frozen_and_thawed(farm: Farm, check: Check) -> None:
@@ -167,22 +167,22 @@ def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:
     router.communicate(timeout=10)
     farm.start("router", "--listen", endpoint)
     finish(learner)
-    check("router killed and back", 15, said=" left")
+    check("router killed and back", 15, log=" left")
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["listening", "connecting"])
 def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: int) -> None:
-    here, there = free_endpoint(), free_endpoint()
-    flags = [(here,), (there, "--connect", here)]
+    here, remote = free_endpoint(), free_endpoint()
+    flags = [(here,), (remote, "--connect", here)]
     routers = [farm.start_router(*words) for words in flags]
     learner = farm.start("learner", "--connect", here, *SETTINGS)
-    farm.start("worker", "--connect", there, "--processes", "2")
+    farm.start("worker", "--connect", remote, "--processes", "2")
     running(farm)
     routers[which].kill()
     routers[which].communicate(timeout=10)
     farm.start_router(*flags[which])
     finish(learner)
-    check(f"of two joined routers, the {('listening', 'connecting')[which]} one killed and back", 15, said=" left")
+    check(f"of two joined routers, the {('listening', 'connecting')[which]} one killed and back", 15, log=" left")
 
 
 def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:
@@ -206,8 +206,8 @@ def test_clocks_that_jump(farm: Farm, check: Check) -> None:
     os.environ["FAKETIME_DONT_FAKE_MONOTONIC"] = "1"
     try:
         clock.write_text("+3600\n")
-        shown = farm.start_python("-c", "import time; print(time.time())").communicate(timeout=30)[0]
-        assert float(shown) - time.time() > 3000, "the clock does not jump"
+        output = farm.start_python("-c", "import time; print(time.time())").communicate(timeout=30)[0]
+        assert float(output) - time.time() > 3000, "the clock does not jump"
         clock.write_text("+0\n")
         learner, _ = start(farm)
     finally:

@@ -112,33 +112,33 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
         assert learner.poll() is None, "over before the end of the attack"
         reached = len(farm.progress("r"))
         farm.wait_for(lambda: len(farm.progress("r")) >= min(reached + 10, 200))
-        asked: list[dict[str, Any]] = []
+        status: list[dict[str, Any]] = []
 
         def told_all() -> bool:
-            asked[:] = json.loads(farm.call("status", "--connect", endpoint, "--json"))
-            return asked[0]["ignored"].keys() >= {"bad", "version", "foreign", "stale", "flood"}
+            status[:] = json.loads(farm.call("status", "--connect", endpoint, "--json"))
+            return status[0]["ignored"].keys() >= {"bad", "version", "foreign", "stale", "flood"}
 
         farm.wait_for(told_all)  # the answer is made twice a second
-        [run] = asked
+        [run] = status
         assert sum(run["ignored"].get(kind, 0) for kind in ("stale", "unasked", "flood")) >= 900
         assert [one["worker"].partition("/")[2].partition("-")[0] for one in run["workers"]] == [str(worker)]
         assert max(megabytes(learner.pid), megabytes(worker)) < 500
     assert children(workers.pid) == [worker], "the worker fell over"
-    told, _ = learner.communicate(timeout=120)
-    assert learner.returncode == 0, told
-    assert "Traceback" not in told
+    output, _ = learner.communicate(timeout=120)
+    assert learner.returncode == 0, output
+    assert "Traceback" not in output
     assert farm.summary("r")["parameters_sha256"] == farm.json("undisturbed/r/summary.json")["parameters_sha256"]
 
 
 def overheard(stranger: session.Session) -> dict[str, tuple[str, bytes]]:
     """A valid message of each kind."""
-    heard: dict[str, tuple[str, bytes]] = {}
-    while set(heard) < set(TOPICS):
+    messages: dict[str, tuple[str, bytes]] = {}
+    while set(messages) < set(TOPICS):
         event = stranger.events.get(timeout=20)
         for topic in TOPICS:
             if f"/{topic}" in event.key and event.payload:
-                heard[topic] = event.key, event.payload
-    return heard
+                messages[topic] = event.key, event.payload
+    return messages
 
 
 def megabytes(pid: int) -> float:
@@ -159,6 +159,6 @@ def test_nonsense_at_the_decoder_guided_by_coverage(farm: Farm) -> None:
         "sh", "-c", '"$@"; exit $?', "sh", sys.executable, str(script), str(corpus),
         "-max_total_time=20", "-rss_limit_mb=1024", "-seed=1",
     )  # fmt: skip
-    said, _ = fuzzer.communicate(timeout=120)
-    assert fuzzer.returncode == 0, said[-3000:]
-    assert "Done " in said
+    output, _ = fuzzer.communicate(timeout=120)
+    assert fuzzer.returncode == 0, output[-3000:]
+    assert "Done " in output

@@ -58,8 +58,8 @@ def test_a_worker_killed_and_a_run_resumed_learn_the_same(farm: Farm, learnt: Fa
     os.kill(children(process.pid)[0], signal.SIGKILL)
     farm.wait_for(lambda: len(farm.progress("r")) >= 2)
     process.send_signal(signal.SIGTERM)
-    said, _ = process.communicate(timeout=30)
-    assert process.returncode == 130, said
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 130, output
     farm.call("run", "--resume", "runs/r", "--no-record")
     same(farm.summary("r"), learnt)
 
@@ -112,10 +112,10 @@ def test_workers_and_a_recorder_elsewhere(farm: Farm, learnt: Farm) -> None:
     recorder = farm.start("record", "--connect", endpoint, "--run", "r")
     farm.start("worker", "--connect", endpoint, "--processes", "1")
     for process in (learner, recorder):
-        said, _ = process.communicate(timeout=120)
-        assert process.returncode == 0, said
+        output, _ = process.communicate(timeout=120)
+        assert process.returncode == 0, output
     same(farm.summary("r"), learnt)
-    here, there = content(farm.folder / "runs/r/run.rrd"), content(farm.folder / "recordings/r/run.rrd")
-    shown = [key for key in here if key[0].startswith(("/world", "/reward", "/actions", "/learning"))]
-    assert shown
-    assert all(repr(here[key]) == repr(there[key]) for key in shown)  # nan where there is no baseline
+    here, remote = content(farm.folder / "runs/r/run.rrd"), content(farm.folder / "recordings/r/run.rrd")
+    curves = [key for key in here if key[0].startswith(("/world", "/reward", "/actions", "/learning"))]
+    assert curves
+    assert all(repr(here[key]) == repr(remote[key]) for key in curves)  # nan where there is no baseline

@@ -76,9 +76,9 @@ def test_whatever_viewers_do(farm: Farm, viewers: Viewers) -> None:
     saving = viewers.keep(late)
     learnt(100)
     looking.send_signal(signal.SIGCONT)
-    said, _ = learner.communicate(timeout=120)
-    assert learner.returncode == 0, said
-    assert "Traceback" not in said
+    output, _ = learner.communicate(timeout=120)
+    assert learner.returncode == 0, output
+    assert "Traceback" not in output
     saving.wait(30)
 
     assert generations(farm.folder / "runs/r/run.rrd") == generations(late) == list(range(1, COUNT + 1))

@@ -49,6 +49,6 @@ def test_mistakes(
 ) -> None:  # fmt: skip
     monkeypatch.chdir(done.folder)
     assert main(words) == status
-    said = "".join(capfd.readouterr())
-    assert line in said
-    assert len(said.strip().splitlines()) == 1, said
+    output = "".join(capfd.readouterr())
+    assert line in output
+    assert len(output.strip().splitlines()) == 1, output

@@ -41,11 +41,11 @@ def test_a_farm_over_three_hosts_learns_the_gait_while_workers_die(farm: Farm, r
         thread = threading.Thread(target=kill)
         thread.start()
         try:
-            said, _ = learner.communicate(timeout=500)
+            output, _ = learner.communicate(timeout=500)
         finally:
             over.set()
             thread.join()
-        assert learner.returncode == 0, said
+        assert learner.returncode == 0, output
     summary, undisturbed = farm.summary("r"), farm.json("undisturbed/r/summary.json")
     assert summary["mean_policy_success"] is True
     assert summary["robust_success_rate"] >= 0.8

@@ -26,8 +26,8 @@ def test_a_page_is_served_in_one_line(tmp_path: Path) -> None:
         assert process.stdout
         assert process.stdout.readline().startswith("open http://127.0.0.1:")
         process.send_signal(signal.SIGTERM)
-        said, _ = process.communicate(timeout=30)
+        output, _ = process.communicate(timeout=30)
     finally:
         end([process], 5.0)
-    assert said.split() == ["SIGTERM:", "closing", "the", "viewer"]
+    assert output.split() == ["SIGTERM:", "closing", "the", "viewer"]
     assert list(home.iterdir()) == []

@@ -30,21 +30,21 @@ def test_what_is_played_is_the_replay_bit_for_bit(done: Farm, memory: bool) -> N
         other = Rnn(RnnConfig(units=4), policy.problem.spec, {})
         mu = other.start(np.random.default_rng(0))
         policy = LoadedPolicy(replace(policy.problem, policy=other), policy.generation, mu)
-    shown = policy.rollout()
-    task, seen = policy.problem.task, [shown.frames["qpos"][0]]
+    replay = policy.rollout()
+    task, poses = policy.problem.task, [replay.frames["qpos"][0]]
     engine = DataEngine(task.model)
     task.setup(Sim(engine))
 
     def step() -> bool:
         mujoco.mj_step(task.model, engine.data)
-        seen.append(engine.data.qpos.copy())
+        poses.append(engine.data.qpos.copy())
         return True
 
     engine.pace = step
     for _ in range(2):  # nothing of one rollout is left in the next
-        del seen[1:]
-        assert rollout(policy)(Sim(engine)) == shown.rollouts.steps[0]
-        assert np.stack(seen).tobytes() == shown.frames["qpos"].tobytes()
+        del poses[1:]
+        assert rollout(policy)(Sim(engine)) == replay.rollouts.steps[0]
+        assert np.stack(poses).tobytes() == replay.frames["qpos"].tobytes()
 
 
 @pytest.fixture
@@ -72,18 +72,18 @@ def test_play_on_a_display(done: Farm, screen: str, monkeypatch: pytest.MonkeyPa
     assert "double-click a body" in process.stdout.readline()
     assert "the first rollout ended after" in process.stdout.readline()
     process.send_signal(number)
-    said, _ = process.communicate(timeout=30)
-    assert process.returncode == 130, said
-    assert int(said.splitlines()[-1].split()[0]) >= 15
-    assert "Traceback" not in said
-    assert "X Error" not in said
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 130, output
+    assert int(output.splitlines()[-1].split()[0]) >= 15
+    assert "Traceback" not in output
+    assert "X Error" not in output
 
 
 @pytest.mark.slow
 def test_play_needs_a_display(done: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    said = done.call("play", "runs/a", status=2)
-    assert "no display to open a window on: farm replay runs/a --video rollout.gif draws without one" in said
+    output = done.call("play", "runs/a", status=2)
+    assert "no display to open a window on: farm replay runs/a --video rollout.gif draws without one" in output
     monkeypatch.setenv("DISPLAY", ":987")
     assert "cannot open a window" in done.call("play", "runs/a", status=1)

@@ -50,22 +50,22 @@ def recorder(farm: Farm, endpoint: str, *flags: str) -> Process:
 def until(process: Process, text: str) -> str:
     """Wait for the line with this text."""
     assert process.stdout
-    said = []
+    lines = []
     for line in iter(process.stdout.readline, ""):
-        said.append(line)
+        lines.append(line)
         if text in line:
             return line
-    raise AssertionError("".join(said))
+    raise AssertionError("".join(lines))
 
 
 def finish(process: Process, status: int = 0) -> str:
-    said, _ = process.communicate(timeout=120)
-    assert process.returncode == status, said
-    assert "Traceback" not in said
-    return said
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == status, output
+    assert "Traceback" not in output
+    return output
 
 
-def kept(farm: Farm) -> list[str]:
+def files(farm: Farm) -> list[str]:
     return sorted(path.name for path in (farm.folder / "recordings/r").glob("*.rrd"))
 
 
@@ -80,25 +80,25 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     until(process, "no answer from")
     flags = ("--name", "r", "--pairs", "3", "--generations", "12", "--traces", "all", "--listen", endpoint)
     farm.call("run", *flags)
-    said = finish(process)
-    assert "run over after generation 12, all recorded in recordings/r" in said
-    own, other = farm.folder / "runs/r", farm.folder / "recordings/r"
-    theirs = content(other / "run.rrd")
-    for key, values in content(own / "run.rrd").items():
+    output = finish(process)
+    assert "run over after generation 12, all recorded in recordings/r" in output
+    original, other = farm.folder / "runs/r", farm.folder / "recordings/r"
+    rest = content(other / "run.rrd")
+    for key, values in content(original / "run.rrd").items():
         # Commands that show a generation again name the run's folder, which is not here.
-        told = str(values).replace("runs/r", "RUN") if key[0] == "/again" else str(values)
-        assert told == str(theirs.pop(key)), key
-    assert not theirs
+        text = str(values).replace("runs/r", "RUN") if key[0] == "/again" else str(values)
+        assert text == str(rest.pop(key)), key
+    assert not rest
     names = {entity for entity, *_ in content(other / "run.rrd")}
     assert {"/learning/return", "/joints/position", "/traces/best", "/log"} <= names
-    assert kept(farm) == ["replay.rrd", "run.rrd"]
+    assert files(farm) == ["replay.rrd", "run.rrd"]
     captions = [
         [str(chunk.to_record_batch()) for chunk in RrdReader(folder / "replay.rrd").stream() if "rollout" in str(chunk)]
-        for folder in (own, other)
+        for folder in (original, other)
     ]
     assert len(captions[0]) == len(captions[1]) > 0
     for name in ("config.json", "summary.json"):
-        assert (own / name).read_bytes() == (other / name).read_bytes()
+        assert (original / name).read_bytes() == (other / name).read_bytes()
 
 
 def test_a_late_recorder_has_everything(farm: Farm) -> None:
@@ -118,8 +118,8 @@ def test_a_late_recorder_has_everything(farm: Farm) -> None:
     finish(learning)
     finish(process)
     assert generations(farm.folder / FILE) == numbers(20)
-    shown = {generation for entity, _, generation, _ in content(farm.folder / FILE) if entity == "/joints/position"}
-    assert shown == {0, *numbers(20)}, "rollouts from before are there too"
+    rollouts = {generation for entity, _, generation, _ in content(farm.folder / FILE) if entity == "/joints/position"}
+    assert rollouts == {0, *numbers(20)}, "rollouts from before are there too"
 
 
 def test_a_recorder_killed_and_started_again(farm: Farm) -> None:
@@ -134,14 +134,14 @@ def test_a_recorder_killed_and_started_again(farm: Farm) -> None:
     process.communicate(timeout=10)
     process = farm.start("record", "--connect", endpoint)
     line = until(process, "recording run r into recordings/r")
-    found = re.search(r"continuing after generation (\d+)", line)
-    assert found
-    assert int(found[1]) >= 1
+    match = re.search(r"continuing after generation (\d+)", line)
+    assert match
+    assert int(match[1]) >= 1
     hire(farm, endpoint)
     finish(learning)
     finish(process)
     assert generations(farm.folder / FILE) == numbers(30)
-    assert kept(farm) == ["replay.rrd", "run.rrd"]
+    assert files(farm) == ["replay.rrd", "run.rrd"]
 
 
 def test_a_learner_killed_and_resumed(farm: Farm) -> None:
@@ -154,8 +154,8 @@ def test_a_learner_killed_and_resumed(farm: Farm) -> None:
     learning.communicate(timeout=10)
     until(process, "the learner of run r is gone, waiting for it to come back")
     farm.call("learner", "--resume", "runs/r", "--listen", endpoint, "--no-record")
-    said = finish(process)
-    assert "the learner of run r is back, after generation" in said
+    output = finish(process)
+    assert "the learner of run r is back, after generation" in output
     assert generations(farm.folder / FILE) == numbers(30)
 
 
@@ -167,12 +167,12 @@ def test_stopped_and_gone_on(farm: Farm) -> None:
     until(process, "live: farm view rerun+http://127.0.0.1:")
     farm.wait_for(lambda: (farm.folder / FILE).stat().st_size > 50_000)
     process.send_signal(signal.SIGTERM)
-    begun = time.monotonic()
-    said = finish(process, 130)
-    assert time.monotonic() - begun < 10
-    found = re.search(r"recorded up to generation (\d+) in recordings/r; the same command continues", said)
-    assert found
-    assert generations(farm.folder / FILE) == numbers(int(found[1]))
+    start = time.monotonic()
+    output = finish(process, 130)
+    assert time.monotonic() - start < 10
+    match = re.search(r"recorded up to generation (\d+) in recordings/r; the same command continues", output)
+    assert match
+    assert generations(farm.folder / FILE) == numbers(int(match[1]))
     assert learning.poll() is None
 
 
@@ -213,12 +213,12 @@ def test_folders_and_runs_that_make_no_sense(farm: Farm) -> None:
     for name in ("a", "b"):
         farm.start("learner", "--name", name, "--connect", endpoint, *SMALL)
     farm.wait_for(lambda: len(_runs(endpoint)) == 2)
-    said = farm.call("record", "--connect", endpoint, status=2)
-    assert said == "farm: farm farm has several runs: a, b; choose one with --run\n"
+    output = farm.call("record", "--connect", endpoint, status=2)
+    assert output == "farm: farm farm has several runs: a, b; choose one with --run\n"
 
-    begun = farm.folder / "recordings/b"
-    begun.mkdir(parents=True)
-    RunFolder(begun).write_config(replace(RunFolder(farm.folder / "runs/b").read_config(), seed=7))
+    folder = farm.folder / "recordings/b"
+    folder.mkdir(parents=True)
+    RunFolder(folder).write_config(replace(RunFolder(farm.folder / "runs/b").read_config(), seed=7))
     strange = farm.folder / "strange/b"
     strange.mkdir(parents=True)
     (strange / "letter.txt").touch()

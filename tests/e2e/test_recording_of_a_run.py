@@ -36,8 +36,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
 
 def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
     folder = RunFolder.open(recorded.folder / "runs" / "r")
-    kept = rows(read(folder.recording)["/traces/all"], "data")
-    assert sorted(kept) == list(range(1, GENERATIONS + 1))
+    tensors = rows(read(folder.recording)["/traces/all"], "data")
+    assert sorted(tensors) == list(range(1, GENERATIONS + 1))
 
     config = folder.read_config()
     problem, at = start(config, "r")
@@ -45,25 +45,25 @@ def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
     state = algorithm.restore(at.state)
     for generation in range(GENERATIONS):
         eps = algorithm.ask(state, seeds.exploration(config.seed, generation))
-        drawn = [seeds.training(config.seed, generation, i) for i in range(len(eps))]
-        given = runner.run(state.mu, Jobs.exploring(eps, (1, -1), drawn), "all")
-        (tensor,) = kept[generation + 1]
-        assert tensor_of(tensor).tobytes() == given.traces.tobytes()
-        state = algorithm.tell(state, eps, given.returns.reshape(-1, 2))
+        starts = [seeds.training(config.seed, generation, i) for i in range(len(eps))]
+        results = runner.run(state.mu, Jobs.exploring(eps, (1, -1), starts), "all")
+        (tensor,) = tensors[generation + 1]
+        assert tensor_of(tensor).tobytes() == results.traces.tobytes()
+        state = algorithm.tell(state, eps, results.returns.reshape(-1, 2))
     assert state.mu.tobytes() == folder.parameters.rows()["mu"][-1].tobytes()
 
 
 def test_new_bests_are_in_the_log(recorded: Farm) -> None:
-    told = {line["generation"]: line["best"] for line in recorded.progress("r") if line["return_max"] == line["best"]}
-    found = {}
+    bests = {line["generation"]: line["best"] for line in recorded.progress("r") if line["return_max"] == line["best"]}
+    lines = {}
     for batch in read(recorded.folder / "runs/r/run.rrd")["/log"]:
         [text] = [name for name in batch.schema.names if name.endswith(":text")]
         numbers = batch.column("generation").cast("int64").to_pylist()
         for generation, [line] in zip(numbers, batch.column(text).to_pylist(), strict=True):
             if "new best" in line:
-                found[generation] = line
-    assert told
-    assert found == {generation: f"new best rollout: return {best:.3f}" for generation, best in told.items()}
+                lines[generation] = line
+    assert bests
+    assert lines == {generation: f"new best rollout: return {best:.3f}" for generation, best in bests.items()}
 
 
 def tensor_of(value: dict[str, Any]) -> np.ndarray[Any, Any]:
@@ -93,18 +93,18 @@ def test_figures_are_the_same_everywhere(recorded: Farm) -> None:
     table = recorded.call("runs")
     assert "finished" in table
     assert summary["parameters_sha256"][:8] in table
-    said = recorded.call("replay", "runs/r", "--to", "again.rrd")
-    assert f"return {summary['mean_policy_return']:.3f}" in said
-    assert "written to again.rrd; look at it with: farm view again.rrd" in said
+    output = recorded.call("replay", "runs/r", "--to", "again.rrd")
+    assert f"return {summary['mean_policy_return']:.3f}" in output
+    assert "written to again.rrd; look at it with: farm view again.rrd" in output
     assert [r.recording_id for r in RrdReader(recorded.folder / "again.rrd").recordings()] == ["r-replay"]
 
 
 def test_a_window_needs_a_display(recorded: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    said = recorded.call("view", "runs/r", status=2)
-    assert "no display to open a window on: farm view runs/r --web serves a browser, or copy" in said
-    assert len(said.splitlines()) == 1
+    output = recorded.call("view", "runs/r", status=2)
+    assert "no display to open a window on: farm view runs/r --web serves a browser, or copy" in output
+    assert len(output.splitlines()) == 1
 
 
 def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
@@ -112,10 +112,10 @@ def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
     process = farm.start("run", *SMALL[:-1], "30")
     farm.wait_for(lambda: len(farm.progress("r")) >= 3)
     process.terminate()
-    said, _ = process.communicate(timeout=30)
-    assert process.returncode == 130, said
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 130, output
     (farm.folder / "runs" / "r").rename(farm.folder / "runs" / "s")
-    said = farm.call("run", "--resume", "runs/s/")
+    output = farm.call("run", "--resume", "runs/s/")
     assert farm.summary("s")["run"] == "s"
     folder = farm.folder / "runs" / "s"
     assert sorted(path.name for path in folder.glob("*.rrd")) == ["replay.rrd", "run.rrd"]
@@ -146,8 +146,8 @@ def test_a_run_that_is_first_recorded_later_has_the_curves_of_its_beginning(farm
 
 def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
     before = recorded.summary("r")
-    said = recorded.call("run", "--resume", "runs/r")
-    assert f"continuing after generation {GENERATIONS}" in said
+    output = recorded.call("run", "--resume", "runs/r")
+    assert f"continuing after generation {GENERATIONS}" in output
     after = recorded.summary("r")
     again = {"reissued": 0, "checks": {}}  # its last answers are checked again
     assert {**after, **again} == {**before, **again}
@@ -159,14 +159,14 @@ def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
 
 def listeners(port: int) -> set[str]:
     """Addresses of this machine on which a program listens at this port."""
-    found = set()
+    hosts = set()
     for name in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
             address, state = line.split()[1], line.split()[3]
             host, _, at = address.partition(":")
             if state == "0A" and int(at, 16) == port:
-                found.add(host)
-    return found
+                hosts.add(host)
+    return hosts
 
 
 def test_the_stream_stays_on_this_machine(farm: Farm) -> None:
@@ -178,9 +178,9 @@ def test_the_stream_stays_on_this_machine(farm: Farm) -> None:
     assert listeners(port) == {"0100007F"}
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     process.terminate()
-    said, _ = process.communicate(timeout=30)
-    assert f"live: farm view rerun+http://127.0.0.1:{port}/proxy   (--web for a browser)" in said
-    assert f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}" in said
+    output, _ = process.communicate(timeout=30)
+    assert f"live: farm view rerun+http://127.0.0.1:{port}/proxy   (--web for a browser)" in output
+    assert f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}" in output
     assert listeners(port) == set()
 
 
@@ -189,16 +189,16 @@ def test_view_takes_its_viewer_with_it(recorded: Farm, ending: signal.Signals) -
     process = recorded.start("view", "runs/r", "--web")
 
     def viewers() -> list[int]:
-        found = []
+        pids = []
         for pid in children(process.pid):
             with contextlib.suppress(FileNotFoundError):  # a child that has just ended
-                found += [pid] if Path(f"/proc/{pid}/exe").resolve().name == "rerun" else []
-        return found
+                pids += [pid] if Path(f"/proc/{pid}/exe").resolve().name == "rerun" else []
+        return pids
 
     recorded.wait_for(viewers)
     [viewer] = viewers()
     process.send_signal(ending)
-    said, _ = process.communicate(timeout=20)
-    assert process.returncode == 130, said
+    output, _ = process.communicate(timeout=20)
+    assert process.returncode == 130, output
     assert not Path(f"/proc/{viewer}").exists()
-    assert "Traceback" not in said
+    assert "Traceback" not in output

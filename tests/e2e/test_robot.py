@@ -18,12 +18,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(60)]
 
 def wait_for(process: "subprocess.Popen[str]", words: str) -> str:
     """Its output up to this text."""
-    said = ""
+    output = ""
     for line in process.stdout or ():
-        said += line
+        output += line
         if words in line:
-            return said
-    raise AssertionError(said)
+            return output
+    raise AssertionError(output)
 
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -42,10 +42,10 @@ def test_the_example_is_short_and_needs_nothing_of_ours() -> None:
 @pytest.mark.parametrize("words", [("--connect", "foo"), ("--tls", "/nowhere")])
 def test_what_it_cannot_begin_with_is_said_without_a_traceback(words: tuple[str, str]) -> None:
     command = [sys.executable, str(EXAMPLES / "robot_worker.py"), *words]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 2
-    assert "robot_worker.py: error: it cannot start with these settings: " in ended.stderr
-    assert "Traceback" not in ended.stderr
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 2
+    assert "robot_worker.py: error: it cannot start with these settings: " in process.stderr
+    assert "Traceback" not in process.stderr
 
 
 def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> None:
@@ -58,14 +58,14 @@ def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> 
     farm.start("worker", *join, "certs/worker-w", "--processes", "2", "--allow-file", "rig.py")
     with connect((endpoint,), 20, lambda: False, find(farm.folder / "certs", "learner")) as looking:
         farm.wait_for(lambda: len(looking.tokens(keys.worker_token("farm", "**"), 1.0)) == 3)
-    said = farm.call("learner", *RUN, *join, "certs/learner", "--name", "r", *DEVICES, timeout=50)
+    output = farm.call("learner", *RUN, *join, "certs/learner", "--name", "r", *DEVICES, timeout=50)
     lines = farm.progress("r")
     assert [line["rollouts"] for line in lines] == [20 * (i + 1) for i in range(GENERATIONS)], "each pair counts once"
     assert lines[0]["mean_policy_return"] < 0, "50 is upright throughout"
     assert lines[-1]["mean_policy_return"] > 40
-    assert "failed at a job: the rig" in said, "what it cannot do"
+    assert "failed at a job: the rig" in output, "what it cannot do"
     assert lines[-1]["reissued"] > 0, "other workers do its jobs"
-    assert "is expelled" not in said
+    assert "is expelled" not in output
     robot.terminate()
     did, _ = robot.communicate(timeout=20)
     assert "job " in did, "how many is a question of how fast the simulating workers are"

@@ -38,16 +38,16 @@ def test_one_router(farm: Farm, learns: Callable[..., None]) -> None:
 )
 def test_two_sites(farm: Farm, tmp_path: Path, learns: Callable[..., None], encrypted: bool, zenohd: bool) -> None:
     """The learner at one site, workers at the other; the second site's router is there first, and tries until then."""
-    here, there, learner, worker = free_endpoint(), free_endpoint(), [], []
+    here, remote, learner, worker = free_endpoint(), free_endpoint(), [], []
     if encrypted:
         certificates.main(["new", str(tmp_path / "certs"), "--learner", "127.0.0.1", "--worker", "w"])
         learner, worker = (["--tls", str(tmp_path / "certs" / name)] for name in ("learner", "worker-w"))
-        here, there = here.replace("tcp", "tls"), there.replace("tcp", "tls")
-    farm.start_router(there, "--connect", here, *learner, zenohd=zenohd)
+        here, remote = here.replace("tcp", "tls"), remote.replace("tcp", "tls")
+    farm.start_router(remote, "--connect", here, *learner, zenohd=zenohd)
     farm.start_router(here, *learner, zenohd=zenohd)
-    learns(["--connect", here, *learner], ["--connect", there, *worker])
+    learns(["--connect", here, *learner], ["--connect", remote, *worker])
 
 
 def test_a_router_that_joins_checks_where(farm: Farm) -> None:
-    said = farm.call("router", "--listen", free_endpoint(), "--connect", "elsewhere:7447", status=2)
-    assert "endpoint 'elsewhere:7447' is not of the form tcp/HOST:PORT" in said
+    output = farm.call("router", "--listen", free_endpoint(), "--connect", "elsewhere:7447", status=2)
+    assert "endpoint 'elsewhere:7447' is not of the form tcp/HOST:PORT" in output

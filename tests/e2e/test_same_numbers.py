@@ -50,9 +50,9 @@ def test_a_worker_killed_in_the_middle(farm: Farm, reference: dict[str, Any]) ->
     farm.wait_for(lambda: len(farm.progress("r")) >= 2)
     for pid in children(process.pid)[:1]:
         os.kill(pid, signal.SIGKILL)
-    said, _ = process.communicate(timeout=120)
-    assert process.returncode == 0, said
-    assert "starting another" in said
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    assert "starting another" in output
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
 
 
@@ -60,9 +60,9 @@ def test_interrupted_and_resumed(farm: Farm, reference: dict[str, Any]) -> None:
     process = farm.start("run", "--name", "r", "--generations", "10", *SMALL)
     farm.wait_for(lambda: len(farm.progress("r")) >= 3)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=10)
-    assert process.returncode == 130, said
-    assert "continue with: farm run --resume" in said
+    output, _ = process.communicate(timeout=10)
+    assert process.returncode == 130, output
+    assert "continue with: farm run --resume" in output
     assert farm.summary("r")["state"] == "interrupted"
     assert children(process.pid) == []
     farm.call("run", "--resume", "runs/r", "--no-record")
@@ -94,12 +94,12 @@ def test_several_objects(farm: Farm) -> None:
     assert set(again.rollouts.which.tolist()) == {0, 1}
     assert again.returns.mean() == pytest.approx(farm.progress("w1")[1]["return_mean"], rel=1e-12)
     for index, which in enumerate(again.rollouts.which.tolist()):
-        shown = again.rollout(index).trajectory
-        assert shown.value == again.returns[index]
-        assert shown.channels[MODEL].argmax(axis=1).tolist() == [which] * len(shown.times)
-    found = json.loads(farm.call("evaluate", "runs/w1", "--json"))
-    assert sum(row["rollouts"] for row in found["models"].values()) == found["perturbed"]["rollouts"] == 100
-    assert found["models"].keys() == {"bar", "bolt"}
+        trajectory = again.rollout(index).trajectory
+        assert trajectory.value == again.returns[index]
+        assert trajectory.channels[MODEL].argmax(axis=1).tolist() == [which] * len(trajectory.times)
+    results = json.loads(farm.call("evaluate", "runs/w1", "--json"))
+    assert sum(row["rollouts"] for row in results["models"].values()) == results["perturbed"]["rollouts"] == 100
+    assert results["models"].keys() == {"bar", "bolt"}
     assert "return" in farm.call("replay", "runs/w1", "--object", "cylinder")
 
 
@@ -115,9 +115,9 @@ def test_learner_and_workers_apart(farm: Farm, reference: dict[str, Any]) -> Non
     endpoint = free_endpoint()
     learner = farm.start("learner", "--name", "r", "--generations", "10", "--listen", endpoint, *SMALL)
     farm.start("worker", "--connect", endpoint, "--processes", "2")
-    said, _ = learner.communicate(timeout=120)
-    assert learner.returncode == 0, said
-    assert f"workers join with: farm worker --connect {endpoint}" in said
+    output, _ = learner.communicate(timeout=120)
+    assert learner.returncode == 0, output
+    assert f"workers join with: farm worker --connect {endpoint}" in output
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
 
 
@@ -171,9 +171,9 @@ def learnt(farm: Farm, variables: dict[str, str]) -> dict[str, str]:
         farm.start_router(endpoint)
         farm.start("worker", "--connect", endpoint, "--processes", "2")
         learner = farm.start_python("-P", "-c", LEARN, endpoint, json.dumps(SETTINGS))
-    said, _ = learner.communicate(timeout=150)
-    assert learner.returncode == 0, said
-    return json.loads(said.splitlines()[-1])
+    output, _ = learner.communicate(timeout=150)
+    assert learner.returncode == 0, output
+    return json.loads(output.splitlines()[-1])
 
 
 @pytest.fixture(scope="module")

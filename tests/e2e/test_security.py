@@ -61,44 +61,44 @@ def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Res
     """Very high returns for every pair."""
     eps = np.zeros((count, 1))
     flags = np.tile([True, False, False, False], (2 * count, 1))
-    given = Simulated(
+    simulated = Simulated(
         returns=np.full(2 * count, 1000.0), flags=flags, steps=np.full(2 * count, 15),
         traces=np.zeros((2, 15, 54), dtype="<f4"), trajectories=(),
     )  # fmt: skip
     jobs = Jobs.exploring(eps, (1, -1), None)
-    return Results.carrying(given, jobs, run=run, incarnation=incarnation, round=round_, worker=worker)
+    return Results.carrying(simulated, jobs, run=run, incarnation=incarnation, round=round_, worker=worker)
 
 
 def test_intruders_do_nothing_and_honest_workers_do_not_notice(
     farm: Farm, certs: Path, place: tuple[str, list[str]], reference: dict[str, object]
 ) -> None:
     endpoint, learner_flags = place
-    own = certs / "own"
+    folder = certs / "own"
     learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
     farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
-    watched = find(own, "worker", "w2")
-    with intruder(endpoint, watched) as w2, intruder(endpoint, find(own, "viewer", "eva")) as eva:
+    watched = find(folder, "worker", "w2")
+    with intruder(endpoint, watched) as w2, intruder(endpoint, find(folder, "viewer", "eva")) as eva:
         w2.subscribe("generation", keys.generation("farm", "r"))
         w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
         for posing in (w2, eva):
             posing.token(keys.worker_token("farm", "w1/1-abc"))
             want = WorkRequest(worker="w1/1-abc", credits=100, idle=("r",), version="0", canary="c", host="h", cores=2)
             posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))
-        farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "2")
-        seen = []
+        farm.start("worker", "--connect", endpoint, "--tls", str(folder), "--name", "w1", "--processes", "2")
+        topics = []
         while learner.poll() is None:
             with contextlib.suppress(Exception):
                 event = w2.events.get(timeout=0.2)
-                seen.append(event.topic)
+                topics.append(event.topic)
                 header = json_of(event.payload)
                 false = lie("w1/1-abc", "r", header["incarnation"], header["round"], 6)
                 for liar in (w2, eva):
                     liar.publish(keys.result("farm", "r", "w1/1-abc"), codec.encode(false))
-    said, _ = learner.communicate(timeout=60)
-    assert learner.returncode == 0, said
-    assert "generation" in seen, "the intruder was in a position to lie"
-    assert "stolen" not in seen, "jobs for another worker were read"
-    assert "1-abc" not in said, "nothing of the intruders' got through"
+    output, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, output
+    assert "generation" in topics, "the intruder was in a position to lie"
+    assert "stolen" not in topics, "jobs for another worker were read"
+    assert "1-abc" not in output, "nothing of the intruders' got through"
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
 
 
@@ -106,10 +106,10 @@ def test_a_worker_cannot_pose_as_a_learner(
     farm: Farm, certs: Path, place: tuple[str, list[str]], reference: dict[str, object]
 ) -> None:
     endpoint, learner_flags = place
-    own, lie, mine = certs / "own", b"a lie", keys.want("farm", "w2/1")
+    folder, lie, request = certs / "own", b"a lie", keys.want("farm", "w2/1")
     learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
     farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
-    with intruder(endpoint, find(own, "worker", "w2")) as w2, intruder(endpoint, find(own, "learner")) as witness:
+    with intruder(endpoint, find(folder, "worker", "w2")) as w2, intruder(endpoint, find(folder, "learner")) as witness:
         witness.subscribe("heard", "farm/**")
         witness.watch("token", "farm/live/**")
         w2.token(keys.learner_token("farm", "fake"))
@@ -123,21 +123,21 @@ def test_a_worker_cannot_pose_as_a_learner(
             "**",
         ):  # fmt: skip
             w2.publish(key, lie)
-        heard = []
+        names = []
 
         def last_is_heard() -> bool:
-            w2.publish(mine, lie)  # this one may, and comes after all others; Zenoh drops it if it comes too soon
+            w2.publish(request, lie)  # this one may, and comes after all others; Zenoh drops it if it comes too soon
             for event in witness.events.waiting(0.1):
                 if event.topic == "token" or event.payload == lie:  # the learner may begin its first round meanwhile
-                    heard.append(event.key)
-            return mine in heard
+                    names.append(event.key)
+            return request in names
 
         farm.wait_for(last_is_heard)
-        assert {key for key in heard if "live" not in key} == {mine}
-        assert not [key for key in heard if "fake" in key]
-        worker = farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "1")
-        said, _ = learner.communicate(timeout=60)
-    assert learner.returncode == 0, said
+        assert {key for key in names if "live" not in key} == {request}
+        assert not [key for key in names if "fake" in key]
+        worker = farm.start("worker", "--connect", endpoint, "--tls", str(folder), "--name", "w1", "--processes", "1")
+        output, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, output
     worker.terminate()
     assert "ignored" not in worker.communicate(timeout=20)[0]
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
@@ -145,21 +145,21 @@ def test_a_worker_cannot_pose_as_a_learner(
 
 def test_a_viewer_records_and_a_worker_cannot_look(farm: Farm, certs: Path, place: tuple[str, list[str]]) -> None:
     endpoint, learner_flags = place
-    own = certs / "own"
+    folder = certs / "own"
     learner = farm.start("learner", "--name", "r", "--generations", "5", *SMALL, *learner_flags)
-    recorder = farm.start("record", "--connect", endpoint, "--tls", str(own), "--name", "eva")
+    recorder = farm.start("record", "--connect", endpoint, "--tls", str(folder), "--name", "eva")
     assert recorder.stdout
     assert any("recording run r" in line for line in iter(recorder.stdout.readline, ""))
-    with intruder(endpoint, find(own, "worker", "w2")) as w2:
+    with intruder(endpoint, find(folder, "worker", "w2")) as w2:
         w2.subscribe("report", keys.report("farm", "*"))
         w2.subscribe("history", keys.history("farm", "*"))
         assert w2.ask(keys.history("farm", "r"), 1.0) is None
-        farm.start("worker", "--connect", endpoint, "--tls", str(own), "--name", "w1", "--processes", "1")
-        said, _ = learner.communicate(timeout=60)
-        assert learner.returncode == 0, said
+        farm.start("worker", "--connect", endpoint, "--tls", str(folder), "--name", "w1", "--processes", "1")
+        output, _ = learner.communicate(timeout=60)
+        assert learner.returncode == 0, output
         assert not len(w2.events)
-    said, _ = recorder.communicate(timeout=60)
-    assert recorder.returncode == 0, said
+    output, _ = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, output
     assert generations(farm.folder / "recordings/r/run.rrd") == [1, 2, 3, 4, 5]
 
 
@@ -227,8 +227,8 @@ def test_keys_are_kept_private(certs: Path) -> None:
 
 
 def test_configuration_for_zenohd(farm: Farm, certs: Path) -> None:
-    said = farm.call("router", "--print-config", "--listen", "tls/0.0.0.0:7447", "--tls", str(certs / "own"))
-    config = json.loads(said)
+    output = farm.call("router", "--print-config", "--listen", "tls/0.0.0.0:7447", "--tls", str(certs / "own"))
+    config = json.loads(output)
     assert config["mode"] == "router"
     assert config["access_control"]["default_permission"] == "deny"
     assert config["transport"]["link"]["tls"]["enable_mtls"] is True

@@ -48,9 +48,9 @@ def test_a_learner_whose_workers_are_away_waits_for_next_to_nothing(farm: Farm) 
         farm.wait_for(lambda: not ask(link, "farm", "r")[0].workers)
     at = len(farm.progress("r"))
     assert at < 40
-    cpu, size, begun = _cpu(learner.pid), _resident(learner.pid), time.monotonic()
+    cpu, size, start = _cpu(learner.pid), _resident(learner.pid), time.monotonic()
     time.sleep(5.0)
-    share = (_cpu(learner.pid) - cpu) / (time.monotonic() - begun)
+    share = (_cpu(learner.pid) - cpu) / (time.monotonic() - start)
     assert share < 0.05, f"{share:.3f} of a core"
     assert _resident(learner.pid) - size < 2e6
     assert len(farm.progress("r")) == at

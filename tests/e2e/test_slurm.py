@@ -86,9 +86,9 @@ def test_tasks_of_the_job_script_join_leave_and_are_replaced(
     monkeypatch.setenv("FARM", str(Path(sys.executable).with_name("farm")))
     monkeypatch.setenv("FARM_ROUTER", endpoint)
     monkeypatch.setenv("FARM_CERTS", str(certs / "worker-slurm"))
-    said = slurm("sbatch", "--array=0-49", "--cpus-per-task=2", str(SCRIPT))
-    assert "Submitted batch job" in said
-    job = said.split()[-1]
+    output = slurm("sbatch", "--array=0-49", "--cpus-per-task=2", str(SCRIPT))
+    assert "Submitted batch job" in output
+    job = output.split()[-1]
 
     def log(task: int) -> str:
         path = farm.folder / f"farm-workers-{job}-{task}.log"

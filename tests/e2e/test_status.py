@@ -25,9 +25,9 @@ def test_runs_and_workers_are_seen(farm: Farm) -> None:
     assert all(worker["rollouts"] > 0 and worker["rate"] > 0 for worker in run["workers"])
     assert run["ignored"].keys() <= {"stale", "doubled"}, "copies of jobs that took long on a busy machine"
     assert all(worker["ignored"].keys() <= {"stale"} for worker in run["workers"])
-    said = farm.call("status", "--connect", endpoint)
-    assert "100000" in said
-    assert "workers" in said
+    output = farm.call("status", "--connect", endpoint)
+    assert "100000" in output
+    assert "workers" in output
 
 
 STATUS = RunStatus(
@@ -45,15 +45,15 @@ def test_learners_of_another_release(farm: Farm) -> None:
     endpoint = free_endpoint()
     with listen(endpoint, "farm") as session:
         session.answer(keys.status("farm", "r"), lambda: codec.encode(STATUS, codec.SCHEMA + 1))
-        said = farm.call("status", "--connect", endpoint, status=1)
+        output = farm.call("status", "--connect", endpoint, status=1)
     versions = f"schema version {codec.SCHEMA + 1}, this side has {codec.SCHEMA}"
-    assert f"a learner answers, but its message cannot be read: {versions}" in said
+    assert f"a learner answers, but its message cannot be read: {versions}" in output
 
 
 def test_no_learner(farm: Farm) -> None:
     endpoint = free_endpoint()
-    said = farm.call("status", "--connect", endpoint, "--timeout", "1", status=1)
-    assert f"no answer from {endpoint}" in said
+    output = farm.call("status", "--connect", endpoint, "--timeout", "1", status=1)
+    assert f"no answer from {endpoint}" in output
 
 
 def test_status_fails_when_the_named_run_or_worker_is_missing(farm: Farm) -> None:
@@ -61,10 +61,10 @@ def test_status_fails_when_the_named_run_or_worker_is_missing(farm: Farm) -> Non
     farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
     farm.start("worker", "--connect", endpoint, "--processes", "1", "--name", "w")
     farm.wait_for(lambda: farm.progress("r"))
-    asked = ("status", "--connect", endpoint)
-    farm.call(*asked, "--run", "r", "--worker", "w")
-    assert "no learner of run s answers on farm farm" in farm.call(*asked, "--run", "s", status=1)
-    assert "no worker v is on farm farm" in farm.call(*asked, "--worker", "v", status=1)
+    words = ("status", "--connect", endpoint)
+    farm.call(*words, "--run", "r", "--worker", "w")
+    assert "no learner of run s answers on farm farm" in farm.call(*words, "--run", "s", status=1)
+    assert "no worker v is on farm farm" in farm.call(*words, "--worker", "v", status=1)
 
 
 def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Farm) -> None:
@@ -79,8 +79,8 @@ def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Far
     assert stranger.stdout
     lines = iter(stranger.stdout.readline, "")
     line = next(line for line in lines if "cannot serve" in line)
-    said = "its code of 'finger-gait' differs from the learner's: install the learner's release on both sides"
-    assert f"cannot serve run r: {said}" in line
+    reason = "its code of 'finger-gait' differs from the learner's: install the learner's release on both sides"
+    assert f"cannot serve run r: {reason}" in line
 
     def refused() -> bool:  # what the worker read in the spec may reach it before its own words reach the learner
         (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
@@ -89,6 +89,6 @@ def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Far
 
     farm.wait_for(refused)
     farm.start("worker", "--connect", endpoint, "--processes", "1")
-    told, _ = learner.communicate(timeout=60)
-    assert learner.returncode == 0, told
-    assert told.count(f"does not serve this run: {said}") == 1
+    output, _ = learner.communicate(timeout=60)
+    assert learner.returncode == 0, output
+    assert output.count(f"does not serve this run: {reason}") == 1

@@ -22,27 +22,27 @@ def hashes(folder: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_an_interrupted_sweep_goes_on_to_the_numbers_of_runs_one_after_another(farm: Farm) -> None:
-    begun = farm.start(*SHORT, "--out", "s", "--workers", "2", "--parallel", "2")
+    process = farm.start(*SHORT, "--out", "s", "--workers", "2", "--parallel", "2")
     farm.wait_for(lambda: list(farm.folder.glob("s/*/progress.jsonl")))
-    started = children(begun.pid)
-    begun.send_signal(signal.SIGTERM)
-    said, _ = begun.communicate(timeout=60)
-    assert begun.returncode == 130, said
-    assert "the same command continues with them" in said
+    started = children(process.pid)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert "the same command continues with them" in output
     assert not any(Path(f"/proc/{pid}").exists() for pid in started)
-    said = farm.call(*SHORT, "--out", "s", "--workers", "2")
-    assert "(0 left)" in said
-    assert "mean ± standard deviation over seeds" in said
-    found = hashes(farm.folder / "s")
+    output = farm.call(*SHORT, "--out", "s", "--workers", "2")
+    assert "(0 left)" in output
+    assert "mean ± standard deviation over seeds" in output
+    digests = hashes(farm.folder / "s")
     with (farm.folder / "s" / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {row["parameters_sha256"] for row in rows} == set(found.values())
+    assert {row["parameters_sha256"] for row in rows} == set(digests.values())
     assert [row["state"] for row in rows] == ["finished"] * 4
     for row in rows:
         name = f"initial_sigma-{row['initial_sigma']}-s{row['seed']}"
-        own = ("--initial-sigma", row["initial_sigma"], "--seed", row["seed"], "--pairs", "6", "--generations", "6")
-        farm.call("run", *own, "--name", name, "--no-record", "--workers", "1")
-        assert farm.summary(name)["parameters_sha256"] == found[name]
+        flags = ("--initial-sigma", row["initial_sigma"], "--seed", row["seed"], "--pairs", "6", "--generations", "6")
+        farm.call("run", *flags, "--name", name, "--no-record", "--workers", "1")
+        assert farm.summary(name)["parameters_sha256"] == digests[name]
     before = {path: path.stat().st_mtime_ns for path in (farm.folder / "s").glob("*/checkpoint")}
     assert "0 of 4 runs to do" in farm.call(*SHORT, "--out", "s")
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())

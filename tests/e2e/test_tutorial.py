@@ -45,8 +45,8 @@ def test_every_command_on_one_machine(copied: Farm) -> None:
             if program == "python"
             else copied.start(*words, *(FEW if words[0] == "run" else ()))
         )
-        said, _ = process.communicate(timeout=120)
-        assert process.returncode == 0, f"{program} {shlex.join(words)}: {said}"
+        output, _ = process.communicate(timeout=120)
+        assert process.returncode == 0, f"{program} {shlex.join(words)}: {output}"
     first, again = copied.summary("first"), copied.summary("again")
     assert first["parameters_sha256"] == again["parameters_sha256"]
     assert {"gait.gif", "plank.gif", "compare.rrd"} <= {path.name for path in copied.folder.iterdir()}

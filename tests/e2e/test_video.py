@@ -22,11 +22,11 @@ def test_pictures_in_a_grid() -> None:
 
 def test_moments_last_as_long_as_they_should() -> None:
     times = np.arange(151) * 0.01
-    shown = video.moments(times.tolist(), speed=0.25, rest=1.0)
-    assert len(shown) == 1.5 / 0.25 * 30 + 1 + 30
-    assert shown[0] == 0
-    assert shown[-31:] == [150] * 31
-    assert np.all(np.diff(shown) >= 0)
+    moments = video.moments(times.tolist(), speed=0.25, rest=1.0)
+    assert len(moments) == 1.5 / 0.25 * 30 + 1 + 30
+    assert moments[0] == 0
+    assert moments[-31:] == [150] * 31
+    assert np.all(np.diff(moments) >= 0)
     assert len(video.moments([0.0, 0.1], speed=10.0, rest=0.0)) == 2
 
 
@@ -36,8 +36,8 @@ def test_a_gif(done: Farm, tmp_path: Path) -> None:
     from PIL import Image
 
     path = tmp_path / "a.gif"
-    said = done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "1", "--video", str(path))
-    assert f"video: {path}" in said
+    output = done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "1", "--video", str(path))
+    assert f"video: {path}" in output
     assert path.stat().st_size < 1.5e6
     with Image.open(path) as gif:
         assert gif.size == video.SIZE
@@ -57,9 +57,11 @@ def test_a_gif(done: Farm, tmp_path: Path) -> None:
 def test_nothing_to_draw_with(done: Farm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
-    said = done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--video", str(tmp_path / "a.gif"), status=1)
-    assert "MuJoCo cannot draw here" in said.splitlines()[-1]
-    assert len(said.splitlines()) == 3  # and what the replay itself gave
+    output = done.call(
+        "replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--video", str(tmp_path / "a.gif"), status=1
+    )
+    assert "MuJoCo cannot draw here" in output.splitlines()[-1]
+    assert len(output.splitlines()) == 3  # and what the replay itself gave
     assert not (tmp_path / "a.gif").exists()
 
 
