@@ -30,7 +30,7 @@ def test_the_learners_own_machine_decides_between_two_hosts(
 ) -> None:
     place, file = placed(certs, 1.0), file_of(config)
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
-        for name, forge in (("liar", lie), ("a", lambda said: said)):
+        for name, forge in (("liar", lie), ("a", lambda message: message)):
             hosts.enter_context(host(place.listen, certs, name, file, forge))
         assert finished(run) == honest
     assert "host liar gave different numbers than this machine" in caplog.text
@@ -60,8 +60,8 @@ def test_what_no_second_host_can_check_is_checked_before_the_result_is_final(
 def test_a_mixed_run_says_which_host_nobody_can_check(
     certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def alone(said: Any) -> Any:
-        return replace(said, canary=BOGUS) if isinstance(said, WorkRequest) else LIES["the last bit"](said)
+    def alone(message: Any) -> Any:
+        return replace(message, canary=BOGUS) if isinstance(message, WorkRequest) else LIES["the last bit"](message)
 
     place, file = placed(certs, mixed=True), file_of(config)
     with open_run(config, tmp_path / "r", place) as run, host(place.listen, certs, "liar", file, alone):
@@ -76,12 +76,12 @@ def test_hosts_that_only_say_that_jobs_fail_stop_no_run(
     place, file, liars = placed(certs, 0.0), file_of(config), ("b", "c", "liar")
     failed, everywhere = defaultdict[int, set[str]](set), threading.Event()
 
-    def failing(said: Results) -> Failure:
-        job = int(said.jobs[0])
-        failed[job].add(said.worker)
+    def failing(answer: Results) -> Failure:
+        job = int(answer.jobs[0])
+        failed[job].add(answer.worker)
         if len(failed[job]) == len(liars):
             everywhere.set()
-        where = {"run": said.run, "incarnation": said.incarnation, "round": said.round, "worker": said.worker}
+        where = {"run": answer.run, "incarnation": answer.incarnation, "round": answer.round, "worker": answer.worker}
         return Failure(**where, index=job, error="ValueError: made up")
 
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
@@ -92,8 +92,8 @@ def test_hosts_that_only_say_that_jobs_fail_stop_no_run(
             assert everywhere.wait(30)
             hosts.enter_context(host(place.listen, certs, "a", file))
             assert learnt.result(60) == honest
-    told = (re.match(r"worker (\w+)/\S+ does not serve this run: it failed at job", line) for line in caplog.messages)
-    assert {each[1] for each in told if each} == set(liars)
+    hits = (re.match(r"worker (\w+)/\S+ does not serve this run: it failed at job", line) for line in caplog.messages)
+    assert {each[1] for each in hits if each} == set(liars)
 
 
 def test_a_pool_checks_a_lone_host_before_it_gives_out_returns(certs: Path, config: RunConfig) -> None:
@@ -101,8 +101,8 @@ def test_a_pool_checks_a_lone_host_before_it_gives_out_returns(certs: Path, conf
     with listen(endpoint, "farm", find(certs, "learner")), ExitStack() as hosts:
         pool = hosts.enter_context(farm.Farm(config.task, connect=endpoint, tls=certs))
         thetas = np.random.default_rng(0).normal(size=(5, pool.size))
-        with farm.Farm(config.task, workers=1) as own:
-            right = own.map(thetas, seeds=range(5))
+        with farm.Farm(config.task, workers=1) as local:
+            right = local.map(thetas, seeds=range(5))
         came = pool.imap(thetas, seeds=range(5))
         hosts.enter_context(host(endpoint, certs, "liar", file, LIES["the last bit"]))
         wrong = [next(came) for _ in range(5)]

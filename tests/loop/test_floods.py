@@ -32,11 +32,11 @@ def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> Non
         with connect((endpoint,), None, lambda: False, find(certs, "worker", "a")) as host:
             host.publish(key, b"first")
             assert learner.events.get(10).payload == b"first"
-            begun, sent = time.monotonic(), 0
-            while time.monotonic() - begun < 1.0:
+            start, count = time.monotonic(), 0
+            while time.monotonic() - start < 1.0:
                 host.publish(key, b"x" * 100)
-                sent += 1
-            taken = time.monotonic() - begun
+                count += 1
+            seconds = time.monotonic() - start
             time.sleep(0.01)  # the filter's own pause, so that size alone can be the reason
             host.publish(key, b"y" * 70_000)
             time.sleep(0.01)
@@ -44,8 +44,8 @@ def test_zenoh_drops_requests_that_are_too_many_or_too_large(certs: Path) -> Non
             got = []
             while not got or got[-1].payload != b"last":
                 got.append(learner.events.get(10))
-    assert sent > 10_000
-    assert len(got) < 1100 * taken
+    assert count > 10_000
+    assert len(got) < 1100 * seconds
     assert max(len(event.payload) for event in got) == 100
 
 
@@ -106,7 +106,7 @@ def test_results_larger_than_any_of_the_run_are_dropped_unread(certs: Path, tmp_
 @contextmanager
 def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
     """Instances of one certificate that ask for jobs, and answer none."""
-    stop, there = threading.Event(), threading.Event()
+    stop, ready = threading.Event(), threading.Event()
 
     def ask() -> None:
         with connect((endpoint,), None, stop.is_set, find(certs, "worker", "silent")) as session:
@@ -121,12 +121,12 @@ def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
                     )  # fmt: skip
                     session.publish(keys.want("farm", name), codec.encode(request))
                     stop.wait(0.002)
-                there.set()
+                ready.set()
 
     thread = threading.Thread(target=ask)
     thread.start()
     try:
-        assert there.wait(60)
+        assert ready.wait(60)
         yield
     finally:
         stop.set()

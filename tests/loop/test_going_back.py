@@ -31,7 +31,7 @@ def all_but_the_best(values: np.ndarray) -> np.ndarray:
 UNDONE = {
     "the last bit": (LIES["the last bit"], lambda _: True),
     "one percent": (LIES["one percent"], lambda _: True),
-    "one message in three": (LIES["the last bit"], lambda sent: sent % 3 == 0),
+    "one message in three": (LIES["the last bit"], lambda count: count % 3 == 0),
     "all but its best": (shifted(all_but_the_best), lambda _: True),
 }
 """Lies, and in which of the results from the fourth on."""
@@ -49,15 +49,15 @@ def test_a_liar_costs_time_and_no_number(
     place, rows, hosts = placed(certs, 1.0), list[int](), ExitStack()
     joining, answered = threading.Event(), threading.Event()
 
-    def waiting(said: Any) -> Any:
+    def waiting(message: Any) -> Any:
         if joining.is_set():  # the second host builds the task first, which takes longer than the run
             answered.wait(30)
-        return lie(said)
+        return lie(message)
 
-    def answering(said: Any) -> Any:
-        if isinstance(said, Results):
+    def answering(message: Any) -> Any:
+        if isinstance(message, Results):
             answered.set()
-        return said
+        return message
 
     with hosts:
         with open_run(config, tmp_path / "r", place) as run:
@@ -106,8 +106,8 @@ def test_an_expelled_host_is_not_admitted_by_a_resume(
         hosts.enter_context(host(place.listen, certs, "liar", file, lie))
         hosts.enter_context(host(place.listen, certs, "a", file))
         finished(run)
-    kept = checkpoints.load(run.learner.folder.checkpoint).expelled
-    assert list(kept) == ["liar"]
+    expelled = checkpoints.load(run.learner.folder.checkpoint).expelled
+    assert list(expelled) == ["liar"]
     caplog.clear()
     place = placed(certs, 0.0)
     with open_run(config, tmp_path / "r", place, resume=True) as run, ExitStack() as hosts:
@@ -115,7 +115,7 @@ def test_an_expelled_host_is_not_admitted_by_a_resume(
         hosts.enter_context(host(place.listen, certs, "a", file))
         assert finished(run) == honest
     assert refused(caplog) == {"liar"}
-    assert f"is refused: {kept['liar']}" in caplog.text
+    assert f"is refused: {expelled['liar']}" in caplog.text
 
 
 def test_an_expulsion_is_saved_before_the_generation_ends(certs: Path, config: RunConfig, tmp_path: Path) -> None:
@@ -146,11 +146,11 @@ def test_the_command_goes_on_by_itself_and_no_generation_is_recorded_twice(
     words = [*configs.flags(config), "--connect", endpoint, "--tls", str(certs / "learner"), "--audit", "1"]
     lied, hosts = threading.Event(), ExitStack()
 
-    def lie(said: Any) -> Any:
-        if isinstance(said, Results) and said.round > 3:
+    def lie(message: Any) -> Any:
+        if isinstance(message, Results) and message.round > 3:
             lied.set()
-            return LIES["the last bit"](said)
-        return said
+            return LIES["the last bit"](message)
+        return message
 
     def come() -> None:
         assert lied.wait(30)

@@ -97,9 +97,9 @@ def test_pushes_jumps_and_moving_goals_are_the_same_for_any_workers_and_repeated
     resumed = learnt(config, tmp_path / "half", 1, cart, resume=True)
     assert one["parameters_sha256"] == two["parameters_sha256"] == resumed["parameters_sha256"]
     assert "gave different numbers" not in caplog.text
-    shown = load(tmp_path / "half").rollout().trajectory
-    assert shown.value == one["mean_policy_return"]
-    assert np.diff(shown.channels["place"][:, 0]).max() > 0.09, "it jumps"
+    trajectory = load(tmp_path / "half").rollout().trajectory
+    assert trajectory.value == one["mean_policy_return"]
+    assert np.diff(trajectory.channels["place"][:, 0]).max() > 0.09, "it jumps"
     again = rewind(tmp_path / "half", 4)
     assert again.returns.max() == RunFolder.open(tmp_path / "1").progress()[3].return_max
     assert again.rollout(7).trajectory.value == again.returns[7]
@@ -182,8 +182,8 @@ def test_a_policy_with_memory_is_the_same_for_any_workers_and_acts_again(
     learnt(replace(config, generations=3), tmp_path / "half", 1, cart)
     resumed = learnt(config, tmp_path / "half", 2, cart, resume=True)
     assert one["parameters_sha256"] == two["parameters_sha256"] == resumed["parameters_sha256"]
-    found, again = load(tmp_path / "half"), rewind(tmp_path / "half", 4)
-    assert found.rollout().trajectory.value == one["mean_policy_return"]
+    loaded, again = load(tmp_path / "half"), rewind(tmp_path / "half", 4)
+    assert loaded.rollout().trajectory.value == one["mean_policy_return"]
     assert again.rollout(7).trajectory.value == again.returns[7]
     assert again.returns.max() == RunFolder.open(tmp_path / "1").progress()[3].return_max
     assert evaluate(RunFolder.open(tmp_path / "2"), 100, 0)["perturbed"]["return_mean"] == one["robust_return"]
@@ -209,11 +209,11 @@ def test_the_average_of_the_last_means_is_judged_kept_and_resumed(cart: Path, tm
 def test_a_fitted_start_is_kept_and_repeated(cart: Path, tmp_path: Path) -> None:
     config = configure(f"{cart}:Cart", policy="kernel", start="fitted", initial_mu=1.0, generations=2, pairs=3)
     first = learnt(config, tmp_path / "a", 1, cart)
-    kept = RunFolder.open(tmp_path / "a").read_config()
-    assert kept.policy_config.bandwidth == pytest.approx((1.25 / 2) ** 0.5)  # type: ignore[attr-defined]
-    assert kept.algorithm_config.initial_sigma == kept.policy_config.bandwidth  # type: ignore[attr-defined]  # d = 2
-    assert learnt(kept, tmp_path / "b", 1, cart)["parameters_sha256"] == first["parameters_sha256"]
-    longer = replace(kept, generations=3)
+    fit = RunFolder.open(tmp_path / "a").read_config()
+    assert fit.policy_config.bandwidth == pytest.approx((1.25 / 2) ** 0.5)  # type: ignore[attr-defined]
+    assert fit.algorithm_config.initial_sigma == fit.policy_config.bandwidth  # type: ignore[attr-defined]  # d = 2
+    assert learnt(fit, tmp_path / "b", 1, cart)["parameters_sha256"] == first["parameters_sha256"]
+    longer = replace(fit, generations=3)
     assert learnt(longer, tmp_path / "a", 1, cart, resume=True)["generations"] == 3
 
 
@@ -232,20 +232,20 @@ def test_a_file_is_served_only_where_it_is_allowed(
     other.write_text(TASK.replace("np.abs", "2 * np.abs"))
     config = configure(f"{cart}:Cart", **{**SMALL, "generations": 1})
     place = Placement(listen=free_endpoint(), record=False)
-    told = threading.Event()
+    complete = threading.Event()
 
     class Both(logging.Handler):
         """Hears both sides."""
 
-        said: set[str] = set()
+        parts: set[str] = set()
 
         def emit(self, record: logging.LogRecord) -> None:
-            self.said |= {
-                wanted for wanted in ("allow it by --allow-file cart.py", "cart.py differs from the learner's")
-                if wanted in record.getMessage() and "does not serve this run" in record.getMessage()
+            self.parts |= {
+                part for part in ("allow it by --allow-file cart.py", "cart.py differs from the learner's")
+                if part in record.getMessage() and "does not serve this run" in record.getMessage()
             }  # fmt: skip
-            if len(self.said) == 2:
-                told.set()
+            if len(self.parts) == 2:
+                complete.set()
 
     handler = Both()
     logging.getLogger().addHandler(handler)
@@ -257,7 +257,7 @@ def test_a_file_is_served_only_where_it_is_allowed(
                 results: list[Any] = []
                 learning = threading.Thread(target=lambda: results.extend(reports))
                 learning.start()
-                assert told.wait(30), handler.said
+                assert complete.wait(30), handler.parts
                 with workers(endpoint, 1, cart):
                     learning.join(30)
         assert run.summary["state"] == "finished"
@@ -290,7 +290,7 @@ def test_an_error_in_a_task_of_ones_own_is_named(cart: Path, tmp_path: Path) -> 
 def test_of_two_learners_of_one_name_that_start_together_one_gives_way(cart: Path, tmp_path: Path, _: int) -> None:
     config = configure(f"{cart}:Cart", **{**SMALL, "generations": 1})
     place = Placement(connect=(free_endpoint(),), record=False)
-    together, told, refused, done = threading.Barrier(2), threading.Event(), [], []
+    together, refusal, refused, done = threading.Barrier(2), threading.Event(), [], []
 
     def begin(folder: Path) -> None:
         together.wait(20)
@@ -299,17 +299,17 @@ def test_of_two_learners_of_one_name_that_start_together_one_gives_way(cart: Pat
                 done.extend(run.learn())
         except ConfigError as error:
             refused.append((folder, str(error)))
-            told.set()
+            refusal.set()
 
     with listen(place.connect[0], "farm"):
         threads = [threading.Thread(target=begin, args=(tmp_path / name,)) for name in "ab"]
         for thread in threads:
             thread.start()
-        assert told.wait(30)
+        assert refusal.wait(30)
         with workers(place.connect[0], 1, cart):
             for thread in threads:
                 thread.join(30)
     assert len(done) == 1
-    ((folder, said),) = refused
-    assert said == "a learner of run same is on farm farm already: choose a different --name"
+    ((folder, reason),) = refused
+    assert reason == "a learner of run same is on farm farm already: choose a different --name"
     assert not (folder / "same").exists()

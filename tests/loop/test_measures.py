@@ -77,46 +77,48 @@ def test_an_evaluation_has_everything_in_order_and_the_same_bits_as_one_process(
     thetas, seeds = np.random.default_rng(0).normal(size=(30, pool.size)), range(30)
     runner = problem(configure(f"{cart}:Cart", policy="linear", gamma=0.9)).runner()
     one = [runner.rollouts(thetas[i : i + 1], [(4, 0, i, 0)]) for i in range(30)]
-    found = pool.evaluate(thetas, seeds, traces=True)
+    outcome = pool.evaluate(thetas, seeds, traces=True)
     assert (
-        found.returns.tobytes() == b"".join(each.returns.tobytes() for each in one) == pool.map(thetas, seeds).tobytes()
+        outcome.returns.tobytes()
+        == b"".join(each.returns.tobytes() for each in one)
+        == pool.map(thetas, seeds).tobytes()
     )
-    assert found.measures.tobytes() == b"".join(each.measures.tobytes() for each in one)
-    assert found.steps.tolist() == [int(each.steps[0]) for each in one]
-    assert len(set(found.steps.tolist())) > 1, "some end early"
-    assert (found.success, found.failed.any()) == (None, False)
+    assert outcome.measures.tobytes() == b"".join(each.measures.tobytes() for each in one)
+    assert outcome.steps.tolist() == [int(each.steps[0]) for each in one]
+    assert len(set(outcome.steps.tolist())) > 1, "some end early"
+    assert (outcome.success, outcome.failed.any()) == (None, False)
     assert pool.spec.terms == ("near", "calm")
-    np.testing.assert_allclose(found.terms.sum(axis=1), found.returns, rtol=1e-12)
+    np.testing.assert_allclose(outcome.terms.sum(axis=1), outcome.returns, rtol=1e-12)
     weights = 0.9 ** np.arange(20)
     for i, each in enumerate(one):
-        np.testing.assert_allclose(found.terms[i], (each.terms[0] * weights[:, None]).sum(axis=0), rtol=1e-12)
-        assert found.traces is not None
+        np.testing.assert_allclose(outcome.terms[i], (each.terms[0] * weights[:, None]).sum(axis=0), rtol=1e-12)
+        assert outcome.traces is not None
         np.testing.assert_array_equal(
-            found.traces[i, : found.steps[i]], each.frames["place"][0, : found.steps[i]].astype("<f4")
+            outcome.traces[i, : outcome.steps[i]], each.frames["place"][0, : outcome.steps[i]].astype("<f4")
         )
-    farthest, push = found.measures.T
+    farthest, push = outcome.measures.T
     assert [each.name for each in pool.spec.measures] == ["farthest", "push"]
     assert (farthest > 0.29).all()
     assert push.min() < 0.5 < push.max() <= 1.0
     # In another order, and others beside them: the same.
     again = pool.evaluate(thetas[::-1], list(seeds)[::-1])
-    assert again.measures[::-1].tobytes() == found.measures.tobytes()
+    assert again.measures[::-1].tobytes() == outcome.measures.tobytes()
     assert again.traces is None
 
 
 def test_nothing_to_evaluate(pool: farm.Farm) -> None:
-    found = pool.evaluate([], traces=True)
-    assert (found.measures.shape, found.terms.shape) == ((0, 2), (0, 2))
-    assert found.traces is not None
-    assert found.traces.shape == (0, 20, 1)
+    outcome = pool.evaluate([], traces=True)
+    assert (outcome.measures.shape, outcome.terms.shape) == ((0, 2), (0, 2))
+    assert outcome.traces is not None
+    assert outcome.traces.shape == (0, 20, 1)
 
 
 def test_a_task_without_measures_or_traces(cart: Path) -> None:
     lines = TASK.replace(", trace=True", "").partition("    def outcomes")[0].splitlines()
     cart.write_text("\n".join(line for line in lines if "measures =" not in line))
     with farm.Farm(f"{cart}:Cart", policy="linear", workers=1) as pool:
-        found = pool.evaluate(np.zeros((3, pool.size)))
-        assert (found.measures.shape, found.terms.shape) == ((3, 0), (3, 2))
+        outcome = pool.evaluate(np.zeros((3, pool.size)))
+        assert (outcome.measures.shape, outcome.terms.shape) == ((3, 0), (3, 2))
         with pytest.raises(ConfigError, match="^traces: no channel of the task has trace=True$"):
             pool.evaluate(np.zeros((3, pool.size)), traces=True)
 
@@ -132,7 +134,7 @@ def test_a_measure_outside_its_bounds_is_named(cart: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "reason"),
     [
         ('"push": np.where', '"shove": np.where', "outcomes 'push' gave a NoneType"),
         ("return {\"push\"", "return 3 or {\"push\"", "outcomes gave a int; expected arrays by name"),
@@ -140,17 +142,17 @@ def test_a_measure_outside_its_bounds_is_named(cart: Path) -> None:
         ("far.clip(0.0, 2.0)", "record.frames['place']", r"outcomes 'farthest'.* \(1, 20, 1\)"),
     ],
 )  # fmt: skip
-def test_wrong_outcomes_are_one_line(cart: Path, old: str, new: str, said: str) -> None:
+def test_wrong_outcomes_are_one_line(cart: Path, old: str, new: str, reason: str) -> None:
     assert old in TASK
     cart.write_text(TASK.replace(old, new))
     runner = problem(small(cart)).runner()
-    with pytest.raises(TaskError, match=said) as error:
+    with pytest.raises(TaskError, match=reason) as error:
         runner.rollouts(np.zeros((1, runner.size)), [None])
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "reason"),
     [
         ('name="push"', 'name="farthest"', "task Cart: two measures are named alike: farthest, farthest"),
         ('name="push"', 'name="a b"', "measure 'a b': expected a name of letters, digits and _"),
@@ -159,10 +161,10 @@ def test_wrong_outcomes_are_one_line(cart: Path, old: str, new: str, said: str) 
         ("measures = (", "measures = 3, (", r"measures is \(3, .*; expected a tuple of farm.Measure"),
     ],
 )
-def test_wrong_measures_are_one_line(cart: Path, old: str, new: str, said: str) -> None:
+def test_wrong_measures_are_one_line(cart: Path, old: str, new: str, reason: str) -> None:
     assert old in TASK
     cart.write_text(TASK.replace(old, new))
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=reason):
         problem(small(cart))
 
 
@@ -172,9 +174,9 @@ def test_an_unstable_rollout_has_the_lowest_measures_and_no_terms(cart: Path) ->
                      "        return super().act(sim, action)\n\n    def measure(")
     )  # fmt: skip
     runner = problem(small(cart)).runner()
-    found = runner.rollouts(np.zeros((2, runner.size)), [None, None])
-    assert found.failed.all()
-    assert found.measures.tolist() == [[0.0, 0.0]] * 2
+    rollouts = runner.rollouts(np.zeros((2, runner.size)), [None, None])
+    assert rollouts.failed.all()
+    assert rollouts.measures.tolist() == [[0.0, 0.0]] * 2
 
 
 # ---------------------------------------------------------------- a run
@@ -183,16 +185,16 @@ def test_an_unstable_rollout_has_the_lowest_measures_and_no_terms(cart: Path) ->
 def test_progress_and_summary_have_measures_and_workers_do_not_matter(cart: Path, tmp_path: Path) -> None:
     one, two = (learnt(small(cart), tmp_path / str(count), count, cart, audit=0.5) for count in (1, 2))
     lines = [RunFolder.open(tmp_path / name).progress() for name in "12"]
-    told = [[(each.measures, each.mean_policy_measures) for each in run] for run in lines]
-    assert told[0] == told[1]
-    assert told[0][0][1]["farthest"] == pytest.approx(0.5, abs=1e-3), "a policy of zeros leaves it where it was"
-    assert told[0][0][1]["push"] == 0.0
-    assert 0.0 < told[0][0][0]["push"] < 1.0
+    measures = [[(each.measures, each.mean_policy_measures) for each in run] for run in lines]
+    assert measures[0] == measures[1]
+    assert measures[0][0][1]["farthest"] == pytest.approx(0.5, abs=1e-3), "a policy of zeros leaves it where it was"
+    assert measures[0][0][1]["push"] == 0.0
+    assert 0.0 < measures[0][0][0]["push"] < 1.0
     assert one["mean_policy_measures"] == two["mean_policy_measures"]
     assert 0.29 < one["robust_measures"]["farthest"] < 1.0
     learnt(small(cart, generations=1), tmp_path / "half", 1, cart)
     learnt(small(cart), tmp_path / "half", 1, cart, resume=True)
-    assert [each.measures for each in RunFolder.open(tmp_path / "half").progress()] == [each for each, _ in told[0]]
+    assert [each.measures for each in RunFolder.open(tmp_path / "half").progress()] == [each for each, _ in measures[0]]
     without = TASK.replace("    measures = ", "    others = ")
     cart.write_text(without)
     bare = learnt(small(cart), tmp_path / "bare", 1, cart)
@@ -229,6 +231,6 @@ def test_a_sweeps_table_has_them(
     for row in rows:
         assert 0.29 < float(row["measure_farthest"]) < 2.0
         assert 0.0 <= float(row["measure_push"]) <= 1.0
-    said = capsys.readouterr().out
-    assert "farthest" in said
-    assert "push" in said
+    output = capsys.readouterr().out
+    assert "farthest" in output
+    assert "push" in output

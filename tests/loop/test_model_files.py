@@ -52,12 +52,12 @@ def test_workers_without_the_robot_learn_it_and_the_run_keeps_it(task: Path, cop
     shutil.rmtree(task.parent / "robot")
     assert learnt(config, tmp_path / "half", 1, copy, resume=True)["parameters_sha256"] == one["parameters_sha256"]
     assert load(tmp_path / "1").rollout().trajectory.value == one["mean_policy_return"]
-    shown = load(tmp_path / "1").rollout()
-    ball = shown.trajectory.bodies[:, -1, :3]
+    replay = load(tmp_path / "1").rollout()
+    ball = replay.trajectory.bodies[:, -1, :3]
     np.testing.assert_allclose(
         ball[::5, 2][1:], 0.3 + 0.01 * np.arange(20), rtol=1e-6, err_msg="a moving goal is drawn"
     )
-    np.testing.assert_array_equal(shown.frames["mocap"][1:, 0, 2], np.repeat(0.3 + 0.01 * np.arange(20), 5))
+    np.testing.assert_array_equal(replay.frames["mocap"][1:, 0, 2], np.repeat(0.3 + 0.01 * np.arange(20), 5))
     assert load(tmp_path / "1", generation=0).problem.task.model.nmesh == 1
     for stats in RunFolder.open(tmp_path / "1").progress():
         assert rewind(tmp_path / "1", stats.generation).returns.max() == stats.return_max

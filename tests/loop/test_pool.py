@@ -43,9 +43,9 @@ def thetas() -> FloatArray:
 def alone(thetas: FloatArray) -> FloatArray:
     """The same evaluations in this process."""
     runner = problem(configure("finger-gait", policy="linear")).runner()
-    found = runner.rollouts(thetas, [(4, 0, i, 0) for i in range(COUNT)]).returns
+    returns = runner.rollouts(thetas, [(4, 0, i, 0) for i in range(COUNT)]).returns
     runner.close()
-    return found
+    return returns
 
 
 def test_returns_are_in_order_and_the_same_bits_as_in_one_process(
@@ -60,10 +60,10 @@ def test_returns_are_in_order_and_the_same_bits_as_in_one_process(
 
 def test_a_worker_that_is_killed_changes_nothing(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
     results = pool.imap(thetas, seeds=range(COUNT))
-    found = [next(results)]
+    pairs = [next(results)]
     os.kill(pool.worker_pids[0], signal.SIGKILL)
-    found += results
-    assert sorted(found) == list(enumerate(alone.tolist()))
+    pairs += results
+    assert sorted(pairs) == list(enumerate(alone.tolist()))
 
 
 @pytest.mark.slow
@@ -72,11 +72,11 @@ def test_two_of_three_workers_that_are_killed_change_nothing(thetas: FloatArray,
         assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
         many = np.tile(thetas, (6, 1))
         results = pool.imap(many, seeds=np.tile(np.arange(COUNT), 6))
-        found = dict([next(results)])
+        returns = dict([next(results)])
         for pid in pool.worker_pids[:2]:
             os.kill(pid, signal.SIGKILL)
-        found |= dict(results)
-        assert [found[i] for i in range(len(many))] == np.tile(alone, 6).tolist()
+        returns |= dict(results)
+        assert [returns[i] for i in range(len(many))] == np.tile(alone, 6).tolist()
 
 
 def test_an_abandoned_imap_does_not_block_other_calls(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
@@ -92,9 +92,9 @@ def test_an_abandoned_imap_does_not_block_other_calls(pool: farm.Farm, thetas: F
 
 
 def test_a_rollout_shows_its_channels(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
-    shown = pool.rollout(thetas[3], seed=3)
-    assert shown.value == alone[3]
-    assert shown.channels["tactile"].shape[1:] == (3, 6, 3)
+    trajectory = pool.rollout(thetas[3], seed=3)
+    assert trajectory.value == alone[3]
+    assert trajectory.channels["tactile"].shape[1:] == (3, 6, 3)
     assert pool.rollout(thetas[3]).value == pool.map(thetas[3:4])[0]
 
 
@@ -111,16 +111,16 @@ def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: Fl
     with listen(endpoint, "farm"):
         worker.start()
         try:
-            with farm.Farm("finger-gait", policy="linear", connect=endpoint) as joined:
-                assert not joined.worker_pids
-                assert joined.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
+            with farm.Farm("finger-gait", policy="linear", connect=endpoint) as client:
+                assert not client.worker_pids
+                assert client.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
         finally:
             stop.set()
             worker.join(30)
 
 
 @pytest.mark.parametrize(
-    ("thetas", "seeds", "said"),
+    ("thetas", "seeds", "reason"),
     [
         ([1.0], None, r"thetas has shape \(1,\); expected \(B, 72\)"),
         (np.zeros((2, 3)), None, r"thetas has shape \(2, 3\); expected \(B, 72\)"),
@@ -136,9 +136,9 @@ def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: Fl
         (np.zeros((1, 72)), [2**32], "expected a whole number from 0 to 4294967295"),
     ],
 )
-def test_arrays_that_do_not_fit(pool: farm.Farm, thetas: object, seeds: object, said: str) -> None:
+def test_arrays_that_do_not_fit(pool: farm.Farm, thetas: object, seeds: object, reason: str) -> None:
     for call in (pool.map, pool.imap):
-        with pytest.raises(farm.ConfigError, match=said) as error:
+        with pytest.raises(farm.ConfigError, match=reason) as error:
             call(thetas, seeds)  # type: ignore[arg-type]
         assert "\n" not in str(error.value)
 
@@ -160,20 +160,20 @@ def test_names_and_numbers_that_no_farm_has() -> None:
 
 def test_closing_ends_a_waiting_call(thetas: FloatArray) -> None:
     pool = farm.Farm("finger-gait", policy="linear", workers=1)
-    ended = threading.Event()
+    over = threading.Event()
 
     def ask() -> None:
         try:
             while True:
                 pool.map(thetas)
         except farm.RunError:
-            ended.set()
+            over.set()
 
     thread = threading.Thread(target=ask)
     thread.start()
     pool.close()
     thread.join(30)
-    assert ended.is_set()
+    assert over.is_set()
     with pytest.raises(farm.RunError, match="the pool is closed"):
         pool.map(thetas)
 
@@ -193,13 +193,13 @@ def test_it_waits_and_says_so_while_no_worker_is_there(
     thetas: FloatArray, alone: FloatArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dispatcher, "_PATIENCE", 0.1)
-    endpoint, stop, said = free_endpoint(), threading.Event(), queue.Queue[str]()
+    endpoint, stop, warnings = free_endpoint(), threading.Event(), queue.Queue[str]()
     worker = threading.Thread(target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set))
-    monkeypatch.setattr(dispatcher.log, "warning", lambda text, *values: said.put(text % values))
+    monkeypatch.setattr(dispatcher.log, "warning", lambda text, *values: warnings.put(text % values))
     with listen(endpoint, "farm"), farm.Farm("finger-gait", policy="linear", connect=endpoint) as pool:
         with ThreadPoolExecutor(1) as thread:
             waits = thread.submit(pool.map, thetas, range(COUNT))
-            assert said.get(timeout=30) == f"no workers; start some with: farm worker --connect {endpoint}"
+            assert warnings.get(timeout=30) == f"no workers; start some with: farm worker --connect {endpoint}"
             assert not waits.done()
             worker.start()
             try:
@@ -217,8 +217,8 @@ def test_with_certificates(thetas: FloatArray, alone: FloatArray, tmp_path: Path
     with listen(endpoint, "farm", find(tmp_path, "learner")):
         worker.start()
         try:
-            with farm.Farm("finger-gait", policy="linear", connect=endpoint, tls=tmp_path / "learner") as joined:
-                assert joined.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
+            with farm.Farm("finger-gait", policy="linear", connect=endpoint, tls=tmp_path / "learner") as client:
+                assert client.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
         finally:
             stop.set()
             worker.join(30)
@@ -249,9 +249,9 @@ def test_ctrl_c_ends_a_call_and_the_workers() -> None:
     assert script.stdout
     pids = script.stdout.readline().split()
     script.send_signal(signal.SIGINT)
-    said, errors = script.communicate(timeout=60)
+    output, errors = script.communicate(timeout=60)
     assert script.returncode == -signal.SIGINT
-    assert said.splitlines()[-1].startswith("["), "after Ctrl-C the pool is usable"
+    assert output.splitlines()[-1].startswith("["), "after Ctrl-C the pool is usable"
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
 
@@ -270,7 +270,7 @@ print(*pool.worker_pids, flush=True)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("end", "status", "said"),
+    ("end", "status", "message"),
     [
         ("", 0, ""),
         ("del pool, pairs", 0, ""),
@@ -278,13 +278,13 @@ print(*pool.worker_pids, flush=True)
         ("raise ValueError('of the script')", 1, "ValueError: of the script"),
     ],
 )
-def test_a_script_that_closes_nothing_ends_and_its_workers_too(end: str, status: int, said: str) -> None:
+def test_a_script_that_closes_nothing_ends_and_its_workers_too(end: str, status: int, message: str) -> None:
     script = subprocess.run(
         [sys.executable, "-c", _LEFT_OPEN + end], capture_output=True, text=True, timeout=60, check=False
     )
     assert script.returncode == status
-    assert script.stderr.rstrip().endswith(said)
-    assert bool(script.stderr) == bool(said), "nothing else is said"
+    assert script.stderr.rstrip().endswith(message)
+    assert bool(script.stderr) == bool(message), "nothing else is said"
     assert not any(Path(f"/proc/{pid}").exists() for pid in script.stdout.split())
 
 
@@ -310,9 +310,9 @@ def test_standing_workers_serve_it_beside_a_learner(thetas: FloatArray, alone: F
                 before = done[0]
                 for _ in range(10):
                     assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
-                theirs = done[0] - before
+                learners = done[0] - before
         finally:
             stop.set()
             learner.join(60)
             worker.join(30)
-    assert COUNT < theirs < 40 * COUNT, "each has had its share of the worker"
+    assert COUNT < learners < 40 * COUNT, "each has had its share of the worker"

@@ -40,10 +40,10 @@ def test_the_numbers_of_runs_one_by_one(tmp_path: Path, words: tuple[str, ...], 
     pytest.importorskip("gymnasium")
     out = tmp_path / "out.jsonl"
     command = [sys.executable, str(TABLES), *words, "--seed", "0", "3", "--starts", "2", "--out", str(out)]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     _, third = (json.loads(line) for line in out.read_text().splitlines())
     assert third["seed"] == 3
-    assert f"| {words[1]} | 3 |" in said
+    assert f"| {words[1]} | 3 |" in output
     config = configure(
         f"gym:{words[1]}", policy="linear", normalise=True, initial_mu=0.0, reward_offset=-1.0, seed=3,
         generations=10_000, **settings,

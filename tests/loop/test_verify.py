@@ -40,10 +40,10 @@ def test_an_interrupted_repetition_of_the_whole_run_continues(
     words += ["--receipt", str(tmp_path / "r.json")]
 
     def pressed(*values: Any) -> Iterator[tuple[int, int]]:
-        for count, found in enumerate(repeated(*values), 1):
+        for count, result in enumerate(repeated(*values), 1):
             if count == 3:
                 signal.raise_signal(signal.SIGINT)
-            yield found
+            yield result
 
     with monkeypatch.context() as patched:
         patched.setattr(command, "verify_all", pressed)

@@ -23,19 +23,19 @@ Call = tuple[str, str]
 
 def calls(folder: Path, generations: int) -> list[Call]:
     """File and name of each function that a run of the hand calls while it learns, in order; learner and worker."""
-    seen: list[Call] = []
+    out: list[Call] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
         if event == "call" and code.co_filename.startswith(PACKAGES):
-            seen.append((code.co_filename.removeprefix(ROOT), code.co_qualname))
+            out.append((code.co_filename.removeprefix(ROOT), code.co_qualname))
 
     config, endpoint = configure("finger-gait", pairs=2, generations=generations), free_endpoint()
     with profiled(note), open_run(config, folder, Placement(listen=endpoint)) as run, workers(endpoint, 1):
-        seen.clear()
+        out.clear()
         for _ in run.learn():
             pass
-    return seen
+    return out
 
 
 @contextmanager
@@ -63,11 +63,11 @@ def test_a_way_is_the_pages(tmp_path: Path, of: str, generations: int, most: int
     page = way(of)
     assert len(page.stations) >= 8
     assert len(page.files) <= most
-    seen = [station(call) for call in calls(tmp_path / "r", generations)]
-    begins = [at for at, call in enumerate(seen) if call == ("learner/run/learner.py", "explored")]
+    stations = [station(call) for call in calls(tmp_path / "r", generations)]
+    begins = [at for at, call in enumerate(stations) if call == ("learner/run/learner.py", "explored")]
     assert len(begins) == generations
     first: dict[Call, int] = {}
-    for at, call in enumerate(seen[begins[-1] :]):
+    for at, call in enumerate(stations[begins[-1] :]):
         first.setdefault(call, at)
     missing = [each for each in page.stations if each not in first]
     assert not missing

@@ -18,11 +18,11 @@ from learner.run.config import RunConfig
 from learner.run.launch import Placement, Run, open_run
 
 
-def without_simulating(said: Any) -> Any:
+def without_simulating(message: Any) -> Any:
     """Another canary, and returns that are made up."""
-    if isinstance(said, WorkRequest):
-        return replace(said, canary=BOGUS)
-    return replace(said, returns=np.full_like(said.returns, 1000.0))
+    if isinstance(message, WorkRequest):
+        return replace(message, canary=BOGUS)
+    return replace(message, returns=np.full_like(message.returns, 1000.0))
 
 
 def admitted(run: Run) -> set[str]:

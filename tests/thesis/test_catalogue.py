@@ -25,8 +25,8 @@ from learner.run.setup import problem
 
 
 def test_every_experiment_shows_set_ups_that_exist_and_every_set_up_is_shown():
-    shown = {name for experiment in EXPERIMENTS.values() for name in experiment.curves.values()}
-    assert shown | {base for base, _ in FITTED.values()} == set(SETUPS) | set(FITTED)
+    names = {name for experiment in EXPERIMENTS.values() for name in experiment.curves.values()}
+    assert names | {base for base, _ in FITTED.values()} == set(SETUPS) | set(FITTED)
     assert not set(SETUPS) & set(FITTED)
 
 
@@ -44,8 +44,8 @@ def test_set_ups_can_be_begun(name):
 
 def test_a_fitted_start_changes_width_and_first_sigma_or_one_of_them():
     def of(name):
-        found = config(name)
-        return found.policy_config.bandwidth, found.algorithm_config.initial_sigma
+        settings = config(name)
+        return settings.policy_config.bandwidth, settings.algorithm_config.initial_sigma
 
     printed, both = of("contacts-D1500"), of("contacts-D1500-fitted")
     assert printed == (1.0, 2.0)
@@ -85,8 +85,8 @@ def test_nothing_is_said_of_a_set_up_without_runs(tmp_path):
     data = Data({"N 50": nothing, "N 15": made(rising(4, -1, 9, 3))}, {}, configs)
     assert judge(experiment, data) == []
     assert verdict([]) == "open"
-    said = draw(experiment, data, tmp_path)[1].read_text()
-    assert "N 50: trial 0 missing" in " ".join(re.sub("<[^>]*>", " ", said).split())
+    svg = draw(experiment, data, tmp_path)[1].read_text()
+    assert "N 50: trial 0 missing" in " ".join(re.sub("<[^>]*>", " ", svg).split())
 
 
 def test_the_features_that_the_thesis_recommends():

@@ -37,9 +37,9 @@ def from_a_checkout():
 
 def call(farm: Farm, *words: str, status: int = 0, timeout: float = 170) -> str:
     process = start(farm, *words)
-    said, _ = process.communicate(timeout=timeout)
-    assert process.returncode == status, said
-    return said
+    output, _ = process.communicate(timeout=timeout)
+    assert process.returncode == status, output
+    return output
 
 
 def start(farm: Farm, *words: str):
@@ -63,23 +63,23 @@ def farm(tmp_path: Path):
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory):
     farm = Farm(tmp_path_factory.mktemp("experiment"))
-    farm.said = call(farm, *SHORT, "--out", "side", "--parallel", "3")  # type: ignore[attr-defined]
+    farm.output = call(farm, *SHORT, "--out", "side", "--parallel", "3")  # type: ignore[attr-defined]
     yield farm
     farm.close()
 
 
 @pytest.mark.slow
 def test_the_data_is_what_the_runs_recorded(done: Farm) -> None:
-    assert "6 of 6 runs to do" in done.said  # type: ignore[attr-defined]
-    assert "runs shortened to 3 generations" in done.said  # type: ignore[attr-defined]
+    assert "6 of 6 runs to do" in done.output  # type: ignore[attr-defined]
+    assert "runs shortened to 3 generations" in done.output  # type: ignore[attr-defined]
     for setup in ("joints-D300-30", "joints-D1500-30", "joints-D8000-30"):
         with np.load(done.folder / "side" / "data" / f"{setup}.npz", allow_pickle=False) as data:
             assert data["states"].tolist() == ["finished", "finished"]
             for number in range(2):
                 lines = (done.folder / "side" / "runs" / f"{setup}-s{number}" / "progress.jsonl").read_text()
-                told = [json.loads(line)["return_mean"] for line in lines.splitlines()]
-                assert len(told) == 3
-                assert data["return_mean"][number].tolist() == np.float32(told).tolist()
+                returns = [json.loads(line)["return_mean"] for line in lines.splitlines()]
+                assert len(returns) == 3
+                assert data["return_mean"][number].tolist() == np.float32(returns).tolist()
     assert (done.folder / "side" / "fig-4.3.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -114,7 +114,7 @@ def test_figures_come_from_the_data_alone(done: Farm) -> None:
 
 def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ExperimentFolder.prepare(tmp_path / "side", ["fig-4.3"], 2, 3)
-    for words, said in (
+    for words, reason in (
         (("fig-9",), "unknown experiment 'fig-9'; known are fig-4.1"),
         ((), "which experiment? python -m benchmarks.thesis --list shows them"),
         (("fig-4.5", "--out", str(tmp_path / "side")), "side holds fig-4.3: give a different --out"),
@@ -124,7 +124,7 @@ def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ):
         with pytest.raises(ConfigError) as line:
             main(words)
-        assert said in str(line.value)
+        assert reason in str(line.value)
         assert len(str(line.value).splitlines()) == 1
     assert main(("--list",)) == 0
     assert "thesis" in capsys.readouterr().out
@@ -132,12 +132,12 @@ def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.slow
 def test_an_interrupted_experiment_goes_on_to_the_same_numbers(farm: Farm, done: Farm) -> None:
-    begun = start(farm, *SHORT, "--out", "side")
+    process = start(farm, *SHORT, "--out", "side")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/*/progress.jsonl")))
-    begun.send_signal(signal.SIGTERM)
-    said, _ = begun.communicate(timeout=60)
-    assert begun.returncode == 130, said
-    assert "runs are left; the same command continues" in said
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert "runs are left; the same command continues" in output
     call(farm, *SHORT, "--out", "side")
     assert hashes(farm.folder / "side").items() <= hashes(done.folder / "side").items()
     assert len(hashes(farm.folder / "side")) == 6
@@ -145,12 +145,12 @@ def test_an_interrupted_experiment_goes_on_to_the_same_numbers(farm: Farm, done:
 
 @pytest.mark.slow
 def test_a_killed_experiment_leaves_no_process_behind(farm: Farm) -> None:
-    begun = start(farm, *SHORT, "--out", "side")
+    process = start(farm, *SHORT, "--out", "side")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/*/progress.jsonl")))
-    started = children(begun.pid)
+    started = children(process.pid)
     assert len(started) > 2
-    begun.kill()
-    begun.wait()
+    process.kill()
+    process.wait()
     farm.wait_for(lambda: not any(Path(f"/proc/{pid}").exists() and not _zombie(pid) for pid in started))
 
 
@@ -163,17 +163,17 @@ def _zombie(pid: int) -> bool:
 
 @pytest.mark.slow
 def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) -> None:
-    begun = start(farm, *SHORT, "--out", "side", "--parallel", "2")
+    process = start(farm, *SHORT, "--out", "side", "--parallel", "2")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/joints-D8000-30-s0/progress.jsonl")))
     learners = [
-        pid for pid in children(begun.pid) if b"joints-D8000-30-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        pid for pid in children(process.pid) if b"joints-D8000-30-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
     assert len(learners) == 1
     os.kill(learners[0], signal.SIGKILL)
-    said, _ = begun.communicate(timeout=120)
-    assert begun.returncode == 1, said
-    assert "joints-D8000-30-s0 failed" in said
-    assert "D 8000: trial 0" in said
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 1, output
+    assert "joints-D8000-30-s0 failed" in output
+    assert "D 8000: trial 0" in output
     again = call(farm, *SHORT, "--out", "side")
     assert "1 of 6 runs to do" in again
     assert "D 8000: trial 0" not in again
@@ -188,8 +188,8 @@ def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) 
     ],
 )
 def test_what_is_measured_on_learnt_policies(farm: Farm, name: str, measured: str, shape: tuple[int, ...]) -> None:
-    said = call(farm, name, "--trials", "1", "--generations", "1", "--out", "e", timeout=170)
-    assert f"{name}: e/{name}.png and e/{name}.svg" in said
+    output = call(farm, name, "--trials", "1", "--generations", "1", "--out", "e", timeout=170)
+    assert f"{name}: e/{name}.png and e/{name}.svg" in output
     path = farm.folder / "e" / "data" / f"{name}.npz"
     with np.load(path, allow_pickle=False) as data:
         assert data[measured].shape == shape
@@ -210,8 +210,8 @@ def test_on_the_workers_of_a_farm_encrypted_and_recorded(farm: Farm, done: Farm)
     farm.start("worker", "--connect", endpoint, "--tls", "certs/worker-w", "--processes", "1")
     words = ("fig-4.3", "--trials", "1", "--generations", "3", "--out", "side", "--record")
     call(farm, *words, "--connect", endpoint, "--tls", "certs/learner")
-    found = hashes(farm.folder / "side")
-    assert len(found) == 3
-    assert found.items() <= hashes(done.folder / "side").items()
-    for name in found:
+    digests = hashes(farm.folder / "side")
+    assert len(digests) == 3
+    assert digests.items() <= hashes(done.folder / "side").items()
+    for name in digests:
         assert generations(farm.folder / "side/runs" / name / "run.rrd") == [1, 2, 3]

@@ -32,21 +32,21 @@ def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
 
     experiment = EXPERIMENTS[name]
     count, rng = len(experiment.curves), np.random.default_rng(0)
-    shown = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
-    if shown:
-        broken = {k: np.where(np.arange(30) < 12, v, np.nan) for k, v in shown[0].columns.items()}
-        shown[0] = replace(shown[0], columns=broken, states=("finished",) * 3 + ("diverged", "missing"))
-    known = dict(zip(experiment.curves, shown, strict=True))
+    curves = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
+    if curves:
+        broken = {k: np.where(np.arange(30) < 12, v, np.nan) for k, v in curves[0].columns.items()}
+        curves[0] = replace(curves[0], columns=broken, states=("finished",) * 3 + ("diverged", "missing"))
+    series = dict(zip(experiment.curves, curves, strict=True))
     configs = {label: config(name) for label, name in experiment.curves.items()}
-    paths = draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)
+    paths = draw(experiment, Data(series, measurements(experiment, count), configs), tmp_path)
     assert all(path.stat().st_size > 5000 for path in paths)
     svg = " ".join(re.sub("<[^>]*>", " ", paths[1].read_text()).split())
     assert experiment.title in svg
-    assert not shown or "trial 3 diverged" in svg
+    assert not curves or "trial 3 diverged" in svg
     if name != "fig-4.1":
         return
     again = paths[1].read_bytes()
-    assert draw(experiment, Data(known, measurements(experiment, count), configs), tmp_path)[1].read_bytes() == again
+    assert draw(experiment, Data(series, measurements(experiment, count), configs), tmp_path)[1].read_bytes() == again
 
 
 def test_a_figure_keeps_the_numbers_that_are_read() -> None:
@@ -81,20 +81,20 @@ def test_every_claim_is_held_against_any_data(name):
     experiment = EXPERIMENTS[name]
     count = len(experiment.curves)
     rng = np.random.default_rng(2)
-    shown = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
-    known = dict(zip(experiment.curves, shown, strict=True))
+    curves = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
+    series = dict(zip(experiment.curves, curves, strict=True))
     assert experiment.find
-    shown_data = Data(known, measurements(experiment, count), dict.fromkeys(known, RunConfig()))
-    found = judge(experiment, shown_data)
-    assert found
-    if known:  # one that ended after three generations is judged as well, one that is missing not at all
-        label, first = next(iter(known.items()))
+    data = Data(series, measurements(experiment, count), dict.fromkeys(series, RunConfig()))
+    findings = judge(experiment, data)
+    assert findings
+    if series:  # one that ended after three generations is judged as well, one that is missing not at all
+        label, first = next(iter(series.items()))
         short = {
             k: np.where((np.arange(5) == 4)[:, None] & (np.arange(30) > 2), np.nan, v) for k, v in first.columns.items()
         }
-        known[label] = replace(first, columns=short, states=("finished",) * 4 + ("diverged",))
-        assert judge(experiment, shown_data)
-        known[label] = replace(first, states=("finished",) * 4 + ("missing",))
-        assert judge(experiment, shown_data) == []
-    assert all(finding.holds in (True, False, UNDECIDED, UNTESTABLE) for finding in found)
-    assert all(finding.part and finding.numbers for finding in found)
+        series[label] = replace(first, columns=short, states=("finished",) * 4 + ("diverged",))
+        assert judge(experiment, data)
+        series[label] = replace(first, states=("finished",) * 4 + ("missing",))
+        assert judge(experiment, data) == []
+    assert all(finding.holds in (True, False, UNDECIDED, UNTESTABLE) for finding in findings)
+    assert all(finding.part and finding.numbers for finding in findings)

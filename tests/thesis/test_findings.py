@@ -64,10 +64,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 
 def test_set_ups_that_never_learn_are_not_compared():
     low, lower = (np.full((5, 150), level) + 0.01 * np.arange(5)[:, None] for level in (-5.27, -5.29))
-    for found in (claims.pairs_per_generation, claims.rollouts_count):
-        shown = data(made(low, robust=np.zeros(5)), made(lower, robust=np.zeros(5)))
-        assert set(holds(found(shown))) == {UNTESTABLE}
-        assert verdict(found(shown)) == "cannot be tested"
+    for claim in (claims.pairs_per_generation, claims.rollouts_count):
+        flat = data(made(low, robust=np.zeros(5)), made(lower, robust=np.zeros(5)))
+        assert set(holds(claim(flat))) == {UNTESTABLE}
+        assert verdict(claim(flat)) == "cannot be tested"
     learnt = made(rising(20, -1), success=np.ones((5, 150)))
     third = claims.states(data(learnt, made(low), made(lower)))[2]
     assert third.holds == UNTESTABLE, "contacts and touch both fail, and the least bit decides nothing"
@@ -77,7 +77,7 @@ def test_noise_does_not_make_two_set_ups_equal():
     rng = np.random.default_rng(3)
     for spread, holds in ((2.0, UNDECIDED), (0.1, True)):
         trials = -3.0 + rng.normal(0.0, spread, (2, 5, 1)) + np.zeros((2, 5, 150))
-        assert claims.rollouts_count(data(*(made(own, np.ones((5, 150))) for own in trials)))[1].holds == holds
+        assert claims.rollouts_count(data(*(made(returns, np.ones((5, 150))) for returns in trials)))[1].holds == holds
 
 
 def test_an_experiment_has_its_own_number_of_trials(tmp_path):
@@ -93,13 +93,13 @@ def test_an_experiment_has_its_own_number_of_trials(tmp_path):
         ExperimentFolder.prepare(folder.path, ["fig-4.3", "fig-4.4"], 5, None)
 
 
-def data(*shown: Series, **measured: np.ndarray) -> Data:
-    labels = [chr(97 + i) for i in range(len(shown))]
-    return Data(dict(zip(labels, shown, strict=True)), measured, dict.fromkeys(labels, RunConfig()))
+def data(*series: Series, **measured: np.ndarray) -> Data:
+    labels = [chr(97 + i) for i in range(len(series))]
+    return Data(dict(zip(labels, series, strict=True)), measured, dict.fromkeys(labels, RunConfig()))
 
 
-def holds(found: list[Finding]) -> list[bool]:
-    return [finding.holds for finding in found]
+def holds(findings: list[Finding]) -> list[bool]:
+    return [finding.holds for finding in findings]
 
 
 def test_the_race_to_the_bottom_is_told_from_learning():
@@ -114,11 +114,11 @@ def test_the_race_to_the_bottom_is_told_from_learning():
 
 def test_more_features_learn_faster_or_they_do_not():
     learnt = np.ones((5, 150))
-    few, some, many = made(rising(151, 0)), made(rising(90, -5), learnt), made(rising(40, -1), learnt)
-    for shown, expected in (((few, some, many), True), ((many, some, few), False)):
-        found = holds(claims.features(data(*shown)))
-        assert found[1] is expected
-        assert found[2] is expected
+    few, middle, many = made(rising(151, 0)), made(rising(90, -5), learnt), made(rising(40, -1), learnt)
+    for curves, expected in (((few, middle, many), True), ((many, middle, few), False)):
+        answers = holds(claims.features(data(*curves)))
+        assert answers[1] is expected
+        assert answers[2] is expected
 
 
 def test_scaled_returns_are_compared_after_division():

@@ -20,8 +20,8 @@ def folder_with(path: Path, generations: int, state: str = "finished") -> RunFol
     """A run's folder with the files of a finished run."""
     run = RunFolder.create(path, RunConfig(generations=9))
     for g in range(1, generations + 1):
-        told = stats(g, return_mean=-g / 7, mean_policy_success=g > 3)
-        run.append(told, np.arange(8.0) * g, np.arange(8.0) / g, 9)
+        progress = stats(g, return_mean=-g / 7, mean_policy_success=g > 3)
+        run.append(progress, np.arange(8.0) * g, np.arange(8.0) / g, 9)
     run.write_summary({
         "state": state, "mean_policy_success": True, "robust_success_rate": 0.9, "mean_policy_return": -0.25,
         "parameters_sha256": "ab", "seconds": 3.0,
@@ -31,9 +31,9 @@ def folder_with(path: Path, generations: int, state: str = "finished") -> RunFol
 
 def test_a_series_is_what_the_runs_recorded_and_survives_its_file(tmp_path):
     runs = [folder_with(tmp_path / "a", 9), folder_with(tmp_path / "b", 4, "diverged"), RunFolder(tmp_path / "none")]
-    read = series.read(runs, RunConfig(generations=9))
-    series.save(tmp_path / "s.npz", read)
-    for s in (read, series.load(tmp_path / "s.npz")):
+    trials = series.read(runs, RunConfig(generations=9))
+    series.save(tmp_path / "s.npz", trials)
+    for s in (trials, series.load(tmp_path / "s.npz")):
         assert s.states == ("finished", "diverged", "missing")
         assert s.failures() == ["trial 1 diverged", "trial 2 missing"]
         np.testing.assert_allclose(s.columns["return_mean"][0], -np.arange(1, 10) / 7, rtol=1e-6)
@@ -110,9 +110,9 @@ def test_data_whose_runs_are_gone_is_not_overwritten(tmp_path):
                                   '{"version": 1, "experiments": ["fig-4.3"], "trials": "2"}'])  # fmt: skip
 def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "experiment.json").write_text(text)
-    with pytest.raises(ConfigError) as said:
+    with pytest.raises(ConfigError) as error:
         ExperimentFolder.open(tmp_path)
-    assert "\n" not in str(said.value)
+    assert "\n" not in str(error.value)
 
 
 def test_an_unknown_experiment_names_the_known_ones():
