@@ -59,7 +59,7 @@ def _learnt(config: RunConfig, audit: float, most: float) -> tuple[list[float], 
     """
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
     flags = ["--connect", place.listen, "--log-level", "WARNING"]
-    times, checks, known = list[float](), list[int](), 0
+    times, checks, warmup = list[float](), list[int](), 0
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder) / "run", place) as run:
         with (
             LocalWorkers(1, [*flags, "--name", "a"]),
@@ -68,8 +68,8 @@ def _learnt(config: RunConfig, audit: float, most: float) -> tuple[list[float], 
             for _ in run.learn():
                 times.append(time.perf_counter())
                 checks.append(min(run.dispatcher.checks.values(), default=0))
-                known = known or (len(times) if checks[-1] >= EARNED else 0)
-                if len(times) == (2 * known or most):
+                warmup = warmup or (len(times) if checks[-1] >= EARNED else 0)
+                if len(times) == (2 * warmup or most):
                     break
     return times, checks
 

@@ -66,8 +66,8 @@ def of_loop() -> Opened:
         if kind == "zero":
             return evaluate(kind, rows)
         if kind not in runners:
-            made = problem(evaluations.config(kind))
-            runners[kind] = Runner(made.task, made.policy, lambda model: BatchEngine(model, 200, WORKERS))
+            subject = problem(evaluations.config(kind))
+            runners[kind] = Runner(subject.task, subject.policy, lambda model: BatchEngine(model, 200, WORKERS))
         return runners[kind].rollouts(rows, [(row // 2,) for row in range(len(rows))]).returns
 
     yield _pooled(call, None)
@@ -218,14 +218,14 @@ def of_run(*, record: bool) -> Opened:
     runs: dict[tuple[str, int], Any] = {}
     with tempfile.TemporaryDirectory() as folder:
 
-        def begun(kind: str, pairs: int) -> Any:  # noqa: ANN401
+        def reports(kind: str, pairs: int) -> Any:  # noqa: ANN401
             config = evaluations.config(kind, generations=100_000)
             still = {"learning_rate_mu": 0.0, "learning_rate_sigma": 0.0, "initial_sigma": 0.02}
             middle = {"initial_mu": evaluations.STILL} if kind == "gait" else {}
-            own = replace(config.algorithm_config, pairs=pairs, **still, **middle)
+            algorithm = replace(config.algorithm_config, pairs=pairs, **still, **middle)
             place = Placement(workers=WORKERS, listen=free_endpoint(), record=record)
             path = Path(folder) / secrets.token_hex(4)
-            with open_run(replace(config, algorithm_config=own), path, place) as run:
+            with open_run(replace(config, algorithm_config=algorithm), path, place) as run:
                 yield from run.learn()
 
         def generation(kind: str, pairs: int) -> None:
@@ -233,7 +233,7 @@ def of_run(*, record: bool) -> Opened:
                 for other in runs.values():
                     other.close()
                 runs.clear()
-                runs[kind, pairs] = begun(kind, pairs)
+                runs[kind, pairs] = reports(kind, pairs)
             next(runs[kind, pairs])
 
         try:

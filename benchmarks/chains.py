@@ -49,12 +49,12 @@ def main() -> None:
         for gait, run in zip(GAITS, runs, strict=True):
             learn(configure("finger-gait", gait, seed=seed, **SETTINGS[arguments.policy]), run, workers=2)
         policies = [load(run) for run in runs]
-        told = " | ".join(_since(run, policy) for run, policy in zip(runs, policies, strict=True))
-        found = chain(policies, [seeds.trial(1, i) for i in range(STARTS)], STEPS)
-        cycles = found.changes // len(GAITS)
-        _keep(arguments.out / f"{arguments.policy}-s{seed}.json", found)
+        since = " | ".join(_since(run, policy) for run, policy in zip(runs, policies, strict=True))
+        result = chain(policies, [seeds.trial(1, i) for i in range(STARTS)], STEPS)
+        cycles = result.changes // len(GAITS)
+        _keep(arguments.out / f"{arguments.policy}-s{seed}.json", result)
         print(
-            f"| {seed} | {told} | {cycles.min()} / {np.median(cycles):g} / {cycles.max()} "
+            f"| {seed} | {since} | {cycles.min()} / {np.median(cycles):g} / {cycles.max()} "
             f"| {(cycles >= 10).mean():.0%}, {(cycles >= 25).mean():.0%} |",
             flush=True,
         )
@@ -67,16 +67,16 @@ def _since(run: Path, policy: LoadedPolicy) -> str:
     starts = [seeds.trial(0, i) for i in range(TRIALS)]
     for line in progress:
         mu, _ = folder.parameters.mean(line.generation)
-        found = policy.runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), starts)
-        robust.append(int(found.success.sum()))
+        rollouts = policy.runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), starts)
+        robust.append(int(rollouts.success.sum()))
     below = [at for at, good in enumerate(robust) if good < ENOUGH]
     first = below[-1] + 1 if below else 0
     return f"{progress[first].rollouts} ({robust[-1]} %)" if first < len(progress) else f"- ({robust[-1]} %)"
 
 
-def _keep(path: Path, found: Chained) -> None:
-    told = {"changes": found.changes.tolist(), "starts": STARTS, "steps": STEPS}
-    path.write_text(json.dumps(told) + "\n", "utf-8")
+def _keep(path: Path, result: Chained) -> None:
+    contents = {"changes": result.changes.tolist(), "starts": STARTS, "steps": STEPS}
+    path.write_text(json.dumps(contents) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

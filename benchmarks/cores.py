@@ -54,8 +54,8 @@ def main() -> None:
     print("\n| processes | memory, forked [MB] | one by one [MB] | all joined, forked [s] | one by one [s] |")
     print("|---|---|---|---|---|")
     for processes in arguments.hosts:
-        (own, joined), (other, later) = _host(processes, forked=True), _host(processes, forked=False)
-        print(f"| {processes} | {own:.0f} | {other:.0f} | {joined:.1f} | {later:.1f} |", flush=True)
+        (memory, seconds), (other, later) = _host(processes, forked=True), _host(processes, forked=False)
+        print(f"| {processes} | {memory:.0f} | {other:.0f} | {seconds:.1f} | {later:.1f} |", flush=True)
 
 
 def _numbers(text: str) -> list[int]:
@@ -93,15 +93,15 @@ def _host(processes: int, *, forked: bool) -> tuple[float, float]:
     program = ["-m", "farm"] if forked else ["-c", ONE_BY_ONE]
     endpoint = free_endpoint()
     with session.listen(endpoint, "farm") as link:
-        joined = 0
-        begun = time.perf_counter()
+        count = 0
+        start = time.perf_counter()
         command = [sys.executable, "-P", *program, "worker", "--connect", endpoint, "--processes", str(processes)]
         host = subprocess.Popen([*command, "--log-level", "ERROR"])
         try:
-            while joined < processes:
-                joined = len(link.tokens(keys.worker_token("farm", "**"), 1.0))
+            while count < processes:
+                count = len(link.tokens(keys.worker_token("farm", "**"), 1.0))
                 time.sleep(0.02)
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - start
             return family(host.pid)[1], seconds
         finally:
             host.terminate()

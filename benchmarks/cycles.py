@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import keep, kept, learn, script
+from running import keep, learn, rows_of, script
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
@@ -58,16 +58,20 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/cycles"))
     parser.add_argument("--out", type=Path, default=TABLE)
     parser.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
-    given = parser.parse_args()
-    rows = kept(given.out)
-    if not given.table:
-        there = {(row["object"], row["state"], row["seed"]) for row in rows}
-        wanted = [("script", None), *((state, seed) for seed in given.seeds for state in given.states)]
-        for state, seed in wanted:
-            if (given.object, state, seed) not in there:
-                policy = _script(given.object) if seed is None else _learnt(given.object, state, seed, given.runs)
-                rows.append({"object": given.object, "state": state, "seed": seed} | _tried(policy))
-                keep(given.out, rows[-1])
+    arguments = parser.parse_args()
+    rows = rows_of(arguments.out)
+    if not arguments.table:
+        done = {(row["object"], row["state"], row["seed"]) for row in rows}
+        cells = [("script", None), *((state, seed) for seed in arguments.seeds for state in arguments.states)]
+        for state, seed in cells:
+            if (arguments.object, state, seed) not in done:
+                policy = (
+                    _script(arguments.object)
+                    if seed is None
+                    else _learnt(arguments.object, state, seed, arguments.runs)
+                )
+                rows.append({"object": arguments.object, "state": state, "seed": seed} | _tried(policy))
+                keep(arguments.out, rows[-1])
     print("\n".join(table(rows)))
 
 
@@ -76,15 +80,15 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     yield f"| bar | what is seen | seed | cycles, least / median / most | starts with at least {WANTED} | never lost |"
     yield "|---|---|---|---|---|---|"
     for row in sorted(rows, key=lambda row: (row["object"], list(SEEN).index(row["state"]), row["seed"])):
-        seen, seed = (row["state"], row["seed"]) if row["seed"] is not None else ("nothing: a script", "-")
+        state, seed = (row["state"], row["seed"]) if row["seed"] is not None else ("nothing: a script", "-")
         cycles = f"{row['least']:g} / {row['median']:g} / {row['most']:g}"
-        yield f"| {row['object']} | {seen} | {seed} | {cycles} | {row['reached']:.0%} | {row['kept']:.0%} |"
+        yield f"| {row['object']} | {state} | {seed} | {cycles} | {row['reached']:.0%} | {row['kept']:.0%} |"
 
 
 def _script(name: str) -> LoadedPolicy:
     """The grips' targets as they are."""
-    found = problem(configure(TASK, **SEEN["script"], object=name, steps=STEPS))
-    return LoadedPolicy(found, 0, np.zeros(found.policy.size))
+    subject = problem(configure(TASK, **SEEN["script"], object=name, steps=STEPS))
+    return LoadedPolicy(subject, 0, np.zeros(subject.policy.size))
 
 
 def _learnt(name: str, state: str, seed: int, runs: Path) -> LoadedPolicy:
@@ -113,8 +117,8 @@ def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
     Fitted to the bar's place along the fingers' way [fingertip radii], with the readings' noise, on starts that neither
     learning nor the table uses.
     """
-    found = problem(configure(TASK, **{**settings, **SEEN["script"]}))
-    task: Any = found.task
+    subject = problem(configure(TASK, **{**settings, **SEEN["script"]}))
+    task: Any = subject.task
     grips, observe = task.parts[0], task.observe
     averaged, places = [], []  # of each step (n, 36), averaged as the estimate will be, and (n,)
 
@@ -131,8 +135,8 @@ def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
         return observed
 
     task.observe = noted
-    policy = LoadedPolicy(found, 0, np.zeros(found.policy.size))
-    added = ADDED * np.random.default_rng(0).standard_normal((FITTED, found.policy.size))
+    policy = LoadedPolicy(subject, 0, np.zeros(subject.policy.size))
+    added = ADDED * np.random.default_rng(0).standard_normal((FITTED, subject.policy.size))
     policy.runner.rollouts(added, [streams.trial(3, i) for i in range(FITTED)])
     weights = np.linalg.lstsq(np.concatenate(averaged), np.concatenate(places))[0]
     return tuple(weights.round(2).tolist())  # hides how LAPACK rounds

@@ -49,8 +49,8 @@ class Curve:
         """Test a mean policy."""
         if robust:
             trials = [seeds.trial(0, i) for i in range(TRIALS)]
-            found = runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), trials)
-            self.robust.append((rollouts, int(found.success.sum())))
+            results = runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), trials)
+            self.robust.append((rollouts, int(results.success.sum())))
         if nominal:
             self.nominal.append((rollouts, float(runner.rollouts(mu[None], [None]).returns[0])))
 
@@ -65,8 +65,8 @@ def main() -> None:
     arguments = parser.parse_args()
     constant: dict[str, Any] = {"policy": f"{__file__}:Constant", "initial_mu": 0.0, "initial_sigma": 0.1}
     changed = constant if arguments.policy == "constant" else {}
-    chosen = range(arguments.first, arguments.first + arguments.seeds)
-    configs = {seed: configure("finger-gait", arguments.preset, seed=seed, **changed) for seed in chosen}
+    numbers = range(arguments.first, arguments.first + arguments.seeds)
+    configs = {seed: configure("finger-gait", arguments.preset, seed=seed, **changed) for seed in numbers}
     print(f"| seed | robust success >= {ENOUGH} % from rollout on | return >= {GOOD} from rollout on ", end="")
     print("| return, last | robust success, lowest in the last half, last |\n|---|---|---|---|---|")
     runner: Runner | None = None
@@ -93,8 +93,8 @@ def _learnt(config: Any, runner: Runner | None) -> tuple[Curve, Runner]:  # noqa
         if not end:
             eps = algorithm.ask(state, seeds.exploration(config.seed, generation))
             theta = (state.mu + eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(per, -1)
-            wanted = config.task_config.perturb
-            starts = [seeds.training(config.seed, generation, row // 2) if wanted else None for row in range(per)]
+            perturb = config.task_config.perturb
+            starts = [seeds.training(config.seed, generation, row // 2) if perturb else None for row in range(per)]
             returns = runner.rollouts(theta, starts).returns.reshape(-1, 2)
             state = algorithm.tell(state, eps, returns)
     return curve, runner

@@ -79,9 +79,9 @@ def _farm(kind: type[Environment], name: str, config: EnvironmentConfig, count: 
 
 
 def _seconds(work: Callable[[], object]) -> float:
-    begun = time.process_time()
+    start = time.process_time()
     work()
-    return time.process_time() - begun
+    return time.process_time() - start
 
 
 if __name__ == "__main__":

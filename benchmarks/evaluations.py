@@ -85,8 +85,8 @@ def _bare(kind: str, count: int, threads: int) -> tuple[mujoco.batch.Batch, list
 def physics(kind: str, count: int, threads: int) -> None:
     """The physics steps of so many rollouts, and nothing else; each begins as a rollout does."""
     bare, states = _bare(kind, count, threads)
-    for state, begun in states:
-        state[:] = begun
+    for state, start in states:
+        state[:] = start
     bare.step(nstep=int(steps(kind)))
 
 

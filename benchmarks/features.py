@@ -35,9 +35,9 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=5)
     arguments = parser.parse_args()
     runners: dict[str, Runner] = {}
-    for policy, own in CASES:
-        settings = {"features": arguments.features, **own} if own else {}
-        name = " ".join([policy, *own.values()])
+    for policy, options in CASES:
+        settings = {"features": arguments.features, **options} if options else {}
+        name = " ".join([policy, *options.values()])
         runners[name] = problem(configure(preset="thesis", policy=policy, **settings)).runner()
     shares: dict[str, list[float]] = {name: [] for name in runners}
     for _ in range(arguments.turns):
@@ -46,16 +46,16 @@ def main() -> None:
             shares[name].append(2.0 * _rollouts(runner) / (before + _physics(runner)))
     print(f"D {arguments.features}, medians of {arguments.turns} turns (lowest to highest)\n")
     print("| controller | speed relative to MuJoCo alone |\n|---|---|")
-    for name, found in shares.items():
-        print(f"| {name} | {statistics.median(found):.2f} ({min(found):.2f} to {max(found):.2f}) |")
+    for name, values in shares.items():
+        print(f"| {name} | {statistics.median(values):.2f} ({min(values):.2f} to {max(values):.2f}) |")
 
 
 def _rollouts(runner: Runner) -> float:
     """Physics steps per second of whole rollouts, without those that close the grip."""
     theta = np.random.default_rng(0).normal(0.0, 1e-3, (ROLLOUTS, runner.size))
-    found = runner.rollouts(theta, SEEDS)
-    taken = _duration(lambda: runner.rollouts(theta, SEEDS)) - _duration(lambda: _begun(runner))
-    return float(found.steps.sum()) * runner.task.substeps / taken
+    rollouts = runner.rollouts(theta, SEEDS)
+    seconds = _duration(lambda: runner.rollouts(theta, SEEDS)) - _duration(lambda: _begun(runner))
+    return float(rollouts.steps.sum()) * runner.task.substeps / seconds
 
 
 def _physics(runner: Runner) -> float:
@@ -73,9 +73,9 @@ def _begun(runner: Runner) -> Batch:
 
 
 def _duration(call: Callable[[], object]) -> float:
-    begun = time.perf_counter()
+    start = time.perf_counter()
     call()
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 if __name__ == "__main__":

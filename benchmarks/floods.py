@@ -118,12 +118,12 @@ def _attack(kind: str, endpoint: str, certs: Path) -> None:
 
 def _run(kind: str | None, certs: Path, generations: int) -> tuple[float, float, str]:
     """Time per generation [s], the learner's largest memory [MB], and the hash of a run under an attack."""
-    endpoint, said = free_endpoint().replace("tcp/", "tls/"), ["--tls", str(certs)]
+    endpoint, tls = free_endpoint().replace("tcp/", "tls/"), ["--tls", str(certs)]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        words = ["-m", "farm", "learner", "--listen", endpoint, "--no-record", "--name", "run", *said]
+        words = ["-m", "farm", "learner", "--listen", endpoint, "--no-record", "--name", "run", *tls]
         words += ["--generations", str(generations), "--pairs", "15"]
         learner = stack.enter_context(process(words, folder))
-        worker = ["-m", "farm", "worker", "--connect", endpoint, "--name", "honest", *said]
+        worker = ["-m", "farm", "worker", "--connect", endpoint, "--name", "honest", *tls]
         stack.enter_context(process(worker, folder))
         run, most = Path(folder, "runs/run"), 0.0
         while len(progress(run)) < 2:
@@ -131,12 +131,12 @@ def _run(kind: str | None, certs: Path, generations: int) -> tuple[float, float,
         if kind is not None:
             flags = ["--attack", kind, "--at", endpoint, str(certs)]
             stack.enter_context(process([str(HERE), *flags], folder))
-        begun = time.monotonic()
+        start = time.monotonic()
         while learner.poll() is None:
             with suppress(OSError, IndexError):
                 most = max(most, megabytes(learner.pid))
             pause()
-        took = (time.monotonic() - begun) / (generations - 2)
+        took = (time.monotonic() - start) / (generations - 2)
         summary = json.loads((run / "summary.json").read_text())
     return took, most, summary["parameters_sha256"]
 

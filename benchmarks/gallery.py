@@ -88,18 +88,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=Path, default=Path("runs/gallery"))
     parser.add_argument("--docs", type=Path, default=ROOT / "docs")
-    given = parser.parse_args()
-    films = given.docs / "pictures/gallery"
+    arguments = parser.parse_args()
+    films = arguments.docs / "pictures/gallery"
     films.mkdir(parents=True, exist_ok=True)
-    file = given.docs / "results/tables/gallery.jsonl"
+    file = arguments.docs / "results/tables/gallery.jsonl"
     rows = {row["task"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
     for piece in PIECES:
-        if piece.name in given.only.split(","):
-            run = given.runs / f"{piece.name}-s{given.seed}"
-            rows[piece.task] = measured(piece, run, given.seed)
+        if piece.name in arguments.only.split(","):
+            run = arguments.runs / f"{piece.name}-s{arguments.seed}"
+            rows[piece.task] = measured(piece, run, arguments.seed)
             film(run, films / f"{piece.name}.gif", load(run), piece.view)
             file.write_text("".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows))
-    (given.docs / "gallery.md").write_text(page(rows), "utf-8")
+    (arguments.docs / "gallery.md").write_text(page(rows), "utf-8")
 
 
 def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
@@ -120,20 +120,20 @@ def film(run: Path, path: Path, policy: LoadedPolicy, view: tuple[float, ...]) -
     speed = task.steps * task.period / SECONDS
     _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"))
     frames: list[Image.Image] = []
-    shown: list[int] = []  # for how long [ms]; equal frames are one
+    durations: list[int] = []  # for how long [ms]; equal frames are one
     with Image.open(path) as large:
         left, top, right, bottom = (round(share * size) for share, size in zip(view, 2 * large.size, strict=True))
         for at, frame in enumerate(ImageSequence.Iterator(large)):
             if at % 2:
-                shown[-1] += frame.info["duration"]
+                durations[-1] += frame.info["duration"]
             else:
                 frames.append(
                     frame.convert("RGB").crop((left, top, right, bottom)).resize(SIZE, Image.Resampling.LANCZOS)
                 )
-                shown.append(frame.info["duration"])
+                durations.append(frame.info["duration"])
     palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    first.save(path, save_all=True, append_images=rest, duration=shown, loop=0, optimize=True)
+    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
 
 
 def page(rows: dict[str, Any]) -> str:

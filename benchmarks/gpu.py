@@ -28,15 +28,15 @@ def main() -> None:
     parser.add_argument("--tasks", default="finger-gait,gym:Ant-v5,gym:HalfCheetah-v5")
     parser.add_argument("--steps", type=int, default=20, help="control steps per rollout")
     parser.add_argument("--threads", default="2,16", help="numbers of MuJoCo's threads on the processor")
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     print("| task | simulated by | together | physics steps/s |\n|---|---|---|---|")
-    for name in chosen.tasks.split(","):
-        for count in map(int, chosen.threads.split(",")):
-            row(name, f"{count} threads", 256, chosen.steps, threads(count, 256))
-        for worlds in map(int, chosen.worlds.split(",")):
-            made = make_backend("warp")
-            made.__class__.capacity = worlds
-            row(name, "warp", worlds, chosen.steps, made.engine, exact=False)
+    for name in arguments.tasks.split(","):
+        for count in map(int, arguments.threads.split(",")):
+            row(name, f"{count} threads", 256, arguments.steps, threads(count, 256))
+        for worlds in map(int, arguments.worlds.split(",")):
+            backend = make_backend("warp")
+            backend.__class__.capacity = worlds
+            row(name, "warp", worlds, arguments.steps, backend.engine, exact=False)
 
 
 def threads(count: int, size: int) -> MakeEngine:
@@ -47,14 +47,14 @@ def threads(count: int, size: int) -> MakeEngine:
 
 def row(name: str, by: str, worlds: int, steps: int, make: MakeEngine, *, exact: bool = True) -> None:
     """Run once to compile, run again, and print."""
-    found = problem(configure(name, policy="linear", steps=steps))
-    runner = Runner(found.task, found.policy, make, exact=exact)
+    subject = problem(configure(name, policy="linear", steps=steps))
+    runner = Runner(subject.task, subject.policy, make, exact=exact)
     theta = 0.1 * np.random.default_rng(0).standard_normal((worlds, runner.size))
-    drawn: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(worlds)]
-    runner.rollouts(theta, drawn)
-    begun = time.perf_counter()
-    done = runner.rollouts(theta, drawn)
-    speed = found.task.substeps * done.steps.sum() / (time.perf_counter() - begun)
+    starts: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(worlds)]
+    runner.rollouts(theta, starts)
+    start = time.perf_counter()
+    done = runner.rollouts(theta, starts)
+    speed = subject.task.substeps * done.steps.sum() / (time.perf_counter() - start)
     print(f"| {name} | {by} | {worlds} | {speed:.3g} |", flush=True)
 
 

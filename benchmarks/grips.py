@@ -48,18 +48,18 @@ def hold(object_name: str, pose: str, grip: str, options: Mapping[str, str] | No
     """A rollout with zero actions: the commands of the start grip do not change."""
     steps = round(SECONDS[-1] / CONTROL_PERIOD)
     config = FingerGaitConfig(object=object_name, pose=pose, start_grip=grip, goal_grip=grip, steps=steps)
-    own = POSES[pose] if options is None else replace(POSES[pose], options=options)
-    task = FingerGait(config, files=model.posed(model.files([object_name], "opposed"), own))
+    settings = POSES[pose] if options is None else replace(POSES[pose], options=options)
+    task = FingerGait(config, files=model.posed(model.files([object_name], "opposed"), settings))
     sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
 
-    def held() -> Rollouts:
+    def play() -> Rollouts:
         task.setup(sim)
         batch = Batch(task, sim, [None], every=1)
         while not batch.over:
             batch.step(np.zeros((1, len(JOINTS))))
         return batch.rollouts()
 
-    rollouts: Rollouts = again(held)
+    rollouts: Rollouts = again(play)
     return rollouts
 
 

@@ -82,9 +82,9 @@ class Network:
     @contextmanager
     def _apart(self) -> Iterator[float]:
         """The block is not the learner's work; yields the time at which it begins."""
-        begun, now = time.thread_time(), self.now()
+        start, now = time.thread_time(), self.now()
         yield now
-        self._other += time.thread_time() - begun
+        self._other += time.thread_time() - start
 
     def _send(self, at: float, event: Event) -> None:
         heapq.heappush(self._due, (at, next(self._number), event))
@@ -93,10 +93,10 @@ class Network:
         """Messages that have arrived, as `Events` gives them."""
         with self._apart() as now:
             wait = max(0.0, min(timeout, self._due[0][0] - now if self._due else timeout))
-            self._waited, now, found = self._waited + wait, now + wait, []
+            self._waited, now, events = self._waited + wait, now + wait, []
             while self._due and self._due[0][0] <= now:
-                found.append(heapq.heappop(self._due)[2])
-        return found
+                events.append(heapq.heappop(self._due)[2])
+        return events
 
     def publish(self, key: str, payload: bytes, **_: Any) -> None:  # noqa: ANN401
         """Deliver a chunk to its worker, and send its results when the worker has done it."""

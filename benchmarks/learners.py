@@ -122,22 +122,22 @@ def main() -> None:
                 parser.error(f"{name} has no policy {policy!r}; it has {', '.join(policies)}")
             start = policies[policy]
             cells = []
-            for algorithm, own in ALGORITHMS.items():
-                found = _row(task, budget, {"policy": policy, "algorithm": algorithm, **own, **start}, numbers)
-                cells.append(_cell(found))
+            for algorithm, options in ALGORITHMS.items():
+                row = _row(task, budget, {"policy": policy, "algorithm": algorithm, **options, **start}, numbers)
+                cells.append(_cell(row))
                 if arguments.out:
                     with arguments.out.open("a") as file:
-                        file.write(json.dumps({"task": name, "policy": policy, "algorithm": algorithm, **found}) + "\n")
+                        file.write(json.dumps({"task": name, "policy": policy, "algorithm": algorithm, **row}) + "\n")
             print(f"| {policy} | {' | '.join(cells)} |", flush=True)
 
 
-def _cell(found: Mapping[str, Any]) -> str:
-    returns = sorted(found["returns"])
-    said = f"{np.median(returns):.4g} ({returns[0]:.4g} to {returns[-1]:.4g})"
-    if "since" not in found:
-        return said
-    since = [at for at in found["since"] if at is not None]
-    return f"{len(since)} of {len(returns)}" + (f", {np.median(since):.0f}; " if since else "; ") + said
+def _cell(row: Mapping[str, Any]) -> str:
+    returns = sorted(row["returns"])
+    text = f"{np.median(returns):.4g} ({returns[0]:.4g} to {returns[-1]:.4g})"
+    if "since" not in row:
+        return text
+    since = [at for at in row["since"] if at is not None]
+    return f"{len(since)} of {len(returns)}" + (f", {np.median(since):.0f}; " if since else "; ") + text
 
 
 def _row(task: str, budget: int, settings: dict[str, Any], numbers: Sequence[int]) -> dict[str, Any]:
@@ -149,11 +149,11 @@ def _row(task: str, budget: int, settings: dict[str, Any], numbers: Sequence[int
         if gait and searches[0].rollouts // LOOK > len(looks):
             looks.append((searches[0].rollouts, *(each.success.mean() for each in _tried(runner, searches, 0))))
     final = _tried(runner, searches, 1)
-    found: dict[str, Any] = {"returns": [round(float(each.returns.mean()), 4) for each in final]}
+    row: dict[str, Any] = {"returns": [round(float(each.returns.mean()), 4) for each in final]}
     if gait:
-        found["success"] = [float(each.success.mean()) for each in final]
-        found["since"] = [_since([(at[0], at[1 + i]) for at in looks]) for i in range(len(searches))]
-    return found
+        row["success"] = [float(each.success.mean()) for each in final]
+        row["since"] = [_since([(at[0], at[1 + i]) for at in looks]) for i in range(len(searches))]
+    return row
 
 
 def _begun(task: str, settings: dict[str, Any], number: int) -> Search:
@@ -169,13 +169,13 @@ def _begun(task: str, settings: dict[str, Any], number: int) -> Search:
 
 
 def _generation(runner: Runner, searches: Sequence[Search]) -> None:
-    asked = [explored(search.config, search.state) for search in searches]
-    thetas = [jobs.theta(search.state.mu) for search, (_, jobs) in zip(searches, asked, strict=True)]
-    starts = [start for _, jobs in asked for start in jobs.seeds()]
-    found = _together(runner, searches, thetas, starts)
-    for search, (eps, _), rollouts in zip(searches, asked, found, strict=True):
-        told = learnt_from(search.config, search.problem.task, rollouts.returns, rollouts.steps)
-        search.state = search.config.algorithm_config.tell(search.state, eps, told)
+    proposals = [explored(search.config, search.state) for search in searches]
+    thetas = [jobs.theta(search.state.mu) for search, (_, jobs) in zip(searches, proposals, strict=True)]
+    starts = [start for _, jobs in proposals for start in jobs.seeds()]
+    results = _together(runner, searches, thetas, starts)
+    for search, (eps, _), rollouts in zip(searches, proposals, results, strict=True):
+        returns = learnt_from(search.config, search.problem.task, rollouts.returns, rollouts.steps)
+        search.state = search.config.algorithm_config.tell(search.state, eps, returns)
         search.rollouts += len(rollouts.returns)
         if search.moments.size:
             table = np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
@@ -194,9 +194,9 @@ def _together(
     """Rollouts of each search's parameters, simulated together."""
     rows = [np.column_stack([theta, np.full(len(theta), i)]) for i, theta in enumerate(thetas)]
     policy, moments = SideBySide(searches), bool(searches[0].moments.size)
-    found = loop.run(runner.task, policy, runner.sim, np.concatenate(rows), starts, moments=moments)
+    rollouts = loop.run(runner.task, policy, runner.sim, np.concatenate(rows), starts, moments=moments)
     ends = np.cumsum([len(theta) for theta in thetas])
-    return [found.at(slice(end - len(theta), end)) for end, theta in zip(ends.tolist(), thetas, strict=True)]
+    return [rollouts.at(slice(end - len(theta), end)) for end, theta in zip(ends.tolist(), thetas, strict=True)]
 
 
 def _since(looks: Sequence[tuple[int, float]]) -> int | None:

@@ -33,7 +33,7 @@ from typing import Any, Final
 
 import numpy as np
 from own_tasks import TESTED, Rollouts, by_ars, by_evotorch
-from running import keep, kept, script
+from running import keep, rows_of, script
 
 import farm
 from farm.arrays import FloatArray
@@ -77,8 +77,8 @@ class Shared(Rollouts):
     def simulated(self, jobs: Jobs) -> tuple[FloatArray, FloatArray]:
         """Returns and moments, as those of one process."""
         parts = [part.tolist() for part in np.array_split(np.arange(len(jobs)), 2) if len(part)]
-        given = self._pool.starmap(_half, [(self._config, jobs.take(part), self._normaliser()) for part in parts], 1)
-        returns, moments = zip(*given, strict=True)
+        answers = self._pool.starmap(_half, [(self._config, jobs.take(part), self._normaliser()) for part in parts], 1)
+        returns, moments = zip(*answers, strict=True)
         return np.concatenate(returns), np.concatenate(moments)
 
     def reached(self, mean: FloatArray) -> None:
@@ -102,18 +102,18 @@ def ready(config: dict[str, Any]) -> None:
     time.sleep(0.2)  # so that the other process takes the other call
 
 
-def _half(config: dict[str, Any], jobs: Jobs, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _half(config: dict[str, Any], jobs: Jobs, constants: FloatArray) -> tuple[FloatArray, FloatArray]:
     runner = _runner(config)
-    given = runner.run(np.zeros(runner.size), jobs, normaliser=seen)
-    return given.returns, given.moments
+    results = runner.run(np.zeros(runner.size), jobs, normaliser=constants)
+    return results.returns, results.moments
 
 
-def reached(runner: Runner, means: Iterable[Mean], wanted: float) -> tuple[int, float] | None:
+def reached(runner: Runner, means: Iterable[Mean], goal: float) -> tuple[int, float] | None:
     """Rollouts and seconds after which the means have the return; None if they never do."""
     good = list[tuple[int, float]]()
-    for rollouts, seconds, mean, seen in means:
-        given = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([seen, seen]))
-        good = [*good, (rollouts, seconds)] if given.returns[:STARTS].mean() >= wanted else []
+    for rollouts, seconds, mean, constants in means:
+        results = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([constants, constants]))
+        good = [*good, (rollouts, seconds)] if results.returns[:STARTS].mean() >= goal else []
         if len(good) == IN_A_ROW:
             return good[0]
     return None
@@ -157,11 +157,11 @@ METHODS: Final[dict[str, tuple[Search, dict[str, Any]]]] = {
 
 def measured(pool: Pool, name: str, method: str, seed: int) -> tuple[int, float] | None:
     """Rollouts and seconds until a task's return; None if it is not reached."""
-    task, rollouts, wanted = TASKS[name]
+    task, rollouts, goal = TASKS[name]
     search, settings = METHODS[method]
     runner = problem(farm.configure(task, seed=seed, **settings)).runner()
     try:
-        return reached(runner, search(pool, task, seed, rollouts), wanted)
+        return reached(runner, search(pool, task, seed, rollouts), goal)
     finally:
         runner.close()
 
@@ -179,12 +179,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _cell(values: Sequence[float | None]) -> str:
-    there = [value for value in values if value is not None]
-    if not there:
+    numbers = [value for value in values if value is not None]
+    if not numbers:
         return f"none of {len(values)}" if values else "-"
-    some = "" if len(there) == len(values) else f", {len(there)} of {len(values)} seeds"
-    middle, low, high = (_number(value) for value in (statistics.median(there), min(there), max(there)))
-    return f"{middle} ({low} to {high}){some}"
+    share = "" if len(numbers) == len(values) else f", {len(numbers)} of {len(values)} seeds"
+    middle, low, high = (_number(value) for value in (statistics.median(numbers), min(numbers), max(numbers)))
+    return f"{middle} ({low} to {high}){share}"
 
 
 def _number(value: float) -> str:
@@ -199,20 +199,20 @@ def main() -> None:
     words.add_argument("--seeds", type=int, default=5, help="number of seeds, 0 and on")
     words.add_argument("--out", type=Path, default=TABLE)
     words.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
-    given = words.parse_args()
-    rows = kept(given.out)
-    if not given.table:
-        there = {(row["task"], row["method"], row["seed"]) for row in rows}
-        cells = itertools.product(range(given.seeds), given.tasks, given.methods)
+    arguments = words.parse_args()
+    rows = rows_of(arguments.out)
+    if not arguments.table:
+        done = {(row["task"], row["method"], row["seed"]) for row in rows}
+        cells = itertools.product(range(arguments.seeds), arguments.tasks, arguments.methods)
         with multiprocessing.get_context("spawn").Pool(2) as pool:
             for seed, task, method in cells:
-                if (task, method, seed) not in there:
-                    found = measured(pool, task, method, seed)
-                    rollouts, seconds = (found[0], round(found[1], 2)) if found else (None, None)
+                if (task, method, seed) not in done:
+                    result = measured(pool, task, method, seed)
+                    rollouts, seconds = (result[0], round(result[1], 2)) if result else (None, None)
                     rows.append(
                         {"task": task, "method": method, "seed": seed} | {"rollouts": rollouts, "seconds": seconds}
                     )
-                    keep(given.out, rows[-1])
+                    keep(arguments.out, rows[-1])
     print("\n".join(table(sorted(rows, key=lambda row: list(TASKS).index(row["task"])))))
 
 

@@ -48,16 +48,16 @@ def _learners(count: int, seconds: float) -> None:
         workers = stack.enter_context(process([emulator, "--pair", "0", "--emulate", endpoint, "4"], folder))
         words = ["-m", "farm", "learner", "--connect", endpoint, "--no-record", "--pairs", "15"]
         words += ["--generations", str(generations)]
-        begun = time.monotonic()
+        start = time.monotonic()
         learners = [stack.enter_context(process([*words, "--name", f"r{i}"], folder)) for i in range(count)]
         runs = [Path(folder, f"runs/r{i}") for i in range(count)]
         most = 0.0
         while any(len(progress(run)) < generations for run in runs):
             most = max(most, *(megabytes(each.pid) for each in learners if each.poll() is None), 0.0)
-            if time.monotonic() - begun > 60 * seconds:
+            if time.monotonic() - start > 60 * seconds:
                 sys.exit(f"{sum(len(progress(run)) for run in runs)} of {count * generations} generations were done")
             pause(router, workers)
-        took = time.monotonic() - begun
+        took = time.monotonic() - start
         print(
             f"| {count} learners behind a router, 4 workers | {count * generations / took:.1f} | "
             f"{30 * count * generations / took:.0f} | - | router: {cpu(router.pid) / took:.2f} | "

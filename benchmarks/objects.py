@@ -44,9 +44,11 @@ def main() -> None:
     parser.add_argument("--pose", default="opposed")
     parser.add_argument("--out", type=Path, default=Path("runs/objects"))
     parser.add_argument("--unseen", action="store_true", help="policies with different observations")
-    given = parser.parse_args()
-    own = {"generations": given.generations, "pose": given.pose}
-    (unseen if given.unseen else sets)(given.seeds or list(range(20, 25) if given.unseen else range(3)), given.out, own)
+    arguments = parser.parse_args()
+    settings = {"generations": arguments.generations, "pose": arguments.pose}
+    (unseen if arguments.unseen else sets)(
+        arguments.seeds or list(range(20, 25) if arguments.unseen else range(3)), arguments.out, settings
+    )
 
 
 def sets(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
@@ -54,8 +56,8 @@ def sets(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
     print(f"| trained on | {' | '.join(OBJECTS)} |")
     print(f"|---|{'---|' * len(OBJECTS)}")
     for trained in TRAINED:
-        found = _tried(seeds, OBJECTS, out, {**settings, "object": trained}, "-".join(trained))
-        cells = [", ".join(f"{share:g}" for share in each) for each in found.T]
+        shares = _tried(seeds, OBJECTS, out, {**settings, "object": trained}, "-".join(trained))
+        cells = [", ".join(f"{share:g}" for share in each) for each in shares.T]
         print(f"| {', '.join(trained)} | {' | '.join(cells)} |", flush=True)
 
 
@@ -64,8 +66,8 @@ def unseen(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
     heads = [*OBJECTS, "their mean", *UNSEEN, "their mean"]
     print(f"| the policy sees | {' | '.join(heads)} |\n|---|{'---|' * len(heads)}")
     for name, sees in SEES.items():
-        found = _tried(seeds, (*OBJECTS, *UNSEEN), out, {**settings, "object": OBJECTS, **sees}, name)
-        parts = found[:, : len(OBJECTS)], found[:, len(OBJECTS) :]
+        shares = _tried(seeds, (*OBJECTS, *UNSEEN), out, {**settings, "object": OBJECTS, **sees}, name)
+        parts = shares[:, : len(OBJECTS)], shares[:, len(OBJECTS) :]
         cells = [cell for part in parts for cell in (*map(_cell, part.T), f"**{_cell(part.mean(axis=1))}**")]
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
@@ -82,8 +84,8 @@ def _tried(seeds: Sequence[int], things: Sequence[str], out: Path, settings: dic
 
 def _success(run: Path, thing: str) -> float:
     policy = load(run, object=thing)
-    found = policy.runner.run(policy.mu, evaluation_jobs(STARTS, 1))
-    return 100.0 * float(found.flags[:STARTS, 0].mean())
+    results = policy.runner.run(policy.mu, evaluation_jobs(STARTS, 1))
+    return 100.0 * float(results.flags[:STARTS, 0].mean())
 
 
 def _cell(values: FloatArray) -> str:

@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import keep, kept, script
+from running import keep, rows_of, script
 
 import farm
 from farm import seeds as streams
@@ -86,8 +86,8 @@ class Rollouts:
 
     def simulated(self, jobs: Jobs) -> tuple[FloatArray, FloatArray]:
         """Returns (S,) and moments of the observations (S, 1 + 2 d) of jobs around 0."""
-        given = self.runner.run(np.zeros(self.size), jobs, normaliser=self._normaliser())
-        return given.returns, given.moments
+        results = self.runner.run(np.zeros(self.size), jobs, normaliser=self._normaliser())
+        return results.returns, results.moments
 
     def reached(self, mean: FloatArray) -> None:
         """A search's mean (P,) before each of its generations."""
@@ -168,9 +168,9 @@ def by_ars(trial: Rollouts, seed: int, rollouts: int) -> FloatArray:
         def reset(self, **_: object) -> tuple[FloatArray, dict[str, Any]]:  # it only begins; no step follows
             return np.zeros(shape[0]), {}
 
-    found = Made("LinearPolicy", Spaces(), seed=seed, device="cpu")
-    found.learn(rollouts)
-    return found.weights.numpy().astype(np.float64)
+    model = Made("LinearPolicy", Spaces(), seed=seed, device="cpu")
+    model.learn(rollouts)
+    return model.weights.numpy().astype(np.float64)
 
 
 def pycma(task: str, seed: int, rollouts: int) -> float:
@@ -247,28 +247,30 @@ def main() -> None:
     words.add_argument("--processes", type=int, default=2)
     words.add_argument("--out", type=Path, default=Path("own-tasks.jsonl"))
     words.add_argument("--table", action="store_true", help="print the file's table and compute nothing")
-    given = words.parse_args()
-    rows = kept(given.out)
-    if not given.table:
-        there = {(row["task"], row["method"], row["seed"], row["rollouts"]) for row in rows}
+    arguments = words.parse_args()
+    rows = rows_of(arguments.out)
+    if not arguments.table:
+        present = {(row["task"], row["method"], row["seed"], row["rollouts"]) for row in rows}
         cells = [
-            (task, method, seed, given.rollouts)
-            for seed in range(given.seeds)
-            for task in given.tasks.split(",")
-            for method in given.methods.split(",")
+            (task, method, seed, arguments.rollouts)
+            for seed in range(arguments.seeds)
+            for task in arguments.tasks.split(",")
+            for method in arguments.methods.split(",")
         ]
-        with ProcessPoolExecutor(given.processes) as pool:
-            known = TESTED | TRAINED
+        with ProcessPoolExecutor(arguments.processes) as pool:
+            tasks = TESTED | TRAINED
             waiting = {
-                pool.submit(METHODS[method], known.get(task, task), seed, rollouts): (task, method, seed, rollouts)
+                pool.submit(METHODS[method], tasks.get(task, task), seed, rollouts): (task, method, seed, rollouts)
                 for task, method, seed, rollouts in cells
-                if (task, method, seed, rollouts) not in there
+                if (task, method, seed, rollouts) not in present
             }
             for done in as_completed(waiting):
                 row = dict(zip(("task", "method", "seed", "rollouts"), waiting[done], strict=True))
                 rows.append(row | {"score": round(done.result(), 4)})
-                keep(given.out, rows[-1])
-    print("\n".join(table(row for row in rows if row["rollouts"] == given.rollouts and row["seed"] < given.seeds)))
+                keep(arguments.out, rows[-1])
+    print(
+        "\n".join(table(row for row in rows if row["rollouts"] == arguments.rollouts and row["seed"] < arguments.seeds))
+    )
 
 
 if __name__ == "__main__":

@@ -54,29 +54,29 @@ def main() -> None:
         _serve(arguments.only, arguments.begun)
         return
     if not arguments.table:
-        found = _measured(arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}])
+        results = _measured(arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}])
         if arguments.out:
-            arguments.out.write_text(json.dumps(found, separators=(",", ":")) + "\n")
+            arguments.out.write_text(json.dumps(results, separators=(",", ":")) + "\n")
     else:
-        found = json.loads(arguments.table.read_text())
-    print("\n".join(table(found)))
+        results = json.loads(arguments.table.read_text())
+    print("\n".join(table(results)))
 
 
-def table(found: dict[str, Any]) -> Iterator[str]:
+def table(results: dict[str, Any]) -> Iterator[str]:
     """The lines of both tables: medians of the turns, lowest to highest in parentheses."""
-    backends = found["backends"]
+    backends = results["backends"]
     kinds = [(f"{kind}{pairs}", f"{kind}, {2 * pairs}") for kind, pairs in ROUNDS if kind != "zero"]
     heads = [*(head for _, head in kinds), "core-ms at 30", "not its workers'", "30 empty [ms]", "200 [ms]",
              "first [s]", "MB", "a killed worker"]  # fmt: skip
-    yield f"{found['machine']}; {found['turns']} turns"
+    yield f"{results['machine']}; {results['turns']} turns"
     yield ""
     yield f"| | {' | '.join(heads)} |"
     yield "|---" * (len(heads) + 1) + "|"
-    for name, own in backends.items():
-        cells = [_spread(backends["threads"], own, key, _faster) for key, _ in kinds]
-        cells += [f"{_median(own, 'gait15', part):.1f}" for part in ("cores", "own")]
-        cells += [f"{_median(own, key, 'wall'):.2f}" if key in own["rounds"] else "-" for key in ("zero15", "zero100")]
-        cells += [f"{own['first']:.1f}", f"{own['memory']:.0f}", own.get("killed", "-")]
+    for name, row in backends.items():
+        cells = [_spread(backends["threads"], row, key, _faster) for key, _ in kinds]
+        cells += [f"{_median(row, 'gait15', part):.1f}" for part in ("cores", "own")]
+        cells += [f"{_median(row, key, 'wall'):.2f}" if key in row["rounds"] else "-" for key in ("zero15", "zero100")]
+        cells += [f"{row['first']:.1f}", f"{row['memory']:.0f}", row.get("killed", "-")]
         yield f"| {BACKENDS[name][0]} | {' | '.join(cells)} |"
     yield ""
     yield f"| ratio, turn by turn | {' | '.join(head for _, head in kinds)} |"
@@ -87,14 +87,14 @@ def table(found: dict[str, Any]) -> Iterator[str]:
             yield f"| {words} | {' | '.join(cells)} |"
 
 
-def first_page(found: dict[str, Any]) -> Iterator[str]:
+def first_page(results: dict[str, Any]) -> Iterator[str]:
     """The rows of README's table."""
-    backends = found["backends"]
-    for name, own in backends.items():
+    backends = results["backends"]
+    for name, row in backends.items():
         if name not in (*PHYSICS, "loop", "pipes", "pinned"):
-            speeds = [_spread(backends["threads"], own, key, _faster).split()[0] for key in ("gait15", "gait100")]
-            numbers = [f"{_median(own, 'zero15', 'wall'):.2g}", f"{own['first']:.1f}", f"{own['memory']:.0f}"]
-            yield f"| {' | '.join([BACKENDS[name][0], *speeds, *numbers, own.get('killed', '-')])} |"
+            speeds = [_spread(backends["threads"], row, key, _faster).split()[0] for key in ("gait15", "gait100")]
+            numbers = [f"{_median(row, 'zero15', 'wall'):.2g}", f"{row['first']:.1f}", f"{row['memory']:.0f}"]
+            yield f"| {' | '.join([BACKENDS[name][0], *speeds, *numbers, row.get('killed', '-')])} |"
 
 
 def _median(backend: dict[str, Any], key: str, part: str) -> float:
@@ -128,35 +128,35 @@ RATIOS: Final[tuple[tuple[str, str, str, Ratio], ...]] = (
 
 
 def _measured(turns: int, names: list[str]) -> dict[str, Any]:
-    there = {name: BACKENDS[name] for name in names if importlib.util.find_spec(BACKENDS[name][1])}
+    available = {name: BACKENDS[name] for name in names if importlib.util.find_spec(BACKENDS[name][1])}
     for name in names:
-        if name not in there:
+        if name not in available:
             print(f"{BACKENDS[name][0]} is left out: {BACKENDS[name][1]} is not installed", file=sys.stderr)
-    found: dict[str, Any] = {
+    results: dict[str, Any] = {
         "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, "
         f"MuJoCo {mujoco.__version__}, {time.strftime('%Y-%m-%d')}",
         "turns": turns,
-        "backends": {name: {"rounds": {}} for name in there},
+        "backends": {name: {"rounds": {}} for name in available},
     }
     with ExitStack() as stack:
         backends: dict[str, _Backend] = {}
-        for name in there:  # one after another: the time of the first result counts
+        for name in available:  # one after another: the time of the first result counts
             backends[name] = stack.enter_context(_Backend(name))
-            found["backends"][name] |= backends[name].ask("start")
+            results["backends"][name] |= backends[name].ask("start")
         for kind, pairs in ROUNDS:
             able = {name: backend for name, backend in backends.items() if kind != "zero" or name not in PHYSICS}
-            own = {name: [] for name in able}
+            turns_of = {name: [] for name in able}
             for backend in able.values():
                 backend.ask(f"open {kind} {pairs}")
             for turn in range(turns):
                 for name, backend in able.items():
-                    own[name].append(backend.ask("turn"))
+                    turns_of[name].append(backend.ask("turn"))
                 print(f"{kind}, {pairs} pairs: {turn + 1} of {turns} turns", file=sys.stderr, flush=True)
-            for name, each in own.items():
-                found["backends"][name]["rounds"][f"{kind}{pairs}"] = each
+            for name, each in turns_of.items():
+                results["backends"][name]["rounds"][f"{kind}{pairs}"] = each
         for name, backend in backends.items():
-            found["backends"][name] |= backend.ask("kill")
-    return found
+            results["backends"][name] |= backend.ask("kill")
+    return results
 
 
 class _Backend:
@@ -195,14 +195,14 @@ class _Backend:
         self._process.wait()
 
 
-def _serve(name: str, begun: float) -> None:
+def _serve(name: str, start: float) -> None:
     with BACKENDS[name][2]() as (generation, kill):
         kind, pairs = "gait", 15
         for line in sys.stdin:
             match line.split():
                 case ["start"]:
                     generation("gait" if name in PHYSICS else "zero", 15)
-                    first = time.time() - begun
+                    first = time.time() - start
                     generation("gait", 15)
                     _say(first=first, memory=family()[1])
                 case ["open", kind, number]:
@@ -218,13 +218,13 @@ def _serve(name: str, begun: float) -> None:
 
 def _turn(call: Callable[[], object], *, more: bool, pairs: int) -> dict[str, float]:
     """Wall time of a generation, its processor time, and the part of that which this process took [s]."""
-    count, cores, own, begun = 0, family()[0], time.process_time(), time.perf_counter()
-    while time.perf_counter() - begun < SECONDS:
+    count, cores, process, start = 0, family()[0], time.process_time(), time.perf_counter()
+    while time.perf_counter() - start < SECONDS:
         call()
         count += 1
-    wall, cores, own = time.perf_counter() - begun, family()[0] - cores, time.process_time() - own
+    wall, cores, process = time.perf_counter() - start, family()[0] - cores, time.process_time() - process
     each = 2 * pairs / (2 * pairs + more) / count  # a run's generation has one rollout more
-    return {name: round(each * value, 7) for name, value in (("wall", wall), ("cores", cores), ("own", own))}
+    return {name: round(each * value, 7) for name, value in (("wall", wall), ("cores", cores), ("own", process))}
 
 
 def _say(**values: object) -> None:
@@ -266,14 +266,14 @@ def _killed(kill: Kill) -> None:
     killer = subprocess.Popen(["/bin/sh", "-c", f"sleep {0.4 * undisturbed}; kill -9 {victim()}"])
     before = time.perf_counter()
     try:
-        found = work()
+        returns = work()
     except Exception as error:
         _say(killed=type(error).__name__)
         return
     seconds = time.perf_counter() - before
     killer.wait()
     signal.setitimer(signal.ITIMER_REAL, 0.0)
-    same = "the same returns" if np.array_equal(found, alone) else "different returns"
+    same = "the same returns" if np.array_equal(returns, alone) else "different returns"
     _say(killed=f"{same}, {seconds - undisturbed:+.1f} s")
 
 

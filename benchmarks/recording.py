@@ -60,15 +60,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--long", type=int, default=500, help="generations of the recording whose size is printed")
     arguments = parser.parse_args()
-    found = {name: (Times(), Times()) for name in KINDS}
+    pairs = {name: (Times(), Times()) for name in KINDS}
     for repeat in range(arguments.repeats):
         for name, kind in KINDS.items():
-            _run(configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *found[name])
+            _run(configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *pairs[name])
     print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}")
     print("\n| recorded | time per generation [ms] | recorded | longest | learner's thread | recorded | difference "
           "| recorder and Rerun |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
-    for name, (without, with_) in found.items():
+    for name, (without, with_) in pairs.items():
         wall, thread, process = (
             [statistics.median(getattr(times, what)) for times in (without, with_)]
             for what in ("wall", "thread", "process")
@@ -96,22 +96,22 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
             Path(folder, "run.rrd"), run="r", config=config, drawing=Drawing.of(run.learner.problem), done=0,
             serve=("127.0.0.1", port) if kind else None,
         )  # fmt: skip
-        with opened as made, ExitStack() as stack:
+        with opened as recording, ExitStack() as stack:
             if kind in ("watches", "stopped"):
-                stack.enter_context(_viewer(str(made.uri), stopped=kind == "stopped"))
-            _learn(run, made, without, with_)
+                stack.enter_context(_viewer(str(recording.uri), stopped=kind == "stopped"))
+            _learn(run, recording, without, with_)
 
 
-def _learn(run: Run, made: RunRecording, without: Times, with_: Times) -> None:
+def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> None:
     """Collect each block's times, except those of the first four."""
     before = _now()
     for report in run.learn():
         block, within = divmod(report.progress.generation, BLOCK)
         recorded = block % 4 in (1, 2)
         if recorded:
-            made.put(report)
+            recording.put(report)
         if within == BLOCK - 1:
-            made.settled()
+            recording.settled()
             now = _now()
             times = with_ if recorded else without
             for values, a, b in zip((times.wall, times.thread, times.process), before, now, strict=True):

@@ -29,7 +29,7 @@ def script(main: Callable[[], None]) -> None:
         sys.exit(2 if isinstance(error, ConfigError) else 1)
 
 
-def kept(file: Path) -> list[dict[str, Any]]:
+def rows_of(file: Path) -> list[dict[str, Any]]:
     """Rows that a script has measured before, one of JSON per line; none without the file."""
     return [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
 
@@ -48,8 +48,8 @@ def learn_together(runs: Mapping[Path, RunConfig], where: Path, sharing: Sharing
       KeyboardInterrupt: Ctrl-C or SIGTERM; what is learnt so far is saved.
       RunError: a run failed.
     """
-    with stop_flag("saving") as stop, Runs(runs, where) as shown:
-        over = run(runs, sharing, shown, stop.is_set)
+    with stop_flag("saving") as stop, Runs(runs, where) as display:
+        over = run(runs, sharing, display, stop.is_set)
     if stop.is_set():
         raise KeyboardInterrupt
     if not over:

@@ -71,11 +71,11 @@ class MadeUp:
         returns = jobs.theta(mu).sum(axis=1)
         exploring = ~np.repeat(jobs.seen, jobs.rollouts)
         rows = rows_with_trace(traces if self.spec.trace_channels else "none", returns, exploring)
-        seen = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
+        trajectories = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
         flags = np.zeros((len(returns), 4), dtype=bool)
         steps = np.full(len(returns), self.spec.steps)
         felt = np.zeros((len(rows), *self.spec.trace_shape), "<f4")
-        return Simulated(returns=returns, flags=flags, steps=steps, traces=felt, trajectories=seen)
+        return Simulated(returns=returns, flags=flags, steps=steps, traces=felt, trajectories=trajectories)
 
     def _trajectory(self, *, physics: bool) -> Trajectory:
         frames = self.spec.steps * (self._parts if physics else 1) + 1
@@ -161,10 +161,10 @@ class Noted(Events):
 
     def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> bool:
         """Append the event, and call the function."""
-        kept = super().put(event, wake=wake, most=most)
+        result = super().put(event, wake=wake, most=most)
         if wake:
             self._tell()
-        return kept
+        return result
 
 
 class Agenda:
@@ -251,25 +251,25 @@ def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
         words = ["--listen", endpoint, "--name", "r", "--pairs", str(pairs), "--generations", "100000", "--no-record"]
         learner = stack.enter_context(process(["-m", "farm", "learner", *words], folder))
         link = stack.enter_context(session.connect((endpoint,), 30.0, lambda: False))
-        begun, emulators = time.monotonic(), []
+        origin, emulators = time.monotonic(), []
         for first in range(0, workers, TOGETHER):
             count = min(TOGETHER, workers - first)
             command = [__file__, "--pair", str(pair), "--emulate", endpoint, str(count)]
             emulators.append(stack.enter_context(process(command, folder)))
         while _present(link) < workers:
             pause(learner, *emulators)
-        joined = time.monotonic() - begun
+        arrival = time.monotonic() - origin
         _wait(run, len(progress(run)) + 2, learner, *emulators)
         first, before, start = len(progress(run)), cpu(learner.pid), time.monotonic()
         others = sum(cpu(emulator.pid) for emulator in emulators)
         time.sleep(seconds)
         _wait(run, len(progress(run)) + 1, learner, *emulators)
-        lines, used, took = progress(run), cpu(learner.pid) - before, time.monotonic() - start
+        lines, cpu_seconds, took = progress(run), cpu(learner.pid) - before, time.monotonic() - start
         times = [line["seconds"] for line in lines[first - 1 :]]
         over = (len(times) - 1) * pairs / (times[-1] - times[0])
         latency = statistics.median(b - a for a, b in zip(times, times[1:], strict=False))
         others = sum(cpu(emulator.pid) for emulator in emulators) - others
-        return Measured(joined, over, latency, used / took, megabytes(learner.pid), others / took)
+        return Measured(arrival, over, latency, cpu_seconds / took, megabytes(learner.pid), others / took)
 
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
@@ -296,9 +296,9 @@ def _until_closed(over: threading.Event) -> None:
 @contextmanager
 def process(words: list[str], folder: str) -> "Iterator[subprocess.Popen[bytes]]":
     """A Python process that is stopped at the end of the block."""
-    with Path(folder, "said").open("ab") as said:
+    with Path(folder, "said").open("ab") as log:
         process = subprocess.Popen(
-            [sys.executable, *words], cwd=folder, stdin=subprocess.PIPE, stdout=said, stderr=said,
+            [sys.executable, *words], cwd=folder, stdin=subprocess.PIPE, stdout=log, stderr=log,
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         )  # fmt: skip
         try:

@@ -41,9 +41,9 @@ def _run(out: Path, preset: str, seed: int) -> dict[str, Any]:
     folder = out / f"s{seed}"
     summary = folder / "summary.json"
     if not summary.exists() or json.loads(summary.read_text())["state"] != "finished":
-        begin = ["--resume", str(folder)] if folder.exists() else ["--preset", preset, "--seed", str(seed)]
+        words = ["--resume", str(folder)] if folder.exists() else ["--preset", preset, "--seed", str(seed)]
         name = [] if folder.exists() else ["--out", str(out), "--name", f"s{seed}"]
-        command = [sys.executable, "-m", "farm", "run", *begin, *name, "--no-record"]
+        command = [sys.executable, "-m", "farm", "run", *words, *name, "--no-record"]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             try:
                 process.wait()

@@ -41,9 +41,9 @@ def main() -> None:
         config = configure(task)
         for count in arguments.rollouts or (15, 60):
             turns = _turns(problem(config).runner(), count, arguments.turns)
-            total, physics, own, policy = (1e3 * statistics.median(column) for column in zip(*turns, strict=True))
+            total, physics, code, policy = (1e3 * statistics.median(column) for column in zip(*turns, strict=True))
             ratio = statistics.median(turn[0] / turn[1] for turn in turns)
-            cells = f"{total:.1f} | {physics:.1f} | {own:.1f} | {policy:.1f} | {total - physics - own - policy:.1f}"
+            cells = f"{total:.1f} | {physics:.1f} | {code:.1f} | {policy:.1f} | {total - physics - code - policy:.1f}"
             print(f"| {Path(task).name}, {config.policy} | {count} | {cells} | {ratio:.2f} |", flush=True)
     _functions()
 
@@ -58,19 +58,19 @@ def _turns(runner: Runner, count: int, turns: int) -> list[tuple[float, float, f
     out = []
     for turn in range(turns + 1):
         spent.update(dict.fromkeys(spent, 0.0))
-        begun = time.process_time()
+        start = time.process_time()
         runner.rollouts(theta, [(turn, row) for row in range(count)])
-        out.append((time.process_time() - begun, spent["engine"], spent["task"], spent["policy"]))
+        out.append((time.process_time() - start, spent["engine"], spent["task"], spent["policy"]))
     return out[1:]  # the first one also makes what all need
 
 
 def _timed(call: Callable[..., Any], spent: dict[str, float], part: str) -> Callable[..., Any]:
     def timed(*values: Any) -> Any:  # noqa: ANN401
-        begun = time.process_time()
+        start = time.process_time()
         try:
             return call(*values)
         finally:
-            spent[part] += time.process_time() - begun
+            spent[part] += time.process_time() - start
 
     return timed
 
@@ -82,12 +82,12 @@ def _functions() -> None:
         times = [[], []]
         for part in np.array_split(x, 20):
             for each, call in zip(times, (function, lambda row: np.add(row, row, out)), strict=True):
-                begun = time.process_time()
+                start = time.process_time()
                 for row in part:
                     call(row)
-                each.append((time.process_time() - begun) / len(part))
-        own, addition = (1e6 * statistics.median(each) for each in times)
-        print(f"| {function.__name__} | {own:.1f} | {addition:.2f} |")
+                each.append((time.process_time() - start) / len(part))
+        evaluation, addition = (1e6 * statistics.median(each) for each in times)
+        print(f"| {function.__name__} | {evaluation:.1f} | {addition:.2f} |")
 
 
 if __name__ == "__main__":

@@ -18,10 +18,10 @@ from farm.elementary import cos, exp, sin
 @cache
 def _mjcf(name: str) -> str:
     """One of the suite's models, with its includes."""
-    found = importlib.util.find_spec("dm_control")
-    if found is None or found.origin is None:
+    package = importlib.util.find_spec("dm_control")
+    if package is None or package.origin is None:
         raise ImportError("dm_control is not installed: pip install dm_control")
-    spec = mujoco.MjSpec.from_file(str(Path(found.origin).parent / "suite" / f"{name}.xml"))
+    spec = mujoco.MjSpec.from_file(str(Path(package.origin).parent / "suite" / f"{name}.xml"))
     spec.compile()
     return spec.to_xml()
 

@@ -149,9 +149,9 @@ class Search:
 
     def restore(self, values: Mapping[str, Any]) -> None:
         """Continue from values of `saved`."""
-        own = {name.partition(".")[2]: value for name, value in values.items() if name.startswith("state.")}
+        fields = {name.partition(".")[2]: value for name, value in values.items() if name.startswith("state.")}
         empty = dict.fromkeys(self.state.to_dict())
-        self.state = self.state.from_dict(empty | {n: v if v.ndim else v.item() for n, v in own.items()})
+        self.state = self.state.from_dict(empty | {n: v if v.ndim else v.item() for n, v in fields.items()})
         self.steps, self.pairs, self.moments = int(values["steps"]), int(values["pairs"]), values["moments"]
         self.curve = [(int(at), float(value)) for at, value in values["curve"]]
 
@@ -203,7 +203,7 @@ def main() -> None:
     searches, runner = _begun(task, values, arguments.seed)
     if arguments.state and arguments.state.exists():
         _load(arguments.state, searches)
-    begun, before = time.monotonic(), sum(search.steps for search in searches)
+    start, before = time.monotonic(), sum(search.steps for search in searches)
     _learn(searches, runner, arguments.state)
     print(f"| environment | seed | settings | steps | published | ours, {arguments.starts} starts | parameters |")
     print("|---|---|---|---|---|---|---|")
@@ -216,7 +216,7 @@ def main() -> None:
             f"| {arguments.environment} | {search.config.seed} | {_flags(values)} | {search.steps} | {published} "
             f"| {returns.mean():.0f} +/- {returns.std():.0f} | {digest} |"
         )
-        found = {
+        record = {
             "table": arguments.table, "environment": arguments.environment, "seed": search.config.seed,
             "steps": search.steps, "generations": search.state.generation, "return": round(float(returns.mean()), 3),
             "spread": round(float(returns.std()), 3), "length": round(float(steps.mean()), 1), "parameters": digest,
@@ -224,11 +224,11 @@ def main() -> None:
         }  # fmt: skip
         if arguments.out:
             with arguments.out.open("a") as file:
-                file.write(json.dumps(found) + "\n")
+                file.write(json.dumps(record) + "\n")
     total = sum(search.steps for search in searches) - before
     values = {"generations": _MOST, **values}
     print(f"\nfarm run --task {task} {_flags(values)} --seed S    gives the same parameters")
-    print(f"{total / (time.monotonic() - begun):.0f} steps/s in this process")
+    print(f"{total / (time.monotonic() - start):.0f} steps/s in this process")
 
 
 _MOST: Final = 1_000_000  # generations: runs end by their number of steps
@@ -270,25 +270,25 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
     config, task = searches[0].config, runner.task
     offset = config.task_config.reward_offset
     offsets = np.array([0.0, *itertools.accumulate([task.return_scale * offset] * task.steps)])
-    policy, shown = SideBySide(searches[0].policy), time.monotonic()
+    policy, last = SideBySide(searches[0].policy), time.monotonic()
     going = searches
     while going := [search for search in going if not search.over]:
-        asked = [search.ask() for search in going]
-        theta = np.concatenate([search.extended(own) for search, (own, _) in zip(going, asked, strict=True)])
-        starts = [start for _, each in asked for start in each]
+        proposals = [search.ask() for search in going]
+        theta = np.concatenate([search.extended(rows) for search, (rows, _) in zip(going, proposals, strict=True)])
+        starts = [start for _, each in proposals for start in each]
         moments = config.policy_config.normalise
         rollouts = loop.run(task, policy, runner.sim, theta, starts, moments=moments)
         first = 0
-        for search, (own, _) in zip(going, asked, strict=True):
-            search.tell(rollouts.at(slice(first, first + len(own))), offsets)
-            first += len(own)
-        if saved and (stopped.is_set() or time.monotonic() - shown > 60):
+        for search, (rows, _) in zip(going, proposals, strict=True):
+            search.tell(rollouts.at(slice(first, first + len(rows))), offsets)
+            first += len(rows)
+        if saved and (stopped.is_set() or time.monotonic() - last > 60):
             _save(saved, searches)
         if stopped.is_set():
             sys.stderr.write(f"stopped; the same command continues from {saved}\n")
             sys.exit(INTERRUPTED)
-        if time.monotonic() - shown > 60:
-            shown = time.monotonic()
+        if time.monotonic() - last > 60:
+            last = time.monotonic()
             now = ", ".join(f"{s.steps / 1e6:.2f}M {s.curve[-1][1]:.0f}" for s in going)
             print(f"# {now}", file=sys.stderr, flush=True)
 
@@ -296,8 +296,8 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
 def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntArray]:
     """Returns and lengths of the mean policy's rollouts."""
     theta, starts = search.extended(np.tile(search.state.mu, (count, 1))), [seeds.trial(0, i) for i in range(count)]
-    found = loop.run(runner.task, SideBySide(search.policy), runner.sim, theta, starts)
-    return found.returns, found.steps
+    rollouts = loop.run(runner.task, SideBySide(search.policy), runner.sim, theta, starts)
+    return rollouts.returns, rollouts.steps
 
 
 def _thinned(curve: list[tuple[int, float]]) -> list[tuple[int, float]]:

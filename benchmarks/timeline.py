@@ -40,11 +40,11 @@ def noting(noted: Noted, part: str, function: Callable[..., Any]) -> Callable[..
     """The function, which then also records its begin and end."""
 
     def run(*words: Any, **more: Any) -> Any:  # noqa: ANN401
-        begun = time.monotonic()
+        start = time.monotonic()
         try:
             return function(*words, **more)
         finally:
-            noted.append((part, begun, time.monotonic()))
+            noted.append((part, start, time.monotonic()))
 
     return run
 
@@ -76,15 +76,15 @@ def main() -> None:
     parser.add_argument("--generations", type=int, default=60)
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--work", help=argparse.SUPPRESS)
-    chosen = parser.parse_args()
-    if chosen.work:
-        work(chosen.work)
+    arguments = parser.parse_args()
+    if arguments.work:
+        work(arguments.work)
         return
-    rounds, rows = measure(chosen.pairs, chosen.generations)
+    rounds, rows = measure(arguments.pairs, arguments.generations)
     middle = rounds[len(rounds) // 3 :]
     lengths = [b - a for a, b in zip(middle, middle[1:], strict=False)]
     length = statistics.median(lengths)
-    print(f"{1e3 * length:.1f} ms per generation of {chosen.pairs} pairs (median of {len(lengths)})\n")
+    print(f"{1e3 * length:.1f} ms per generation of {arguments.pairs} pairs (median of {len(lengths)})\n")
     print("| task | ms per generation, learner and both workers |\n|---|---|")
     took = {
         part: 1e3 * sum(e - b for noted in rows for name, b, e in noted if name == part and middle[0] <= b < middle[-1])
@@ -95,9 +95,9 @@ def main() -> None:
     for part, total in took.items():
         print(f"| {part} | {total / len(lengths):.1f} |")
     print(f"| both workers wait | {2e3 * length - (took['simulate'] + took['send results']) / len(lengths):.1f} |")
-    if chosen.picture:
+    if arguments.picture:
         at = min(range(len(middle) - 2), key=lambda i: abs(middle[i + 2] - middle[i] - 2 * length))
-        draw(rows, middle[at] - 0.002, middle[at + 2] + 0.002, chosen.picture)
+        draw(rows, middle[at] - 0.002, middle[at + 2] + 0.002, arguments.picture)
 
 
 def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
@@ -111,19 +111,19 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
         )
         begin, collect, take = run.dispatcher.begin, run.dispatcher.collect, run.dispatcher._take
 
-        def begun(*words: Any, **more: Any) -> None:  # noqa: ANN401
+        def begin_round(*words: Any, **more: Any) -> None:  # noqa: ANN401
             rounds.append(time.monotonic())
             begin(*words, **more)
 
-        run.dispatcher.begin = noting(learner, "hand out jobs", begun)  # type: ignore[method-assign]
+        run.dispatcher.begin = noting(learner, "hand out jobs", begin_round)  # type: ignore[method-assign]
         run.dispatcher._take = noting(learner, "take results", take)  # type: ignore[method-assign]
-        ended = [0.0]
+        last = [0.0]
 
         def collected() -> Any:  # noqa: ANN401
-            if ended[0]:
-                learner.append(("update, save, report", ended[0], time.monotonic()))
+            if last[0]:
+                learner.append(("update, save, report", last[0], time.monotonic()))
             results = collect()
-            ended[0] = time.monotonic()
+            last[0] = time.monotonic()
             return results
 
         run.dispatcher.collect = collected  # type: ignore[method-assign]
@@ -141,11 +141,11 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
             for _ in run.learner.learn(run.dispatcher):
                 pass
         finally:
-            said = [worker.communicate("\n")[0] for worker in workers]
-    return rounds, [learner, *(json.loads(text) for text in said)]
+            outputs = [worker.communicate("\n")[0] for worker in workers]
+    return rounds, [learner, *(json.loads(text) for text in outputs)]
 
 
-def draw(rows: list[Noted], begin: float, end: float, path: Path) -> None:
+def draw(rows: list[Noted], start: float, end: float, path: Path) -> None:
     """Draw bars over time, for learner and workers."""
     from matplotlib.figure import Figure
 
@@ -156,12 +156,12 @@ def draw(rows: list[Noted], begin: float, end: float, path: Path) -> None:
             noted, key=lambda one: one[0] == "hand out jobs"
         )  # part of the learner's update: drawn on top of it
         for part, first, last in order:
-            if last > begin and first < end:
-                axes.barh(-height, 1e3 * (last - first), left=1e3 * (first - begin), height=0.7, color=PARTS[part])
+            if last > start and first < end:
+                axes.barh(-height, 1e3 * (last - first), left=1e3 * (first - start), height=0.7, color=PARTS[part])
     for part, colour in PARTS.items():
         axes.barh(0, 0, color=colour, label=part)
     axes.set_yticks([0, -1, -2], ["learner", "worker 1", "worker 2"])
-    axes.set_xlim(0, 1e3 * (end - begin))
+    axes.set_xlim(0, 1e3 * (end - start))
     axes.set_xlabel("time [ms]; blank: waiting")
     axes.legend(ncols=5, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)

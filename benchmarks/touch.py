@@ -144,25 +144,25 @@ def main() -> None:
     ]
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"bias-{arguments.bias:g}.json"
-    found: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
+    results: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
     print(
         "| policy observes | success on 200 new starts, by seed [%] | last mean alone [%] | with shuffled touch [%] |"
     )
     print("|---|---|---|---|")
     for name, success in (("expert", _expert), ("zeroed", _zeroed)):
-        if name not in found:
-            found[name] = [success(arguments.bias)]
+        if name not in results:
+            results[name] = [success(arguments.bias)]
     for name in rows:
         for what, how in JUDGED.items():
-            if f"{name}{what}" not in found and (name in TOUCH or not how["shuffle"]):
-                found[f"{name}{what}"] = [_learnt(name, seed, arguments.bias, **how) for seed in seeds]
-                path.write_text(json.dumps(found, indent=1) + "\n")
-        cells = (_percent(found.get(f"{name}{what}", ())) for what in JUDGED)
+            if f"{name}{what}" not in results and (name in TOUCH or not how["shuffle"]):
+                results[f"{name}{what}"] = [_learnt(name, seed, arguments.bias, **how) for seed in seeds]
+                path.write_text(json.dumps(results, indent=1) + "\n")
+        cells = (_percent(results.get(f"{name}{what}", ())) for what in JUDGED)
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
-    print(f"| hand-made: rate and lag of the joints | {_percent(found['expert'])} | | |")
-    print(f"| hand-made: zeroed encoders, force from deflections | {_percent(found['zeroed'])} | | |")
-    path.write_text(json.dumps(found, indent=1) + "\n")
-    draw(found, arguments.out / f"bias-{arguments.bias:g}.png", arguments.bias)
+    print(f"| hand-made: rate and lag of the joints | {_percent(results['expert'])} | | |")
+    print(f"| hand-made: zeroed encoders, force from deflections | {_percent(results['zeroed'])} | | |")
+    path.write_text(json.dumps(results, indent=1) + "\n")
+    draw(results, arguments.out / f"bias-{arguments.bias:g}.png", arguments.bias)
 
 
 def _percent(parts: Sequence[float]) -> str:
@@ -211,8 +211,8 @@ def _expert(bias: float) -> float:
         done = []
         for first in range(0, len(starts), runner.sim.engine.size):
 
-            def rollouts(some: tuple[Seed, ...] = starts[first : first + runner.sim.engine.size]) -> Any:  # noqa: ANN401
-                batch, sim = Batch(runner.task, runner.sim, some), runner.sim
+            def rollouts(group: tuple[Seed, ...] = starts[first : first + runner.sim.engine.size]) -> Any:  # noqa: ANN401
+                batch, sim = Batch(runner.task, runner.sim, group), runner.sim
                 while not batch.over:
                     q = sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, sim.t]
                     behind = (sim.own["target"] - q)[:, middle].sum(axis=1)
@@ -247,8 +247,8 @@ class Zeroed:
         self.runner, self.map = runner, np.zeros(len(JOINTS) + 1)
         for rate in (0.01, None):
             x, force = (values[:, self.STILL :] for values in self.rollouts(starts, rate)[1:])
-            kept = (force < BREAKS) & ~np.isnan(x).any(axis=-1)
-            self.map = np.linalg.lstsq(np.insert(x[kept], 0, 1.0, axis=-1), force[kept], rcond=None)[0]
+            good = (force < BREAKS) & ~np.isnan(x).any(axis=-1)
+            self.map = np.linalg.lstsq(np.insert(x[good], 0, 1.0, axis=-1), force[good], rcond=None)[0]
 
     def rollouts(self, starts: Sequence[Seed], rate: float | None = None) -> tuple[AnyArray, ...]:
         """Rollouts that follow the estimate, or close at a constant rate [rad per step].
@@ -263,7 +263,7 @@ class Zeroed:
 
     def _once(self, starts: Sequence[Seed], rate: float | None) -> tuple[AnyArray, ...]:
         batch, sim = Batch(self.runner.task, self.runner.sim, tuple(starts)), self.runner.sim
-        seen = np.full((len(starts), self.runner.task.steps, len(JOINTS)), np.nan)
+        deflections = np.full((len(starts), self.runner.task.steps, len(JOINTS)), np.nan)
         zero, estimate = np.zeros((len(starts), len(JOINTS))), np.zeros(len(starts))
         while not batch.over:
             rows = batch.active
@@ -271,18 +271,18 @@ class Zeroed:
             deflection = sim.own["target"] - reading - zero[rows]
             action = np.zeros((len(sim), len(JOINTS)))
             if sim.t < self.STILL:
-                seen[rows, sim.t] = deflection
+                deflections[rows, sim.t] = deflection
                 if sim.t == self.STILL - 1:
-                    zero = np.nan_to_num(seen[:, : self.STILL].mean(axis=1))
+                    zero = np.nan_to_num(deflections[:, : self.STILL].mean(axis=1))
             else:
-                seen[rows, sim.t] = deflection
+                deflections[rows, sim.t] = deflection
                 force = self.map[0] + deflection @ self.map[1:]
                 estimate[rows] = self.KEEP * estimate[rows] + (1.0 - self.KEEP) * force
                 step = np.clip(self.GAIN * (WANTED - estimate[rows]), -self.MOST, self.MOST)
                 action[:, FINGER_JOINTS["middle"]] = (step if rate is None else np.full(len(sim), rate))[:, None]
             batch.step(action)
         rollouts = batch.rollouts()
-        return rollouts.success, seen, rollouts.frames["force"].sum(axis=-1)[..., FINGERS.index("middle")]
+        return rollouts.success, deflections, rollouts.frames["force"].sum(axis=-1)[..., FINGERS.index("middle")]
 
 
 def _zeroed(bias: float) -> float:
@@ -294,7 +294,7 @@ def _zeroed(bias: float) -> float:
         runner.close()
 
 
-def draw(found: dict[str, list[float]], path: Path, bias: float) -> None:
+def draw(results: dict[str, list[float]], path: Path, bias: float) -> None:
     """One figure: success by the policy's observation, one dot per seed."""
     import matplotlib
 
@@ -302,15 +302,15 @@ def draw(found: dict[str, list[float]], path: Path, bias: float) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(7, 4))
-    names = [name for name in found if not name.endswith(", last mean")]
+    names = [name for name in results if not name.endswith(", last mean")]
     names.sort(key=lambda name: name not in BY_HAND)
     for row, name in enumerate(names):
         touch = name.split(", ")[0] in TOUCH and "shuffled" not in name
         colour = "#0072b2" if touch else "#999999"
-        medians = [float(np.median(found[each])) for each in (name, f"{name}, last mean") if each in found]
+        medians = [float(np.median(results[each])) for each in (name, f"{name}, last mean") if each in results]
         axes.barh(row, 100 * max(medians), color=colour, alpha=0.5)
         for suffix, fill in (("", colour), (", last mean", "none")):
-            parts = [100 * part for part in found.get(f"{name}{suffix}", ())]
+            parts = [100 * part for part in results.get(f"{name}{suffix}", ())]
             axes.plot(parts, [row] * len(parts), "o", markeredgecolor=colour, markerfacecolor=fill, markersize=4)
     axes.set_yticks(range(len(names)), [BY_HAND.get(name, name) for name in names])
     axes.set_xlim(0, 101)

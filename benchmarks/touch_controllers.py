@@ -68,13 +68,13 @@ class Zeroed:
         """Start rollouts."""
         self._memory = {"zero": np.zeros((count, len(JOINTS))), "force": np.zeros(count)}
 
-    def force(self, t: int, rows: AnyArray, seen: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(self, t: int, rows: AnyArray, error: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
         """The estimated force of some rows (K,) [N], from targets less readings (K, 8) [rad] in step t."""
         zero, last = self._memory["zero"], self._memory["force"]
         if t < ZERO:
-            zero[rows] += seen / ZERO
-            return np.zeros(len(seen))
-        last[rows] = self.keep * last[rows] + (1.0 - self.keep) * (self.map[0] + (seen - zero[rows]) @ self.map[1:])
+            zero[rows] += error / ZERO
+            return np.zeros(len(error))
+        last[rows] = self.keep * last[rows] + (1.0 - self.keep) * (self.map[0] + (error - zero[rows]) @ self.map[1:])
         return last[rows]
 
     @classmethod
@@ -82,8 +82,8 @@ class Zeroed:
         """With the map that fits best to rollouts, for each filter."""
         zero = played.seen[:, :ZERO].mean(axis=1, keepdims=True)
         x, force = (played.seen - zero)[:, ZERO:], played.force[:, ZERO:]
-        kept = (force < BREAKS) & ~np.isnan(x).any(axis=-1)
-        fit = np.linalg.lstsq(np.insert(x[kept], 0, 1.0, axis=-1), force[kept], rcond=None)[0]
+        good = (force < BREAKS) & ~np.isnan(x).any(axis=-1)
+        fit = np.linalg.lstsq(np.insert(x[good], 0, 1.0, axis=-1), force[good], rcond=None)[0]
         yield from (cls(fit, keep) for keep in _KEEPS)
 
 
@@ -108,12 +108,12 @@ class Kalman:
         """Start rollouts."""
         self._memory = {"d": np.tile(self.start, (count, 1)), "e": np.zeros((count, len(JOINTS)))}
 
-    def force(self, t: int, rows: AnyArray, seen: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(self, t: int, rows: AnyArray, error: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
         """The estimated force of some rows (K,) [N]; `move` (K,) is what the last step commanded [rad]."""
         d, e = self._memory["d"][rows], self._memory["e"][rows]
         if t:
             d = d @ self.a.T + move[:, None] * self.b + self.c
-        change = (seen - d - e) @ self.gains[t].T
+        change = (error - d - e) @ self.gains[t].T
         self._memory["d"][rows], self._memory["e"][rows] = d + change[:, : len(JOINTS)], e + change[:, len(JOINTS) :]
         return np.asarray(self.map[0] + self._memory["d"][rows] @ self.map[1:])
 
@@ -121,24 +121,24 @@ class Kalman:
     def fitted(cls, played: Played, cell: Cell) -> "Iterator[Kalman]":
         """Fitted to rollouts."""
         d, n = played.true, len(JOINTS)
-        kept = (played.force < BREAKS) & ~np.isnan(d).any(axis=-1)
-        fit = np.asarray(np.linalg.lstsq(np.insert(d[kept], 0, 1.0, axis=-1), played.force[kept], rcond=None)[0], float)
-        pairs = kept[:, 1:] & kept[:, :-1]
+        good = (played.force < BREAKS) & ~np.isnan(d).any(axis=-1)
+        fit = np.asarray(np.linalg.lstsq(np.insert(d[good], 0, 1.0, axis=-1), played.force[good], rcond=None)[0], float)
+        pairs = good[:, 1:] & good[:, :-1]
         before = np.concatenate([d[:, :-1][pairs], played.move[:, :-1][pairs][:, None]], axis=1)
         model, after = np.insert(before, 0, 1.0, axis=1), d[:, 1:][pairs]
-        found = np.asarray(np.linalg.lstsq(model, after, rcond=None)[0], dtype=float)
-        a, b, c = found[1 : 1 + n].T, found[1 + n], found[0]
-        rest = after - model @ found
+        weights = np.asarray(np.linalg.lstsq(model, after, rcond=None)[0], dtype=float)
+        a, b, c = weights[1 : 1 + n].T, weights[1 + n], weights[0]
+        rest = after - model @ weights
         big = np.block([[a, np.zeros((n, n))], [np.zeros((n, n)), np.eye(n)]])
         noise = np.zeros((2 * n, 2 * n))
         noise[:n, :n], noise[n:, n:] = np.cov(rest.T), cell.get("joint_drift", 0.0) ** 2 * np.eye(n)
-        see, read = np.hstack([np.eye(n), np.eye(n)]), (cell.get("joint_noise", 0.01) ** 2 + 1e-10) * np.eye(n)
+        see, covariance = np.hstack([np.eye(n), np.eye(n)]), (cell.get("joint_noise", 0.01) ** 2 + 1e-10) * np.eye(n)
         p = np.zeros((2 * n, 2 * n))
         p[:n, :n], p[n:, n:] = np.cov(d[:, 0].T), 0.05**2 / 3.0 * np.eye(n)  # of the joints' constant error
         gains = []
         for t in range(d.shape[1]):
             p = big @ p @ big.T + noise if t else p
-            gain = p @ see.T @ np.linalg.inv(see @ p @ see.T + read)
+            gain = p @ see.T @ np.linalg.inv(see @ p @ see.T + covariance)
             p = p - gain @ see @ p
             gains.append(gain)
         yield cls(fit, a, b, c, np.stack(gains), d[:, 0].mean(axis=0))
@@ -155,7 +155,7 @@ class Touch:
         """Start rollouts."""
         self._memory = {"force": np.zeros(count)}
 
-    def force(self, t: int, rows: AnyArray, seen: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(self, t: int, rows: AnyArray, error: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
         """The read force of some rows (K,) [N]."""
         last = self._memory["force"]
         last[rows] = self.keep * last[rows] + (1.0 - self.keep) * felt
@@ -193,27 +193,27 @@ def _once(
 ) -> Played:  # fmt: skip
     task: Any = runner.task
     batch, sim = Batch(task, runner.sim, tuple(starts)), runner.sim
-    seen, true = (np.full((len(starts), task.steps, len(JOINTS)), np.nan) for _ in range(2))
+    deflections, true = (np.full((len(starts), task.steps, len(JOINTS)), np.nan) for _ in range(2))
     move, force = np.zeros((len(starts), task.steps)), np.full((len(starts), task.steps), np.nan)
     if estimate is not None:
         estimate.begin(len(starts))
     while not batch.over:
         rows, t = batch.active, sim.t
-        seen[rows, t] = sim.own["target"] - task.joints(sim)
+        deflections[rows, t] = sim.own["target"] - task.joints(sim)
         true[rows, t] = sim.own["target"] - sim.qpos[:, : len(JOINTS)]
         felt = task.images(sim).sum(axis=-1)[:, FINGERS.index("middle")]
         force[rows, t] = task.measure(sim)["force"].sum(axis=-1)[:, FINGERS.index("middle")]
         step = np.full(len(sim), rate)
         if estimate is not None:
             last = move[rows, t - 1] if t else np.zeros(len(sim))
-            step = gain * (WANTED - estimate.force(t, rows, seen[rows, t], last, felt))
+            step = gain * (WANTED - estimate.force(t, rows, deflections[rows, t], last, felt))
         moved = move[rows].sum(axis=1)
         step = np.clip(np.clip(moved + step, *bounds) - moved, -_MOST, _MOST)
         move[rows, t] = step if t >= ZERO else 0.0
         action = np.zeros((len(sim), len(JOINTS)))
         action[:, _MIDDLE] = move[rows, t][:, None]
         batch.step(action)
-    return Played(batch.rollouts().success, seen, true, move, force)
+    return Played(batch.rollouts().success, deflections, true, move, force)
 
 
 @cache
@@ -233,23 +233,23 @@ def by_hand(kinds: Sequence[type[Estimate]], cell: Cell) -> dict[str, Any]:
     angle, runner = open_loop(cell.get("stiffness", 1.0))[0], problem(farm.configure("fragile-bar", **cell)).runner()
     try:
         closing = [play(runner, FITS[i :: len(_WAYS)], None, 0.0, rate) for i, rate in enumerate(_WAYS)]
-        found: list[tuple[float, str, Estimate, float]] = []
+        candidates: list[tuple[float, str, Estimate, float]] = []
         for kind in kinds:
             data = Played.joined(closing)
-            own = play(runner, FITS, next(kind.fitted(data, cell)), 0.04)  # then on what it does itself
-            for estimate, gain in itertools.product(kind.fitted(Played.joined([data, own]), cell), _GAINS):
+            second = play(runner, FITS, next(kind.fitted(data, cell)), 0.04)  # then on what it does itself
+            for estimate, gain in itertools.product(kind.fitted(Played.joined([data, second]), cell), _GAINS):
                 part = float(play(runner, GRID, estimate, gain).success.mean())
-                found.append((part, kind.__name__, estimate, gain))
-        free, name, estimate, gain = max(found, key=lambda each: each[0])
+                candidates.append((part, kind.__name__, estimate, gain))
+        free, name, estimate, gain = max(candidates, key=lambda each: each[0])
         bounds = {ANY: free}
         for width in _WIDTHS:
             near = angle - width, angle + width
             bounds[near] = float(play(runner, GRID, estimate, gain, bounds=near).success.mean())
         within = max(bounds, key=lambda each: bounds[each])
-        kept = f", keep {estimate.keep:g}" if isinstance(estimate, Zeroed | Touch) else ""
+        suffix = f", keep {estimate.keep:g}" if isinstance(estimate, Zeroed | Touch) else ""
         return {
             "success": int(play(runner, STARTS, estimate, gain, bounds=within).success.sum()),
-            "chosen": f"{name}, gain {gain:g}{kept}, within {within[0]:g} to {within[1]:g} rad",
+            "chosen": f"{name}, gain {gain:g}{suffix}, within {within[0]:g} to {within[1]:g} rad",
         }
     finally:
         runner.close()

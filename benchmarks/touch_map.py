@@ -66,7 +66,7 @@ def learnt(name: str, cell: Cell, seed: int, **settings: Any) -> Learnt:  # noqa
     return RUNS / folder, farm.configure("fragile-bar", seed=seed, **settings, **cell)
 
 
-def tried(folder: Path, config: RunConfig) -> int:
+def successes(folder: Path, config: RunConfig) -> int:
     """On how many of the test's starts a learnt policy succeeds."""
     runner, mu = problem(config).runner(), loaded(RunFolder.open(folder)).mu
     size = runner.sim.engine.size
@@ -94,18 +94,18 @@ def runs(*, fine: bool) -> Iterator[tuple[str, Learnt]]:
         for skin, errors in SKINS.items():
             yield f"{skin} learnt, seed {seed}", learnt("forces", errors, seed, state="forces", width=0.4)
         for extra in STIFFER:
-            own = learnt("constant", extra, seed, **CONSTANT)
-            yield f"nothing read, learnt, {_name(extra)}, seed {seed}", own
+            run = learnt("constant", extra, seed, **CONSTANT)
+            yield f"nothing read, learnt, {_name(extra)}, seed {seed}", run
             errors = SKINS["good touch"] | extra
-            own = learnt("forces", errors, seed, state="forces", width=0.4)
-            yield f"good touch learnt, {_name(extra)}, seed {seed}", own
+            run = learnt("forces", errors, seed, state="forces", width=0.4)
+            yield f"good touch learnt, {_name(extra)}, seed {seed}", run
         for cell in REMEMBERED:
-            own = learnt("rnn", cell, seed, policy="rnn", **MEMORY)
-            yield f"blind learnt, {_name(cell)}, with memory, seed {seed}", own
+            run = learnt("rnn", cell, seed, policy="rnn", **MEMORY)
+            yield f"blind learnt, {_name(cell)}, with memory, seed {seed}", run
         for cell in cells():
             if fine or on_the_axes(cell):
-                own = learnt("zeroed", cell, seed, state="zeroed", width=_width(cell))
-                yield f"blind learnt, {_name(cell)}, seed {seed}", own
+                run = learnt("zeroed", cell, seed, state="zeroed", width=_width(cell))
+                yield f"blind learnt, {_name(cell)}, seed {seed}", run
 
 
 def programs() -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -132,45 +132,45 @@ def least(more: float, less: float, n: int = len(STARTS)) -> float:
     return float(p - q - np.sqrt((p - wilson(more, n)[0]) ** 2 + (wilson(less, n)[1] - q) ** 2))
 
 
-def best(found: Mapping[str, Any], cell: Cell) -> int:
+def best(results: Mapping[str, Any], cell: Cell) -> int:
     """The most starts on which anything blind that was tried succeeds, lucky seeds included."""
-    own = {key: value for key, value in cell.items() if key == "stiffness"}
-    seeds = [found[name] for name in found if name.startswith(f"blind learnt, {_name(cell)}, ")]
-    unread = [found[f"nothing read, {_name(own)}"], _unread_best(found, own)]
-    return max(found[f"blind by hand, {_name(cell)}"]["success"], *unread, *seeds)
+    stiffness = {key: value for key, value in cell.items() if key == "stiffness"}
+    seeds = [results[name] for name in results if name.startswith(f"blind learnt, {_name(cell)}, ")]
+    unread = [results[f"nothing read, {_name(stiffness)}"], _unread_best(results, stiffness)]
+    return max(results[f"blind by hand, {_name(cell)}"]["success"], *unread, *seeds)
 
 
-def _unread_best(found: Mapping[str, Any], extra: Mapping[str, float]) -> int:
+def _unread_best(results: Mapping[str, Any], extra: Mapping[str, float]) -> int:
     """The best learnt policy that reads nothing, lucky seeds included."""
-    seeds = [found[name] for name in found if name.startswith(f"nothing read, learnt, {_name(extra)}, ")]
-    return max(seeds, default=0) if extra else int(found[_LEARNT])
+    seeds = [results[name] for name in results if name.startswith(f"nothing read, learnt, {_name(extra)}, ")]
+    return max(seeds, default=0) if extra else int(results[_LEARNT])
 
 
-def tables(found: Mapping[str, Any]) -> str:
+def tables(results: Mapping[str, Any]) -> str:
     """The page's tables."""
     n, lines = len(STARTS), [f"| drift \\ noise [rad] | {' | '.join(f'{each:g}' for each in NOISES)} |"]
     lines.append("|---" * (1 + len(NOISES)) + "|")
-    good = found["good touch by hand, nominal"]["success"]
+    good = results["good touch by hand, nominal"]["success"]
     for drift in DRIFTS:
         row = []
         for noise in NOISES:
             cell = {"joint_drift": drift, "joint_noise": noise}
-            seeds = [found[name] for name in found if name.startswith(f"blind learnt, {_name(cell)}, seed")]
+            seeds = [results[name] for name in results if name.startswith(f"blind learnt, {_name(cell)}, seed")]
             learnt = f" ({100 * np.median(seeds) / n:.0f})" if seeds else ""
-            row.append(f"{100 * best(found, cell) / n:.0f}{learnt}, {100 * least(good, best(found, cell)):+.0f}")
+            row.append(f"{100 * best(results, cell) / n:.0f}{learnt}, {100 * least(good, best(results, cell)):+.0f}")
         lines.append(f"| {drift:g} | {' | '.join(row)} |")
     heads = ["stiffness", "blind", *SKINS, "good touch, learnt", "good touch adds at least", "best fixed angle"]
     lines += ["", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for factor in sorted({1.0, *STIFFNESSES}):
-        own = {} if factor == 1.0 else {"stiffness": factor}
-        hands = [found[f"{skin} by hand, {_name(own)}"]["success"] for skin in SKINS]
-        blind = best(found, {"joint_drift": 0.0, "joint_noise": 0.01, **own})
-        learnt = _median(found, f"good touch learnt, {_name(own)}" if own else "good touch learnt")
+        stiffness = {} if factor == 1.0 else {"stiffness": factor}
+        hands = [results[f"{skin} by hand, {_name(stiffness)}"]["success"] for skin in SKINS]
+        blind = best(results, {"joint_drift": 0.0, "joint_noise": 0.01, **stiffness})
+        learnt = _median(results, f"good touch learnt, {_name(stiffness)}" if stiffness else "good touch learnt")
         cells = [
             *(_percent(count) for count in (blind, *hands, learnt)),
             f"{100 * least(max(hands[1], learnt), blind):+.0f}",
         ]
-        lines.append(f"| {factor:g} | {' | '.join([*cells, _percent(found[f'nothing read, {_name(own)}'])])} |")
+        lines.append(f"| {factor:g} | {' | '.join([*cells, _percent(results[f'nothing read, {_name(stiffness)}'])])} |")
     lines += ["", "| learnt with | success by seed [%] |", "|---|---|"]
     rows = {skin: f"{skin} learnt" for skin in SKINS}
     rows |= {f"good touch, stiffness {extra['stiffness']:g}": f"good touch learnt, {_name(extra)}"
@@ -180,15 +180,15 @@ def tables(found: Mapping[str, Any]) -> str:
     rows |= {f"memory, without touch, drift {cell['joint_drift']:g}": f"blind learnt, {_name(cell)}, with memory"
              for cell in REMEMBERED}  # fmt: skip
     for head, name in rows.items():
-        shares = [found[f"{name}, seed {seed}"] / n for seed in SEEDS if f"{name}, seed {seed}" in found]
+        shares = [results[f"{name}, seed {seed}"] / n for seed in SEEDS if f"{name}, seed {seed}" in results]
         if shares:
             lines.append(f"| {head} | {', '.join(f'{100 * share:.3g}' for share in shares)} |")
     return "\n".join(lines) + "\n"
 
 
-def _median(found: Mapping[str, Any], name: str) -> int:
+def _median(results: Mapping[str, Any], name: str) -> int:
     """Of the seeds that have been learnt."""
-    seeds = [found[f"{name}, seed {seed}"] for seed in SEEDS if f"{name}, seed {seed}" in found]
+    seeds = [results[f"{name}, seed {seed}"] for seed in SEEDS if f"{name}, seed {seed}" in results]
     return int(np.median(seeds)) if seeds else 0
 
 
@@ -196,7 +196,7 @@ def _percent(count: int) -> str:
     return f"{100 * count / len(STARTS):.0f}"
 
 
-def draw(found: Mapping[str, Any], path: Path) -> None:
+def draw(results: Mapping[str, Any], path: Path) -> None:
     """The map: blind success by drift and noise; and beside it, along the drift, what touch reaches."""
     import matplotlib
 
@@ -204,7 +204,7 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
     from matplotlib import pyplot
 
     n = len(STARTS)
-    square = np.array([[best(found, {"joint_drift": d, "joint_noise": s}) for s in NOISES] for d in DRIFTS]) / n
+    square = np.array([[best(results, {"joint_drift": d, "joint_noise": s}) for s in NOISES] for d in DRIFTS]) / n
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), width_ratios=(1.1, 1))
     left.imshow(square, origin="lower", cmap="viridis", vmin=0.4, vmax=1.0, aspect="auto")
     for (row, column), share in np.ndenumerate(square):
@@ -216,7 +216,7 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
     left.set_xlabel("noise of joint readings [rad]")
     left.set_ylabel("drift of joint readings [rad per step]")
     left.set_title("best success without touch")
-    along = [best(found, {"joint_drift": drift, "joint_noise": 0.01}) for drift in DRIFTS]
+    along = [best(results, {"joint_drift": drift, "joint_noise": 0.01}) for drift in DRIFTS]
     shares = np.array(along) / n
     bounds = np.array([wilson(count) for count in along])
     right.errorbar(
@@ -224,9 +224,9 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
         capsize=3, label="without touch",
     )  # fmt: skip
     for skin, colour, width in zip(SKINS, ("#0072b2", "#009e73", "#d55e00"), (6, 3.5, 1.2), strict=True):
-        share = found[f"{skin} by hand, nominal"]["success"] / n
+        share = results[f"{skin} by hand, nominal"]["success"] / n
         right.axhline(100 * share, color=colour, linewidth=width, label=skin)
-    right.axhline(100 * found[_LEARNT] / n, color="#999999", linestyle=":", label="nothing read")
+    right.axhline(100 * results[_LEARNT] / n, color="#999999", linestyle=":", label="nothing read")
     right.set_xticks(range(len(DRIFTS)), [f"{each:g}" for each in DRIFTS])
     right.set_ylim(0, 103)
     right.set_xlabel("drift of joint readings [rad per step], noise 0.01 rad")
@@ -266,16 +266,16 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "map.json"
-    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    todo = {name: run for name, run in runs(fine=arguments.fine) if name not in found}
+    results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    todo = {name: run for name, run in runs(fine=arguments.fine) if name not in results}
     learn_together(dict(todo.values()), RUNS, Sharing(connect=tuple(arguments.connect), tls=arguments.tls))
-    for name, compute in (*((name, partial(tried, *run)) for name, run in todo.items()), *programs()):
-        if name not in found:
-            found[name] = compute()
-            path.write_text(json.dumps(found, indent=1) + "\n")
-            print(name, found[name], flush=True)
-    draw(found, arguments.out / "map.png")
-    print(tables(found), end="")
+    for name, compute in (*((name, partial(successes, *run)) for name, run in todo.items()), *programs()):
+        if name not in results:
+            results[name] = compute()
+            path.write_text(json.dumps(results, indent=1) + "\n")
+            print(name, results[name], flush=True)
+    draw(results, arguments.out / "map.png")
+    print(tables(results), end="")
 
 
 if __name__ == "__main__":

@@ -75,22 +75,22 @@ class Keys:
         """Targets (8,) with the fingers at these offsets along x from the plate's middle, at most one lifted."""
         script, out = self.script, np.empty(len(JOINTS))
         for finger, along in (("index", index), ("middle", middle)):
-            own = 0.0 if finger == lifted else -script.press
-            out[FINGER_JOINTS[finger]] = self._at(finger, along, script.lift if finger == lifted else 0.0, own)
+            force = 0.0 if finger == lifted else -script.press
+            out[FINGER_JOINTS[finger]] = self._at(finger, along, script.lift if finger == lifted else 0.0, force)
         out[FINGER_JOINTS["thumb"]] = self._at("thumb", 0.0, 0.0, script.pinch if lifted else script.thumb)
         return np.clip(out, LOWER, UPPER)
 
     def _at(self, finger: str, along: float, up: float, force: float) -> FloatArray:
         """A finger's targets at a position, beyond it by J' F / k to press upwards with this force."""
-        joints, own = FINGER_JOINTS[finger], self._hand.model
+        joints, hand_model = FINGER_JOINTS[finger], self._hand.model
         goal = np.array([self._centre[0] + along, self._height[finger] + up])
-        values, jacobian = self._touch.copy(), np.empty((3, own.nv))
+        values, jacobian = self._touch.copy(), np.empty((3, hand_model.nv))
         for _ in range(40):
             error = goal - self._reached(finger, values)[[0, 2]]
-            mujoco.mj_jacSite(own, self._data, jacobian, None, self._site(finger))
+            mujoco.mj_jacSite(hand_model, self._data, jacobian, None, self._site(finger))
             plane = jacobian[[0, 2]][:, joints]
             values[joints] += np.linalg.lstsq(plane, error, rcond=None)[0]
-        return values[joints] + jacobian[2, joints] * force / own.actuator_gainprm[joints, 0]
+        return values[joints] + jacobian[2, joints] * force / hand_model.actuator_gainprm[joints, 0]
 
     def _reached(self, finger: str, values: FloatArray) -> FloatArray:
         """Position of a fingertip [m]."""
@@ -119,9 +119,9 @@ def phases(keys: Keys) -> list[tuple[FloatArray, float]]:
 
 def script_of(keys: Keys, cycles: int) -> FloatArray:
     """Targets for each physics step, (T, 8): to where a stroke begins, and the cycles."""
-    begin = (keys.targets(-keys.script.reach, keys.script.reach), keys.script.stroke)
+    first = (keys.targets(-keys.script.reach, keys.script.reach), keys.script.stroke)
     last, out = keys.targets(0.0, 0.0), []
-    for targets, seconds in [begin, *phases(keys) * cycles]:
+    for targets, seconds in [first, *phases(keys) * cycles]:
         part = np.arange(1, round(seconds / TIMESTEP) + 1)[:, None] / max(1, round(seconds / TIMESTEP))
         out.append(last + (targets - last) * part)
         last = targets
@@ -152,8 +152,8 @@ class Turned:
         degrees = np.cumsum(np.degrees(2.0 * np.arctan(0.5 * turned(pose))), axis=1)
         tilt = np.degrees(np.arccos(np.clip(upright(pose), -1.0, 1.0)))
         drift = np.linalg.norm(pose[..., :3] - pose[:, :1, :3], axis=-1)
-        lost = np.maximum.accumulate(~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1)
-        return cls(np.pad(degrees, ((0, 0), (1, 0))), tilt, drift, lost, felt, qpos)
+        drops = np.maximum.accumulate(~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1)
+        return cls(np.pad(degrees, ((0, 0), (1, 0))), tilt, drift, drops, felt, qpos)
 
     def first(self, row: int) -> "Turned":
         """One rollout up to the loss of the plate."""
@@ -179,7 +179,7 @@ def task(object_name: str = "plate", torsion: float | None = None) -> FingerGait
 
 def turn(gait: FingerGait, targets: FloatArray, starts: Sequence[Seed]) -> Turned:
     """Close the grip at each start, release the plate, and play the targets (T, 8)."""
-    sim = Sim(gait.engine(lambda own: BatchEngine(own, len(starts))))
+    sim = Sim(gait.engine(lambda hand_model: BatchEngine(hand_model, len(starts))))
 
     def played() -> tuple[FloatArray, BoolArray]:
         gait.setup(sim)
@@ -208,27 +208,29 @@ def main() -> None:
     parser.add_argument(
         "--video", type=Path, metavar="FILE", help="video of the rollout from the nominal start: .gif or .mp4"
     )
-    chosen = parser.parse_args()
-    if chosen.video is not None:
-        video.check(chosen.video)
-    gait = task(chosen.object, chosen.torsion and 1e-3 * chosen.torsion)
+    arguments = parser.parse_args()
+    if arguments.video is not None:
+        video.check(arguments.video)
+    gait = task(arguments.object, arguments.torsion and 1e-3 * arguments.torsion)
     print(
         "| reach [mm] | start | turned [deg] | in [s] | deg/s | 360 after [s] | tilt [deg] | drift [mm] | reached 360 |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
-    for number, reach in enumerate(chosen.reach.split(",")):
+    for number, reach in enumerate(arguments.reach.split(",")):
         keys = Keys(gait.hand, Script(reach=1e-3 * float(reach)))
-        found = turn(gait, script_of(keys, chosen.cycles), [None, *(seeds.trial(0, i) for i in range(chosen.starts))])
-        print(f"| {reach} | nominal | {row(found, slice(0, 1))} |")
-        if chosen.starts:
-            print(f"| | {chosen.starts} perturbed | {row(found, slice(1, None))} |", flush=True)
-        if chosen.video is not None and not number:
-            video.write(chosen.video, film(gait, found))
+        result = turn(
+            gait, script_of(keys, arguments.cycles), [None, *(seeds.trial(0, i) for i in range(arguments.starts))]
+        )
+        print(f"| {reach} | nominal | {row(result, slice(0, 1))} |")
+        if arguments.starts:
+            print(f"| | {arguments.starts} perturbed | {row(result, slice(1, None))} |", flush=True)
+        if arguments.video is not None and not number:
+            video.write(arguments.video, film(gait, result))
 
 
-def row(found: Turned, rows: slice) -> str:
+def row(result: Turned, rows: slice) -> str:
     """Cells of the table: least turn and speed, latest time, largest tilt and drift of these rollouts."""
-    each = [found.first(i) for i in range(len(found.lost))[rows]]
+    each = [result.first(i) for i in range(len(result.lost))[rows]]
     whole = [i for i in each if i.degrees[0].max(initial=0.0) >= TURN]
     degrees = min(i.degrees[0, -1] for i in each)
     seconds = max(i.degrees.shape[1] for i in each) * TIMESTEP
@@ -240,13 +242,13 @@ def row(found: Turned, rows: slice) -> str:
     return f"{degrees:.0f} | {seconds:.1f} | {speed:.0f} | {after} | {tilt:.1f} | {drift:.1f} | {reached}"
 
 
-def film(gait: FingerGait, found: Turned) -> Iterator[rendering.Picture]:
+def film(gait: FingerGait, result: Turned) -> Iterator[rendering.Picture]:
     """Pictures of the first rollout in real time, until the plate has made a full turn."""
-    first = found.first(0)
+    first = result.first(0)
     round_at = np.flatnonzero(first.degrees[0] >= TURN)
     poses = first.qpos[0, : round_at[0] + 1] if len(round_at) else first.qpos[0]
-    shown = video.moments((np.arange(len(poses)) * TIMESTEP).tolist(), speed=1.0, rest=0.0)[::2]
-    for picture in rendering.pictures(gait.model, poses[shown], SIDE, camera=Turning.camera):
+    moments = video.moments((np.arange(len(poses)) * TIMESTEP).tolist(), speed=1.0, rest=0.0)[::2]
+    for picture in rendering.pictures(gait.model, poses[moments], SIDE, camera=Turning.camera):
         yield from (picture, picture)  # a gif stores it once
 
 

@@ -53,8 +53,8 @@ class Shuffled:
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, d), whose last numbers are forces."""
-        own = -len(FINGERS)
-        return self._policy.act(prepared, np.concatenate([x[:, :own], np.roll(x[:, own:], 1, axis=0)], axis=1))
+        split = -len(FINGERS)
+        return self._policy.act(prepared, np.concatenate([x[:, :split], np.roll(x[:, split:], 1, axis=0)], axis=1))
 
 
 def main() -> None:
@@ -65,26 +65,26 @@ def main() -> None:
     parser.add_argument("--generations", type=int, help="number of generations instead of the preset's")
     parser.add_argument("--video", type=Path, metavar="FILE", help="video file: .gif or .mp4")
     parser.add_argument("--json", type=Path, metavar="FILE", help="file for the table's numbers of each seed")
-    chosen = parser.parse_args()
-    if chosen.video is not None:
-        video.check(chosen.video)
-    options = {} if chosen.generations is None else {"generations": chosen.generations}
-    names, numbers = chosen.rows.split(","), [int(word) for word in chosen.seeds.split(",")]
+    arguments = parser.parse_args()
+    if arguments.video is not None:
+        video.check(arguments.video)
+    options = {} if arguments.generations is None else {"generations": arguments.generations}
+    names, numbers = arguments.rows.split(","), [int(word) for word in arguments.seeds.split(",")]
     table: dict[str, list[Figures]] = {}
-    for name, found in _rows(names, numbers, options):
+    for name, columns in _rows(names, numbers, options):
         if not table:
-            print(f"| what the policy observes | {' | '.join(found[0])} |\n|---|{'---|' * len(found[0])}")
-        table[name] = found
-        cells = (", ".join(_cell(figures[column]) for figures in found) for column in found[0])
+            print(f"| what the policy observes | {' | '.join(columns[0])} |\n|---|{'---|' * len(columns[0])}")
+        table[name] = columns
+        cells = (", ".join(_cell(figures[column]) for figures in columns) for column in columns[0])
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
-    if chosen.json is not None:
-        chosen.json.write_text(json.dumps(table) + "\n")
-    if chosen.video is not None:
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(table) + "\n")
+    if arguments.video is not None:
         policy = farm.load(_learnt(names[-1], numbers[0], options), **LONG)
-        shown = _turned(policy.runner.rollouts(policy.mu[None], [None], physics=True))
-        lifts = (shown.felt[0, :-1] & ~shown.felt[0, 1:]).sum(axis=0).tolist()
+        result = _turned(policy.runner.rollouts(policy.mu[None], [None], physics=True))
+        lifts = (result.felt[0, :-1] & ~result.felt[0, 1:]).sum(axis=0).tolist()
         print(f"fingers lifted in the 16 s of the video: {dict(zip(FINGERS, lifts, strict=True))}")
-        video.write(chosen.video, film(policy.runner.task, shown))
+        video.write(arguments.video, film(policy.runner.task, result))
 
 
 def _cell(figure: float | None) -> str:
@@ -123,17 +123,17 @@ def _tested(policy: LoadedPolicy, mean: FloatArray, *, shuffle: bool = False) ->
     return _figures(_turned(loop.run(runner.task, acts, runner.sim, theta, STARTS)))
 
 
-def _turned(found: Rollouts) -> Turned:
+def _turned(rollouts: Rollouts) -> Turned:
     """Motion of the plate in these rollouts."""
     qpos, force = (
-        np.concatenate([found.start[name][:, None], found.frames[name]], axis=1) for name in ("qpos", "force")
+        np.concatenate([rollouts.start[name][:, None], rollouts.frames[name]], axis=1) for name in ("qpos", "force")
     )
     return Turned.of(qpos, np.any(force > 0, axis=-1))
 
 
-def _figures(found: Turned) -> Figures:
+def _figures(result: Turned) -> Figures:
     """Results of several rollouts, from one value per control step; each rollout counts until the plate is lost."""
-    each = [found.first(row) for row in range(len(found.lost))]
+    each = [result.first(row) for row in range(len(result.lost))]
     speed = [np.abs(np.diff(one.degrees[0])) / CONTROL_PERIOD for one in each]
     degrees = [one.degrees[0, -1] for one in each]
     round_at = [int(np.argmax(one.degrees[0] >= TURN)) for one in each if one.degrees.max() >= TURN]
@@ -144,7 +144,7 @@ def _figures(found: Turned) -> Figures:
         "largest [deg/s]": round(max(one.max() for one in speed)),
         "tilt [deg]": round(max(one.tilt.max() for one in each), 1),
         "drift [mm]": round(1e3 * max(one.drift.max() for one in each), 1),
-        "lost [%]": round(100 * float(found.lost[:, -1].mean()), 1),
+        "lost [%]": round(100 * float(result.lost[:, -1].mean()), 1),
         "reached 360 [%]": round(100 * len(round_at) / len(each), 1),
         "after [s]": round(float(np.median(round_at)) * CONTROL_PERIOD, 1) if round_at else None,
     }

@@ -41,22 +41,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "pictures")
     parser.add_argument("--run", type=Path)
-    chosen = parser.parse_args()
-    out = chosen.out
+    arguments = parser.parse_args()
+    out = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     (out / "tactile.svg").write_text(tactile_picture(), "utf-8")
     hand_picture().save(out / "hand.png", optimize=True)
-    if chosen.run is not None:
-        video.write(out / "gait.gif", gait_video(chosen.run))
+    if arguments.run is not None:
+        video.write(out / "gait.gif", gait_video(arguments.run))
 
 
 def hand_picture() -> Image.Image:
     """Three moments side by side."""
-    shown = [("waiting", _waiting()), *((grip.replace("+", " + "), _held(grip)) for grip in _HELD)]
+    poses = [("waiting", _waiting()), *((grip.replace("+", " + "), _held(grip)) for grip in _HELD)]
     width, height = PANEL
-    picture = Image.new("RGB", (width * len(shown), height))
+    picture = Image.new("RGB", (width * len(poses), height))
     pen = ImageDraw.Draw(picture)
-    for i, (name, qpos) in enumerate(shown):
+    for i, (name, qpos) in enumerate(poses):
         picture.paste(_photograph(qpos), (i * width, 0))
         pen.text((i * width + width // 2, height - 26), name, (40, 44, 52), ImageFont.load_default(20), anchor="mm")
     return picture
@@ -100,19 +100,19 @@ def _photograph(qpos: FloatArray) -> Image.Image:
 
 def gait_video(run: Path) -> Iterator[rendering.Picture]:
     """The run's first and last policy beside each other, a third of real time."""
-    shown = {
+    policies = {
         "before learning": load(run, generation=0),
         "after learning": load(run),
     }
-    replays = {name: policy.rollout() for name, policy in shown.items()}
+    replays = {name: policy.rollout() for name, policy in policies.items()}
     longest = max((replay.trajectory.times for replay in replays.values()), key=len)
-    chosen = video.moments(longest.tolist(), speed=1 / 3, rest=1.5)
+    schedule = video.moments(longest.tolist(), speed=1 / 3, rest=1.5)
     sides = []
-    for name, policy in shown.items():
-        rows = [min(moment, len(replays[name].trajectory.times) - 1) for moment in chosen]
+    for name, policy in policies.items():
+        rows = [min(moment, len(replays[name].trajectory.times) - 1) for moment in schedule]
         moments = sorted(set(rows))
-        drawn = dict(zip(moments, _drawn(policy, replays[name], moments), strict=True))
-        sides.append([_named(drawn[row], name) for row in rows])
+        frames = dict(zip(moments, _drawn(policy, replays[name], moments), strict=True))
+        sides.append([_named(frames[row], name) for row in rows])
     return (np.concatenate(pair, axis=1) for pair in zip(*sides, strict=True))
 
 

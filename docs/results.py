@@ -106,24 +106,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--machine", default="", help="what the experiments ran on, and their commit: a sentence")
-    chosen = parser.parse_args()
-    folder, out = ExperimentFolder.open(chosen.folder), HERE / "results"
+    arguments = parser.parse_args()
+    folder, out = ExperimentFolder.open(arguments.folder), HERE / "results"
     folder.gather()
     if folder.path.resolve() != out.resolve():
         _take(folder, out)
     machine = out / "machine.txt"
-    if chosen.machine:
-        machine.write_text(chosen.machine + "\n", "utf-8")
+    if arguments.machine:
+        machine.write_text(arguments.machine + "\n", "utf-8")
     notes = dict(sections((out / "notes.md").read_text("utf-8"))) if (out / "notes.md").exists() else {}
     whole = ExperimentFolder.open(out)
-    known = {name: whole.data(EXPERIMENTS[name]) for name in whole.experiments}
-    for name, data in known.items():
+    experiments = {name: whole.data(EXPERIMENTS[name]) for name in whole.experiments}
+    for name, data in experiments.items():
         draw(EXPERIMENTS[name], data, out)[0].unlink()  # the SVG is enough here
     for page in PAGES:
-        (out / f"{page}.md").write_text(question(page, known, notes), "utf-8")
-    (out / f"{FUTURE}.md").write_text(filled(notes.get(f"page {FUTURE}", ""), known) + "\n", "utf-8")
+        (out / f"{page}.md").write_text(question(page, experiments, notes), "utf-8")
+    (out / f"{FUTURE}.md").write_text(filled(notes.get(f"page {FUTURE}", ""), experiments) + "\n", "utf-8")
     head = HEAD.format(
-        overview="\n".join(row for page in PAGES for row in summary(page, known)),
+        overview="\n".join(row for page in PAGES for row in summary(page, experiments)),
         future=FUTURE,
         touch=touch(out / "touch" / "bias-0.05.json"),
         machine=machine.read_text("utf-8").strip(),
@@ -134,16 +134,16 @@ def main() -> None:
 def _take(folder: ExperimentFolder, out: Path) -> None:
     """Make missing measurements, and add a folder's data and experiments to docs/results."""
     (out / "data").mkdir(parents=True, exist_ok=True)
-    known = ExperimentFolder.open(out).experiments if (out / "experiment.json").exists() else ()
+    names = ExperimentFolder.open(out).experiments if (out / "experiment.json").exists() else ()
     for name in folder.experiments:
         experiment = EXPERIMENTS[name]
         measure(folder, experiment)
         for file in {*(f"{setup}.npz" for setup in experiment.curves.values()), f"{name}.npz"}:
             if (folder.path / "data" / file).exists():
                 shutil.copy(folder.path / "data" / file, out / "data")
-    told = json.loads((folder.path / "experiment.json").read_text("utf-8"))
-    told["experiments"] = [name for name in EXPERIMENTS if name in (*known, *folder.experiments)]
-    (out / "experiment.json").write_text(json.dumps(told, indent=2) + "\n", "utf-8")
+    contents = json.loads((folder.path / "experiment.json").read_text("utf-8"))
+    contents["experiments"] = [name for name in EXPERIMENTS if name in (*names, *folder.experiments)]
+    (out / "experiment.json").write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
 
 
 def sections(text: str) -> Iterator[tuple[str, str]]:
@@ -153,22 +153,22 @@ def sections(text: str) -> Iterator[tuple[str, str]]:
         yield name.strip(), body.strip()
 
 
-def question(page: str, known: Mapping[str, Data], notes: Mapping[str, str]) -> str:
+def question(page: str, data: Mapping[str, Data], notes: Mapping[str, str]) -> str:
     """A page: question, answer, verdicts, and a section for each experiment."""
     title, names = PAGES[page]
-    names = tuple(name for name in names if name in known)
-    answer = filled(notes.get(f"page {page}", ""), known)
+    names = tuple(name for name in names if name in data)
+    answer = filled(notes.get(f"page {page}", ""), data)
     table = ["| experiment | what | verdict |", "|---|---|---|"]
     for name in names:
-        table.append(f"| {link(name, page)} | {EXPERIMENTS[name].title} | {said(EXPERIMENTS[name], known[name])} |")
-    parts = [section(EXPERIMENTS[name], known[name], notes.get(name, "")) for name in names]
+        table.append(f"| {link(name, page)} | {EXPERIMENTS[name].title} | {outcome(EXPERIMENTS[name], data[name])} |")
+    parts = [section(EXPERIMENTS[name], data[name], notes.get(name, "")) for name in names]
     top = [f"# {title}", *([answer] if answer else []), "\n".join(table)]
     return "\n\n".join([*top, "All questions, and how to read this page: [results.md](../results.md).", *parts]) + "\n"
 
 
-def filled(text: str, known: Mapping[str, Data]) -> str:
+def filled(text: str, data: Mapping[str, Data]) -> str:
     """A note in which links and verdicts replace {NAME}."""
-    return re.sub(r"\{([a-z0-9.-]+)\}", lambda m: f"{link(m[1])}: {said(EXPERIMENTS[m[1]], known[m[1]])}", text)
+    return re.sub(r"\{([a-z0-9.-]+)\}", lambda m: f"{link(m[1])}: {outcome(EXPERIMENTS[m[1]], data[m[1]])}", text)
 
 
 def link(name: str, page: str = "", folder: str = "") -> str:
@@ -178,33 +178,33 @@ def link(name: str, page: str = "", folder: str = "") -> str:
     return f"[{name}]({file}#{anchor(EXPERIMENTS[name])})"
 
 
-def summary(page: str, known: Mapping[str, Data]) -> Iterator[str]:
+def summary(page: str, data: Mapping[str, Data]) -> Iterator[str]:
     """A page's rows of the overview."""
     title, names = PAGES[page]
     first = f"[{title}](results/{page}.md)"
     for name in names:
-        if name in known:
+        if name in data:
             what = EXPERIMENTS[name].title
-            yield f"| {first} | {link(name, folder='results/')} {what} | {said(EXPERIMENTS[name], known[name])} |"
+            yield f"| {first} | {link(name, folder='results/')} {what} | {outcome(EXPERIMENTS[name], data[name])} |"
             first = ""
 
 
-def said(experiment: Experiment, data: Data) -> str:
+def outcome(experiment: Experiment, data: Data) -> str:
     """What came out, in a few words."""
-    found = judge(experiment, data)
+    findings = judge(experiment, data)
     if experiment.claim:
-        return f"**{verdict(found)}**: {sum(f.holds is True for f in found)} of {len(found)} parts"
-    return "; ".join(_grouped(found)) or "open"
+        return f"**{verdict(findings)}**: {sum(f.holds is True for f in findings)} of {len(findings)} parts"
+    return "; ".join(_grouped(findings)) or "open"
 
 
-def _grouped(found: Sequence[Finding]) -> list[str]:
+def _grouped(findings: Sequence[Finding]) -> list[str]:
     """Findings in a few words; parts with the same last words are joined."""
-    end = os.path.commonprefix([f.part[::-1] for f in found])[::-1]
+    end = os.path.commonprefix([f.part[::-1] for f in findings])[::-1]
     _, space, verb = end.partition(" ")
-    if len(found) < 2 or not space:
-        return [f"{f.part}: {f.answer}" for f in found]
-    named = [(f.part.removesuffix(f" {verb}").removesuffix(":"), f.holds) for f in found]
-    yes, no = ([name for name, holds in named if holds is held] for held in (True, False))
+    if len(findings) < 2 or not space:
+        return [f"{f.part}: {f.answer}" for f in findings]
+    parts = [(f.part.removesuffix(f" {verb}").removesuffix(":"), f.holds) for f in findings]
+    yes, no = ([name for name, holds in parts if holds is value] for value in (True, False))
     if not yes:
         return [f"none {verb}"]
     if not no:
@@ -218,9 +218,9 @@ def _listed(parts: Sequence[str]) -> str:
 
 def touch(path: Path) -> str:
     """The answer of the fragile bar's data."""
-    found = {name: 100.0 * np.array(values) for name, values in json.loads(path.read_text("utf-8")).items()}
-    felt, zeroed = found["forces"], found["zeroed"]
-    blind = [v for n, v in found.items() if not re.match("forces|cop|tactile|expert|zeroed", n)]
+    shares = {name: 100.0 * np.array(values) for name, values in json.loads(path.read_text("utf-8")).items()}
+    felt, zeroed = shares["forces"], shares["zeroed"]
+    blind = [v for n, v in shares.items() if not re.match("forces|cop|tactile|expert|zeroed", n)]
     best = max(np.median(values) for values in blind)
     return (
         f"it helps learning, and is not necessary: learnt with three exact forces, {int((felt >= 95.0).sum())} of "
@@ -242,13 +242,13 @@ def heading(experiment: Experiment) -> str:
 
 def section(experiment: Experiment, data: Data, note: str) -> str:
     """An experiment: question, claim, verdict, numbers, figure."""
-    found = judge(experiment, data)
+    findings = judge(experiment, data)
     lines = [f"## {heading(experiment)}", "", experiment.question, ""]
     if experiment.claim:
-        lines += [f"**Claim.** {experiment.claim}", "", f"**Verdict: {verdict(found)}.**", ""]
-    if found:
+        lines += [f"**Claim.** {experiment.claim}", "", f"**Verdict: {verdict(findings)}.**", ""]
+    if findings:
         lines += ["| statement | true? | numbers |", "|---|---|---|"]
-        lines += [f"| {f.part} | {f.answer} | {f.numbers} |" for f in found]
+        lines += [f"| {f.part} | {f.answer} | {f.numbers} |" for f in findings]
         lines.append("")
     lines += [f"![{experiment.title}]({experiment.name}.svg)", ""]
     if note:

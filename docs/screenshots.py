@@ -47,11 +47,11 @@ class Viewer:
     def show(self, tab: str) -> None:
         """Bring a tab to the front."""
         layout = self._client.get_blueprint("recording").blueprint
-        named = {path: _name(part) for path, part in layout.items()}
+        names = {path: _name(part) for path, part in layout.items()}
         for part in layout.values():
             container = part.get("ContainerBlueprint", {})
             for child in container.get("contents", []):
-                if container["container_kind"] == "Tabs" and named.get("/" + child.lstrip("/")) == tab:
+                if container["container_kind"] == "Tabs" and names.get("/" + child.lstrip("/")) == tab:
                     container["active_tab"] = child
         self._client.set_blueprint(layout, "recording")
 
@@ -84,14 +84,14 @@ def viewer() -> Iterator[Viewer]:
     address = free_endpoint().removeprefix("tcp/")
     program = Path(rerun_cli.__file__).with_name("rerun")
     flags = ["--bind", "127.0.0.1", "--port", address.rpartition(":")[2], "--headless", "--hide-welcome-screen"]
-    with tempfile.TemporaryDirectory() as home, Path(home, "log").open("w") as said:
+    with tempfile.TemporaryDirectory() as home, Path(home, "log").open("w") as log:
         settings = {name: home for name in ("HOME", "XDG_RUNTIME_DIR", "XDG_CONFIG_HOME", "XDG_DATA_HOME")}
         command = [str(program), *flags, "--window-size", SIZE]
-        process = subprocess.Popen(command, env={**os.environ, **settings}, stdout=said, stderr=said)
+        process = subprocess.Popen(command, env={**os.environ, **settings}, stdout=log, stderr=log)
         try:
-            found: list[ViewerClient] = []
-            _until(lambda: _connected(address, found), f"the viewer does not start: {Path(home, 'log').read_text()}")
-            yield Viewer(found[0])
+            clients: list[ViewerClient] = []
+            _until(lambda: _connected(address, clients), f"the viewer does not start: {Path(home, 'log').read_text()}")
+            yield Viewer(clients[0])
         finally:
             process.terminate()
             process.wait()
@@ -120,14 +120,14 @@ def main() -> None:
             ("fragile", "runs/bar/run.rrd", "Rollout", ("sim_time", {"duration": 51.2})),
             ("gym", "runs/swim/run.rrd", "", ("generation", {"sequence": 15})),
         ):
-            with viewer() as shown:
-                shown.open(str(Path(folder, source)))
+            with viewer() as window:
+                window.open(str(Path(folder, source)))
                 if tab:
-                    shown.show(tab)
+                    window.show(tab)
                 if at:
-                    shown.go(at[0], **at[1])
-                shown.shoot(out / f"{name}.png")
-            errors += shown.errors
+                    window.go(at[0], **at[1])
+                window.shoot(out / f"{name}.png")
+            errors += window.errors
     if errors:
         sys.exit("\n".join(errors))
 
@@ -136,26 +136,26 @@ def _live(folder: str, path: Path) -> list[str]:
     """A run while it learns."""
     port = free_endpoint().rpartition(":")[2]
     command = [sys.executable, "-m", "farm", "run", "--name", "first", "--serve", port]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as run, viewer() as shown:
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as run, viewer() as window:
         assert run.stdout
-        uri = next(found[0] for line in run.stdout if (found := re.search(r"rerun\+http\S+", line)))
-        shown.open(uri)
-        shown.shoot(path)
+        uri = next(match[0] for line in run.stdout if (match := re.search(r"rerun\+http\S+", line)))
+        window.open(uri)
+        window.shoot(path)
         run.communicate()
-    return shown.errors
+    return window.errors
 
 
 def _farm(folder: str, *words: str) -> None:
     subprocess.run([sys.executable, "-m", "farm", *words], cwd=folder, check=True)
 
 
-def _connected(address: str, found: list[ViewerClient]) -> bool:
+def _connected(address: str, clients: list[ViewerClient]) -> bool:
     try:
         client = ViewerClient.connect(f"rerun+http://{address}/proxy")
         client.get_state()
     except Exception:  # it does not listen yet; the SDK has no narrower name for that
         return False
-    found.append(client)
+    clients.append(client)
     return True
 
 

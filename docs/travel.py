@@ -56,16 +56,16 @@ class Stage:
         """Put a line on a screen."""
         self.lines.append(Line(time.monotonic() - self.begun, pane, text))
 
-    def start(self, pane: str, *words: str, shown: str = "") -> "subprocess.Popen[str]":
-        """Start a command on a host; `shown` is how it is typed, nothing where it is not seen."""
-        if shown:
-            self.say(pane, f"$ {shown}")
+    def start(self, pane: str, *words: str, caption: str = "") -> "subprocess.Popen[str]":
+        """Start a command on a host; `caption` is how it is typed, nothing where it is not seen."""
+        if caption:
+            self.say(pane, f"$ {caption}")
         command = ["ip", "netns", "exec", self._hosts[pane], sys.executable, "-P", "-m", "farm", *words]
         process = subprocess.Popen(
             command, cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
         )
         self._open.append(process)
-        if shown:
+        if caption:
             threading.Thread(target=self._listen, args=(pane, process), daemon=True).start()
         return process
 
@@ -117,7 +117,7 @@ def play(stage: Stage) -> list[Line]:
             stage.start(
                 name,
                 *words,
-                shown=f"farm worker --connect tls/laptop:7447 --tls worker-{name} --processes 1 --accept-code",
+                caption=f"farm worker --connect tls/laptop:7447 --tls worker-{name} --processes 1 --accept-code",
             )
         for name in ("left", "right"):
             stage.until(name, "joined farm")
@@ -129,9 +129,9 @@ def play(stage: Stage) -> list[Line]:
             stage.say("laptop", f"# pole.py, {'edited and saved' if old else 'as new-task wrote it'}:  {reward}")
             words = ("learner", *join, "certs/learner", "--task", "pole.py:Pole", "--name", run)
             flags = ("--generations", "8", "--pairs", "20", "--no-record")
-            shown = f"farm learner --connect tls/laptop:7447 --tls learner --task pole.py:Pole --name {run} "
-            shown += " ".join(flags)
-            process = stage.start("laptop", *words, *flags, shown=shown)
+            caption = f"farm learner --connect tls/laptop:7447 --tls learner --task pole.py:Pole --name {run} "
+            caption += " ".join(flags)
+            process = stage.start("laptop", *words, *flags, caption=caption)
             process.wait(60)
             stage.until("laptop", "parameters")
             time.sleep(0.5)
@@ -160,12 +160,12 @@ def _frame(lines: list[Line], now: float, font: ImageFont.FreeTypeFont) -> Image
         pen.rectangle((x, y, x + w - 1, y + 18), fill="#3c434d")
         pen.text((x + 8, y + 3), pane, fill="#ffffff", font=font)
         columns, rows = (w - 16) // 7, (h - 30) // 15
-        shown = [
+        texts = [
             (text, _SHADES.get(line.text[:1], _SHADES[" "]))
             for line in lines if line.pane == pane and line.at <= now
             for text in (textwrap.wrap(line.text, columns, subsequent_indent="    ") or [""])
         ]  # fmt: skip
-        for row, (text, shade) in enumerate(shown[-rows:]):
+        for row, (text, shade) in enumerate(texts[-rows:]):
             pen.text((x + 8, y + 24 + 15 * row), text, fill=shade, font=font)
     return picture
 

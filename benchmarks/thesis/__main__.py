@@ -80,16 +80,16 @@ def main(words: Sequence[str]) -> int:
         return 0
     if not command.names:
         raise ConfigError(f"which experiment? {PROGRAM} --list shows them")
-    wanted = {name for each in command.names for name in (EXPERIMENTS if each == ALL else (find(each).name,))}
-    names = tuple(name for name in EXPERIMENTS if name in wanted)
+    selection = {name for each in command.names for name in (EXPERIMENTS if each == ALL else (find(each).name,))}
+    names = tuple(name for name in EXPERIMENTS if name in selection)
     check_matplotlib()
     check_sharing(command.sharing)
     logs.set_up("WARNING")
     out = command.out or Path("runs") / "+".join(command.names)
     folder = ExperimentFolder.prepare(out, names, command.trials, command.generations)
     with stop_flag("saving and ending") as stop:
-        with Runs(folder.runs, folder.path) as shown:
-            complete = sweep.run(folder.runs, command.sharing, shown, stop.is_set)
+        with Runs(folder.runs, folder.path) as display:
+            complete = sweep.run(folder.runs, command.sharing, display, stop.is_set)
         folder.gather()
         if stop.is_set():
             sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command continues\n")
@@ -145,12 +145,12 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
         raise RunError(f"cannot write the figure of {name}: {error.strerror}") from None
     lines = [f"{name}: {' and '.join(map(str, paths))}"]
     lines += [f"  {label}: {failure}" for label, series in data.series.items() for failure in series.failures()]
-    found = judge(experiment, data)
-    lines += [f"  {finding.answer:<3}  {finding.part}: {finding.numbers}" for finding in found]
+    findings = judge(experiment, data)
+    lines += [f"  {finding.answer:<3}  {finding.part}: {finding.numbers}" for finding in findings]
     if folder.generations is not None:
         lines.append(f"  runs shortened to {folder.generations} generations say little about the claim")
-    elif experiment.claim and found:
-        lines.append(f"  {verdict(found)}")
+    elif experiment.claim and findings:
+        lines.append(f"  {verdict(findings)}")
     sys.stdout.write("\n".join(lines) + "\n")
 
 

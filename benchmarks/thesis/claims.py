@@ -11,25 +11,25 @@ from farm.arrays import FloatArray
 
 
 def compared(
-    part: str, data: Data, found: tuple[statistics.Answer, float], said: str, which: Sequence[Series] = ()
+    part: str, data: Data, result: tuple[statistics.Answer, float], numbers: str, which: Sequence[Series] = ()
 ) -> Finding:
     """A comparison of learning, with its p; it cannot be tested if none of the set-ups learns (`which`; else all)."""
-    answer, p = found
+    answer, p = result
     if not any(series.learnt.any() for series in which or data.series.values()):
-        return Finding(part, UNTESTABLE, f"{said}; none of them learns")
-    return Finding(part, answer, f"{said}; p = {p:.2g}")
+        return Finding(part, UNTESTABLE, f"{numbers}; none of them learns")
+    return Finding(part, answer, f"{numbers}; p = {p:.2g}")
 
 
-def near(part: str, data: Data, values: tuple[FloatArray, FloatArray], said: str, *, both: bool = True) -> Finding:
+def near(part: str, data: Data, values: tuple[FloatArray, FloatArray], numbers: str, *, both: bool = True) -> Finding:
     """Whether two set-ups' returns are equal up to NEAR; with both=False, whether the first is not lower than that."""
     if not any(series.learnt.any() for series in data.series.values()):
-        return Finding(part, UNTESTABLE, f"{said}; none of them learns")
+        return Finding(part, UNTESTABLE, f"{numbers}; none of them learns")
     low, high = statistics.difference(*values)
-    said = f"{said}; 95 % interval of the difference {low:.2f} to {high:.2f}"
+    numbers = f"{numbers}; 95 % interval of the difference {low:.2f} to {high:.2f}"
     if low > -statistics.NEAR and (high < statistics.NEAR or not both):
-        return Finding(part, True, said)
+        return Finding(part, True, numbers)
     apart = high < -statistics.NEAR or (both and low > statistics.NEAR)
-    return Finding(part, False if apart else UNDECIDED, said)
+    return Finding(part, False if apart else UNDECIDED, numbers)
 
 
 def race(data: Data) -> list[Finding]:
@@ -64,21 +64,21 @@ def converges(data: Data) -> list[Finding]:
     (series,) = data.series.values()
     sigma, mu = series.end("sigma_2"), series.end("mu_2")
     wander = np.array([np.ptp(row[~np.isnan(row)][-20:]) for row in series.columns["mu_2"]])
-    found = [
+    findings = [
         Finding("sigma of the second parameter goes to 0", bool((sigma < 0.1).all()), spread(sigma, 3)),
         Finding("its mu converges", bool((wander < 0.1).all()), f"moves by {spread(wander, 3)} in 20 generations"),
     ]
     if series.trials > 1:
-        said = ", ".join(f"{m:.2f}" for m in mu)
-        found.append(Finding("to a different value in each trial", bool(mu.std() > 0.3), said))
-    return found
+        numbers = ", ".join(f"{m:.2f}" for m in mu)
+        findings.append(Finding("to a different value in each trial", bool(mu.std() > 0.3), numbers))
+    return findings
 
 
 def features(data: Data) -> list[Finding]:
     """Figure 4.3: with more features learning is faster, higher and more even; with 300 nothing is learnt."""
-    few, some, many = data.series.values()
-    ends = [series.end("mean_policy_return") for series in (few, some, many)]
-    areas = [np.nanmean(series.columns["return_mean"], axis=1) for series in (few, some, many)]
+    few, middle, many = data.series.values()
+    ends = [series.end("mean_policy_return") for series in (few, middle, many)]
+    areas = [np.nanmean(series.columns["return_mean"], axis=1) for series in (few, middle, many)]
     nothing = bool(np.isnan(shapes.rise(few)).all()) and not few.learnt.any()
     return [
         Finding("with D 300 nothing is learnt in 150 generations", nothing, counted(few)),
@@ -126,12 +126,12 @@ def states(data: Data) -> list[Finding]:
     joints, contacts, touch = data.series.values()
     areas = [np.nanmean(s.columns["return_mean"][:, :80], axis=1) for s in (joints, contacts, touch)]
     ends = [s.end("mean_policy_return") for s in (joints, contacts, touch)]
-    said = "return over 80 generations " + ", ".join(f"{area.mean():.2f}" for area in areas)
+    numbers = "return over 80 generations " + ", ".join(f"{area.mean():.2f}" for area in areas)
     slowest = statistics.all_above((areas[1], areas[2]), (areas[0], areas[2]))
     return [
         compared(
             "with joints learning is fastest",
-            data, statistics.all_above((areas[0], areas[1]), (areas[0], areas[2])), said,
+            data, statistics.all_above((areas[0], areas[1]), (areas[0], areas[2])), numbers,
         ),
         compared(
             "and returns are highest",
@@ -139,7 +139,7 @@ def states(data: Data) -> list[Finding]:
             "mean policy at the end " + ", ".join(f"{e.mean():.2f}" for e in ends),
         ),
         # Slower than with contact points: at least one of these two has to learn.
-        compared("with joints and tactile image learning is slowest", data, slowest, said, (contacts, touch)),
+        compared("with joints and tactile image learning is slowest", data, slowest, numbers, (contacts, touch)),
     ]  # fmt: skip
 
 
@@ -181,10 +181,10 @@ def rollouts_count(data: Data) -> list[Finding]:
         np.nanmean(few.columns["return_mean"], axis=1),
         np.nanmean(many.columns["return_mean"][:, :until], axis=1),
     )
-    said = f"return over the first {budget} rollouts {spread(area[0])}; with N 50 {spread(area[1])}"
+    numbers = f"return over the first {budget} rollouts {spread(area[0])}; with N 50 {spread(area[1])}"
     return [
-        compared("with the same number of rollouts, N 15 learns faster", data, statistics.above(*area), said),
-        near("what matters is the number of rollouts: N 15 and N 50 learn as fast", data, area, said),
+        compared("with the same number of rollouts, N 15 learns faster", data, statistics.above(*area), numbers),
+        near("what matters is the number of rollouts: N 15 and N 50 learn as fast", data, area, numbers),
     ]
 
 
@@ -197,9 +197,9 @@ def remedies(data: Data) -> list[Finding]:
         config = data.configs[label]
         if config.task_config.clip or config.task_config.reward == "limited":  # type: ignore[attr-defined]
             early, last = row[:, min(9, row.shape[1] - 1)], np.array([r[~np.isnan(r)][-1] for r in row])
-            said = f"share of targets at a limit {spread(early)} at generation 10; {spread(last)} at the end"
+            numbers = f"share of targets at a limit {spread(early)} at generation 10; {spread(last)} at the end"
             stuck = bool((early > 0.9).all() and (last > 0.9).all())
-            out.append(Finding(f"{label}: all actions at a limit from generation 10 on", stuck, said))
+            out.append(Finding(f"{label}: all actions at a limit from generation 10 on", stuck, numbers))
     return out
 
 
@@ -207,12 +207,12 @@ def no_difference(data: Data) -> list[Finding]:
     """4.1.2: over 2000 histories the number per generation makes no difference."""
     ends = {}
     for label, series in data.series.items():
-        kept = max(1, round(500 / series.rollouts))
-        ends[label] = known_mean(series.columns["return_mean"][:, -kept:], axis=1)
-    said = "; ".join(f"{label}: {spread(e)}" for label, e in ends.items())
+        count = max(1, round(500 / series.rollouts))
+        ends[label] = known_mean(series.columns["return_mean"][:, -count:], axis=1)
+    numbers = "; ".join(f"{label}: {spread(e)}" for label, e in ends.items())
     lowest, *_, highest = sorted(ends.values(), key=np.mean)
     what = "after 2000 histories the returns do not depend on N (last 500 rollouts)"
-    return [near(what, data, (highest, lowest), said)]
+    return [near(what, data, (highest, lowest), numbers)]
 
 
 def only_projected_recovers(data: Data) -> list[Finding]:
@@ -227,7 +227,7 @@ def only_projected_recovers(data: Data) -> list[Finding]:
         ("direct learning falls and stays down", fallen[0].mean() > 0.5, f"{int(fallen[0].sum())} of {direct.trials}"),
         ("projected learning does not", fallen[1].mean() < 0.5, f"{int(fallen[1].sum())} of {projected.trials} do"),
     ]  # fmt: skip
-    return [Finding(part, bool(holds) if learnt else UNTESTABLE, said) for part, holds, said in parts]
+    return [Finding(part, bool(holds) if learnt else UNTESTABLE, numbers) for part, holds, numbers in parts]
 
 
 def scale_free(data: Data) -> list[Finding]:
@@ -254,10 +254,10 @@ def learning(data: Data) -> list[Finding]:
     """Which set-ups learn; for our own questions, which have no claim to reproduce."""
     out = []
     for label, series in data.series.items():
-        said = f"{counted(series)}; mean policy at the end {spread(series.final)}"
+        numbers = f"{counted(series)}; mean policy at the end {spread(series.final)}"
         if series.failures():
-            said += f"; {', '.join(series.failures())}"
-        out.append(Finding(f"{label}: learns", bool(series.learnt.mean() > 0.5), said))
+            numbers += f"; {', '.join(series.failures())}"
+        out.append(Finding(f"{label}: learns", bool(series.learnt.mean() > 0.5), numbers))
     return out
 
 
@@ -274,9 +274,9 @@ def transfer(data: Data) -> list[Finding]:
     rate = known_mean(data.measured["transfer"], axis=1)  # (learnt on, tried on), over the trials
     labels = list(data.series)
     off = rate[~np.eye(len(rate), dtype=bool)]
-    own = "; ".join(f"{label} {rate[i, i]:.0%}" for i, label in enumerate(labels))
+    numbers = "; ".join(f"{label} {rate[i, i]:.0%}" for i, label in enumerate(labels))
     return [
-        Finding("every object is learnt", bool((np.diag(rate) >= LEARNT_ON).all()), own),
+        Finding("every object is learnt", bool((np.diag(rate) >= LEARNT_ON).all()), numbers),
         Finding(
             "a policy works with the other objects",
             bool(off.mean() >= LEARNT_ON),
@@ -293,14 +293,14 @@ _MOST = 0.8  # of the trials
 def chain(data: Data) -> list[Finding]:
     """Number of successive changes of grip."""
     reached = known_mean(data.measured["reached"], axis=0)  # share of the rollouts that made at least 0, 1, ... changes
-    said = ", ".join(
+    numbers = ", ".join(
         f"{part:.0%} make {k}" for k, part in enumerate(reached) if k in (1, 2, 4, 8) or k == len(reached) - 1
     )
     return [
         Finding(
             "most rollouts change the grip four times",
             bool(reached[4] > 0.5),
-            f"of all rollouts, {said} changes or more",
+            f"of all rollouts, {numbers} changes or more",
         )
     ]
 
@@ -311,9 +311,9 @@ def friction(data: Data) -> list[Finding]:
     out = []
     for label, row in zip(data.series, rate, strict=True):
         good = factors[row >= LEARNT_ON]
-        said = "; ".join(f"x{f:g} {r:.0%}" for f, r in zip(factors, row, strict=True))
+        numbers = "; ".join(f"x{f:g} {r:.0%}" for f, r in zip(factors, row, strict=True))
         bounds = f"from x{good.min():g} to x{good.max():g}" if len(good) else "with no factor"
-        out.append(Finding(f"{label}: succeeds {bounds}", bool(len(good)), said))
+        out.append(Finding(f"{label}: succeeds {bounds}", bool(len(good)), numbers))
     return out
 
 
@@ -322,11 +322,11 @@ def kernel_error(data: Data) -> list[Finding]:
     sizes, counts, error = (data.measured[name] for name in ("sizes", "features", "error"))
     out = []
     for i, size in enumerate(sizes):
-        chosen = [(eps, features_for(int(size), eps)) for eps in (0.1, 0.2, 0.3)]
-        found = [float(np.interp(np.log(wanted), np.log(counts), error[i])) for _, wanted in chosen]
-        said = "; ".join(f"D {wanted}: {got:.3f} for {eps}" for (eps, wanted), got in zip(chosen, found, strict=True))
-        holds = all(got <= eps for (eps, _), got in zip(chosen, found, strict=True))
-        out.append(Finding(f"{size} numbers: the error stays below epsilon", holds, said))
+        cases = [(eps, features_for(int(size), eps)) for eps in (0.1, 0.2, 0.3)]
+        errors = [float(np.interp(np.log(count), np.log(counts), error[i])) for _, count in cases]
+        numbers = "; ".join(f"D {count}: {got:.3f} for {eps}" for (eps, count), got in zip(cases, errors, strict=True))
+        holds = all(got <= eps for (eps, _), got in zip(cases, errors, strict=True))
+        out.append(Finding(f"{size} numbers: the error stays below epsilon", holds, numbers))
     return out
 
 

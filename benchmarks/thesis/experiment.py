@@ -139,24 +139,24 @@ def verdict(findings: Sequence[Finding]) -> Verdict:
     """The verdict on all parts of a claim; open if there are no findings."""
     if not findings:
         return "open"
-    held = {finding.holds for finding in findings}
-    if held == {True}:
+    answers = {finding.holds for finding in findings}
+    if answers == {True}:
         return "reproduced"
-    if True in held:
+    if True in answers:
         return "in part"
-    if False in held:
+    if False in answers:
         return "not reproduced"
-    return UNDECIDED if UNDECIDED in held else UNTESTABLE
+    return UNDECIDED if UNDECIDED in answers else UNTESTABLE
 
 
 def spread(values: FloatArray, digits: int = 2) -> str:
     """Mean and range over the trials, as text."""
-    known = values[~np.isnan(values)]
-    if not len(known):
+    numbers = values[~np.isnan(values)]
+    if not len(numbers):
         return "none"
-    if len(known) == 1:
-        return f"{known[0]:.{digits}f}"
-    return f"{known.mean():.{digits}f} ({known.min():.{digits}f} to {known.max():.{digits}f})"
+    if len(numbers) == 1:
+        return f"{numbers[0]:.{digits}f}"
+    return f"{numbers.mean():.{digits}f} ({numbers.min():.{digits}f} to {numbers.max():.{digits}f})"
 
 
 def counted(series: Series) -> str:
@@ -166,8 +166,8 @@ def counted(series: Series) -> str:
     if len(since) > _LISTED:
         when = f"{np.median(since):.0f} (median; {since[0]:.0f} to {since[-1]:.0f})"
     low, high = share(int(series.learnt.sum()), series.trials)
-    said = f"{int(series.learnt.sum())} of {series.trials} learnt ({100 * low:.0f} to {100 * high:.0f} %)"
-    return f"{said}; every mean policy succeeds from generation {when} on" if len(since) else said
+    text = f"{int(series.learnt.sum())} of {series.trials} learnt ({100 * low:.0f} to {100 * high:.0f} %)"
+    return f"{text}; every mean policy succeeds from generation {when} on" if len(since) else text
 
 
 _LISTED: Final = 5  # generations; of more trials the median and the range

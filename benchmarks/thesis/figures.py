@@ -79,21 +79,21 @@ def _canvas(panels: int, caption: str) -> tuple[Canvas, list[Axes]]:
 def _caption(experiment: Experiment, data: Data) -> str:
     """Caption: the settings that all curves share, and trials that did not finish."""
     trials = max(s.trials for s in data.series.values())
-    said = ", ".join(common(list(data.configs.values()))) + f"; {trials} {'trials' if trials > 1 else 'trial'}"
+    text = ", ".join(common(list(data.configs.values()))) + f"; {trials} {'trials' if trials > 1 else 'trial'}"
     if isinstance(experiment.figure, Curves):
-        said += (
+        text += (
             "; line: median of the trials still running, shaded: minimum to maximum"
             if _run_away(experiment.figure, data)
             else "; line: mean of the trials still running, shaded: standard deviation"
         )
-    said += "."
+    text += "."
     broken = [f"{label}: {', '.join(s.failures())}" for label, s in data.series.items() if s.failures()]
-    return said[0].upper() + said[1:] + (f" Not finished: {'; '.join(broken)}." if broken else "")
+    return text[0].upper() + text[1:] + (f" Not finished: {'; '.join(broken)}." if broken else "")
 
 
 def common(configs: Sequence[RunConfig]) -> list[str]:
     """Settings common to all curves, as words of the caption."""
-    told = (
+    phrases = (
         lambda c: c["policy"],
         lambda c: c["state"],
         lambda c: f"D {c['features']}" if "features" in c else None,
@@ -106,8 +106,8 @@ def common(configs: Sequence[RunConfig]) -> list[str]:
         lambda c: "perturbed training" if c["perturb"] else "unperturbed",
     )
     flat = [settings(config) for config in configs]
-    found = [{tell(config) for config in flat} for tell in told]
-    return [words for values in found if len(values) == 1 for words in values if words is not None]
+    answers = [{tell(config) for config in flat} for tell in phrases]
+    return [words for values in answers if len(values) == 1 for words in values if words is not None]
 
 
 def _curves(experiment: Experiment, data: Data) -> Canvas:
@@ -138,8 +138,8 @@ def _curves(experiment: Experiment, data: Data) -> Canvas:
 
 def _run_away(figure: Curves, data: Data) -> bool:
     """Whether the returns of a trial fell so far that this trial alone would determine the mean."""
-    drawn = (series for series in data.series.values() if not series.empty)
-    return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in drawn)
+    curves = (series for series in data.series.values() if not series.empty)
+    return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in curves)
 
 
 def _scale(axis: Axes, panel: Panel, low: float, high: float, *, run_away: bool) -> None:
@@ -163,14 +163,14 @@ def _line(axis: Axes, i: int, name: str, values: FloatArray, step: int = 1, *, r
     Generations that no trial reached are left out. The line is the mean with its standard deviation; if a trial ran
     away, it is the median with minimum and maximum.
     """
-    there = ~np.isnan(values)
-    values = values[:, : int(there.any(axis=0).sum())]
+    present = ~np.isnan(values)
+    values = values[:, : int(present.any(axis=0).sum())]
     if run_away:
         low, line, high = np.nanmin(values, axis=0), np.nanmedian(values, axis=0), np.nanmax(values, axis=0)
     else:
         line, spread = _spread(values)
         low, high = line - spread, line + spread
-    x, began = step * np.arange(1, len(line) + 1), int(there[:, 0].sum())
+    x, began = step * np.arange(1, len(line) + 1), int(present[:, 0].sum())
     axis.plot(
         x, line, color=_COLOURS[i], linestyle=_DASHES[i], marker=_MARKERS[i], ms=4, lw=1.5,
         markevery=(len(x) // 20 + i, max(len(x) // 6, 1)), label=name if began == len(values) else f"{name} ({began})",
@@ -264,8 +264,8 @@ def _kernel(experiment: Experiment, data: Data) -> Canvas:  # noqa: ARG001  one 
     for i, (size, error) in enumerate(zip(data.measured["sizes"].tolist(), data.measured["error"], strict=True)):
         axis.plot(counts, error, color=_COLOURS[i], linestyle=_DASHES[i], marker=_MARKERS[i], ms=4, label=f"d {size}")
         accuracies = np.array([0.1, 0.15, 0.2, 0.25, 0.3])
-        wanted = [features_for(size, float(eps)) for eps in accuracies]
-        axis.plot(wanted, accuracies, color="0.6", linestyle=_DASHES[i], lw=1, marker=_MARKERS[i], ms=3)
+        numbers = [features_for(size, float(eps)) for eps in accuracies]
+        axis.plot(numbers, accuracies, color="0.6", linestyle=_DASHES[i], lw=1, marker=_MARKERS[i], ms=3)
     axis.set(xscale="log", yscale="log", xlabel="number of features D", ylabel="largest error of the kernel")
     axis.set_yticks([0.03, 0.1, 0.3, 1.0], ["0.03", "0.1", "0.3", "1"])
     axis.legend(fontsize=8)

@@ -45,15 +45,15 @@ class ExperimentFolder:
           ConfigError: there is none, or this release does not know its experiment.
         """
         try:
-            told = json.loads((path / "experiment.json").read_text("utf-8"))
+            body = json.loads((path / "experiment.json").read_text("utf-8"))
         except FileNotFoundError:
             raise ConfigError(f"{path} is not an experiment's folder: it has no experiment.json") from None
         except (OSError, ValueError) as error:
             raise ConfigError(f"cannot read {path / 'experiment.json'}: {error}") from None
-        names = told.get("experiments") if isinstance(told, dict) and told.get("version") == _VERSION else None
+        names = body.get("experiments") if isinstance(body, dict) and body.get("version") == _VERSION else None
         if not isinstance(names, list) or not names:
             raise ConfigError(f"{path / 'experiment.json'} is not of version {_VERSION}")
-        trials, generations = told.get("trials"), told.get("generations")
+        trials, generations = body.get("trials"), body.get("generations")
         return cls(
             path=path, experiments=tuple(find(str(name)).name for name in names),
             trials=None if trials is None else _count("trials", trials),
@@ -71,24 +71,24 @@ class ExperimentFolder:
         """
         folder = cls(path=path, experiments=tuple(names), trials=trials, generations=generations)
         if (path / "experiment.json").exists():
-            there = cls.open(path)
-            if there.experiments != folder.experiments:
-                raise ConfigError(f"{path} holds {', '.join(there.experiments)}: give a different --out")
-            if there.generations != generations:
-                said = "all" if there.generations is None else there.generations
-                raise ConfigError(f"{path} was started with {said} generations: use the same, or a different --out")
-            most, wanted = (max(map(each.count, each.setups), default=0) for each in (there, folder))
-            if most > wanted:
-                raise ConfigError(f"{path} has {most} trials: give as many or more, or a different --out")
+            former = cls.open(path)
+            if former.experiments != folder.experiments:
+                raise ConfigError(f"{path} holds {', '.join(former.experiments)}: give a different --out")
+            if former.generations != generations:
+                count = "all" if former.generations is None else former.generations
+                raise ConfigError(f"{path} was started with {count} generations: use the same, or a different --out")
+            before, after = (max(map(each.count, each.setups), default=0) for each in (former, folder))
+            if before > after:
+                raise ConfigError(f"{path} has {before} trials: give as many or more, or a different --out")
         try:
             if not (path / "experiment.json").exists() and path.exists() and any(path.iterdir()):
                 raise ConfigError(f"{path} holds something else and no experiment.json: give a different --out")
             folder.check_runs(go_on=True)
             (path / "runs").mkdir(parents=True, exist_ok=True)
             (path / "data").mkdir(exist_ok=True)
-            told = {"version": _VERSION, "experiments": list(names), "trials": trials, "generations": generations}
+            contents = {"version": _VERSION, "experiments": list(names), "trials": trials, "generations": generations}
             aside = path / "experiment.json.new"
-            aside.write_text(json.dumps(told, indent=2) + "\n", "utf-8")
+            aside.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
             aside.replace(path / "experiment.json")
         except OSError as error:
             raise ConfigError(f"cannot write to {path}: {error.strerror}") from None
@@ -135,15 +135,15 @@ class ExperimentFolder:
         """
         for setup in self.setups:
             folders = [self.run(setup, number) for number in range(self.count(setup))]
-            there = [folder.path.exists() for folder in folders]
+            presence = [folder.path.exists() for folder in folders]
             for number, folder in enumerate(folders):
-                if there[number] and folder.read_config() != self.config(setup, number):
+                if presence[number] and folder.read_config() != self.config(setup, number):
                     raise ConfigError(
                         f"{folder.path} no longer has the settings of set-up {setup}: give a different --out"
                     )
             file = self.path / "data" / f"{setup}.npz"
-            known = series.load(file).states if file.exists() and (go_on or any(there)) else ()
-            for folder, exists, state in zip(folders, there, known, strict=False):
+            states = series.load(file).states if file.exists() and (go_on or any(presence)) else ()
+            for folder, exists, state in zip(folders, presence, states, strict=False):
                 if state != "missing" and not exists:
                     raise ConfigError(
                         f"{file} has data of {folder.path}, which is gone: put it back, or give a different --out"
@@ -168,10 +168,10 @@ class ExperimentFolder:
         Raises:
           ConfigError: nothing has been gathered.
         """
-        known = {label: series.load(self.path / "data" / f"{name}.npz") for label, name in experiment.curves.items()}
+        curves = {label: series.load(self.path / "data" / f"{name}.npz") for label, name in experiment.curves.items()}
         measured = self.measured(experiment)
         return Data(
-            series=known, measured=series.read_arrays(measured) if measured.exists() else {},
+            series=curves, measured=series.read_arrays(measured) if measured.exists() else {},
             configs={label: self.config(name, 0) for label, name in experiment.curves.items()},
         )  # fmt: skip
 

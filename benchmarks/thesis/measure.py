@@ -48,15 +48,15 @@ def measure(folder: ExperimentFolder, experiment: Experiment) -> None:
         return
     path = folder.measured(experiment)
     count = folder.shown(experiment)
-    known = {name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()}
-    of = {"hashes": np.array([digest for series in known.values() for digest in series.hashes])}
-    of["recorded"] = np.array([(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in known.values()])
+    curves = {name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()}
+    of = {"hashes": np.array([digest for series in curves.values() for digest in series.hashes])}
+    of["recorded"] = np.array([(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in curves.values()])
     of |= {"trials": np.array(count), "figure": np.array(repr(experiment.figure))}
     if path.exists():
-        kept = read_arrays(path)
-        if all(name in kept and np.array_equal(kept[name], value) for name, value in of.items()):
+        arrays = read_arrays(path)
+        if all(name in arrays and np.array_equal(arrays[name], value) for name, value in of.items()):
             return
-    for name, series in known.items():
+    for name, series in curves.items():
         for number, digest in enumerate(series.hashes):
             if digest and not folder.run(name, number).checkpoint.exists():
                 raise ConfigError(f"cannot measure for {experiment.name}: {folder.run(name, number).path} is gone")
@@ -153,10 +153,10 @@ class _OneFriction(FingerGait):
 
 def _at_friction(policy: LoadedPolicy, factor: float) -> LoadedPolicy:
     """The same policy, at one friction."""
-    found = policy.problem
-    task = _OneFriction(found.task.config, files=found.task.sources)
+    problem = policy.problem
+    task = _OneFriction(problem.task.config, files=problem.task.sources)
     task.factor = factor
-    return LoadedPolicy(replace(found, task=task), policy.generation, policy.mu)
+    return LoadedPolicy(replace(problem, task=task), policy.generation, policy.mu)
 
 
 def _success(policy: LoadedPolicy) -> float:
@@ -181,16 +181,16 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
     steps = experiment.figure.steps
     most = steps // SUCCESS_STEPS
     reached = np.full((folder.shown(experiment), most + 1), np.nan)
-    shown: dict[str, AnyArray] = {"acting": np.full(steps, -1), "force": np.zeros((steps, 3))}
-    known = (_trials(folder, experiment, name) for name in experiment.curves.values())
-    for trial, runs in enumerate(zip(*known, strict=True)):
+    example: dict[str, AnyArray] = {"acting": np.full(steps, -1), "force": np.zeros((steps, 3))}
+    trials = (_trials(folder, experiment, name) for name in experiment.curves.values())
+    for trial, runs in enumerate(zip(*trials, strict=True)):
         policies = [loaded(run) for run in runs if run is not None]
         if len(policies) == len(runs):
             chained = chain(policies, _drawn(), steps)
             reached[trial] = [(chained.changes >= k).mean() for k in range(most + 1)]
             if trial == 0:
-                shown = {"acting": chained.acting[0], "force": chained.rollouts.frames["force"][0].sum(axis=-1)}
-    return {"reached": reached, **shown}
+                example = {"acting": chained.acting[0], "force": chained.rollouts.frames["force"][0].sum(axis=-1)}
+    return {"reached": reached, **example}
 
 
 def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:

@@ -84,9 +84,9 @@ class Series:
         """(trials,) mean of a column over its last END generations that ran."""
         out = np.full(self.trials, np.nan)
         for trial, row in enumerate(self.columns[column]):
-            kept = row[~np.isnan(row)][-END:]
-            if len(kept):
-                out[trial] = kept.mean()
+            last = row[~np.isnan(row)][-END:]
+            if len(last):
+                out[trial] = last.mean()
         return out
 
     def failures(self) -> list[str]:
@@ -104,11 +104,11 @@ def read(folders: Sequence[RunFolder], config: RunConfig) -> Series:
     """The series of runs, one folder per trial; missing or broken runs get that state."""
     runs = [_run(folder) for folder in folders]
     generations = max([config.generations, *(len(columns["return_mean"]) for columns, _, _ in runs)])
-    columns = {name: np.stack([_padded(own[name], generations) for own, _, _ in runs]) for name in COLUMNS}
+    columns = {name: np.stack([_padded(progress[name], generations) for progress, _, _ in runs]) for name in COLUMNS}
     summaries = [summary for _, summary, _ in runs]
     return Series(
         columns=columns,
-        states=tuple(_state(own, summary) for own, summary, _ in runs),
+        states=tuple(_state(progress, summary) for progress, summary, _ in runs),
         robust=_numbers(summaries, "robust_success_rate"),
         succeeded=np.array([bool(summary.get("mean_policy_success")) for summary in summaries]),
         final=_numbers(summaries, "mean_policy_return"),

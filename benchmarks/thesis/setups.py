@@ -26,8 +26,8 @@ def _projected(state: str, features: int, **settings: Any) -> RunConfig:  # noqa
 
 
 def _direct(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: ANN401
-    own = {"weights": "direct", "clip": False, **settings}
-    return setup("thesis", policy="direct", state=state, features=features, **own)
+    options = {"weights": "direct", "clip": False, **settings}
+    return setup("thesis", policy="direct", state=state, features=features, **options)
 
 
 _FORMER: Final[Mapping[str, Any]] = {
@@ -142,14 +142,14 @@ def config(name: str) -> RunConfig:
     if name in SETUPS:
         return SETUPS[name]
     base, parts = FITTED[name]
-    found: Any = fitted(replace(SETUPS[base], start="fitted"), _FORMER_EXPONENT)
-    begun: Any = SETUPS[base]
-    policy, algorithm = begun.policy_config, begun.algorithm_config
+    fit: Any = fitted(replace(SETUPS[base], start="fitted"), _FORMER_EXPONENT)
+    plain: Any = SETUPS[base]
+    policy, algorithm = plain.policy_config, plain.algorithm_config
     if "bandwidth" in parts:
-        policy = replace(policy, bandwidth=found.policy_config.bandwidth)
+        policy = replace(policy, bandwidth=fit.policy_config.bandwidth)
     if "initial_sigma" in parts:
-        algorithm = replace(algorithm, initial_sigma=found.algorithm_config.initial_sigma)
-    return replace(begun, policy_config=policy, algorithm_config=algorithm)
+        algorithm = replace(algorithm, initial_sigma=fit.algorithm_config.initial_sigma)
+    return replace(plain, policy_config=policy, algorithm_config=algorithm)
 
 
 RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}

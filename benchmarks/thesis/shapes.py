@@ -11,18 +11,18 @@ END_OF_START = 5
 
 def about(values: FloatArray, low: float, high: float) -> bool:
     """Whether most trials have a value and their median is within these bounds."""
-    known = values[~np.isnan(values)]
-    return len(known) > len(values) / 2 and bool(low <= np.median(known) <= high)
+    numbers = values[~np.isnan(values)]
+    return len(numbers) > len(values) / 2 and bool(low <= np.median(numbers) <= high)
 
 
 def _smoothed(row: FloatArray) -> FloatArray:
     """Mean over five generations; nan near the ends."""
     out = np.full(len(row), np.nan)
-    kept = row[~np.isnan(row)]
-    if len(kept) < 5:
-        out[: len(kept)] = kept
+    numbers = row[~np.isnan(row)]
+    if len(numbers) < 5:
+        out[: len(numbers)] = numbers
     else:
-        out[2 : len(kept) - 2] = np.convolve(kept, np.ones(5) / 5, "valid")
+        out[2 : len(numbers) - 2] = np.convolve(numbers, np.ones(5) / 5, "valid")
     return out
 
 
@@ -47,8 +47,8 @@ def largest_drop(series: Series) -> FloatArray:
     """(trials,) the largest drop of the smoothed return within 10 generations."""
     out = []
     for row in first_and_best(series)[0]:
-        kept = row[~np.isnan(row)]
-        out.append(max(float(kept[i] - kept[i : i + 10].min()) for i in range(len(kept))))
+        numbers = row[~np.isnan(row)]
+        out.append(max(float(numbers[i] - numbers[i : i + 10].min()) for i in range(len(numbers))))
     return np.array(out)
 
 

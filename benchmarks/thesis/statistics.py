@@ -32,8 +32,8 @@ def above(first: FloatArray, second: FloatArray) -> tuple[Answer, float]:
 
 def all_above(*pairs: tuple[FloatArray, FloatArray]) -> tuple[Answer, float]:
     """Whether `above` is true of every pair; no if it is false of one; p is the largest."""
-    found = [above(*pair) for pair in pairs]
-    answers, p = {answer for answer, _ in found}, max(p for _, p in found)
+    results = [above(*pair) for pair in pairs]
+    answers, p = {answer for answer, _ in results}, max(p for _, p in results)
     return False if False in answers else "undecided" if "undecided" in answers else True, p
 
 
@@ -62,14 +62,14 @@ def _known(values: FloatArray) -> FloatArray:
 
 
 def _permuted(first: FloatArray, second: FloatArray, alternative: str) -> float:
-    known = _known(first), _known(second)
-    if min(map(len, known)) < 2:  # one trial shows nothing
+    samples = _known(first), _known(second)
+    if min(map(len, samples)) < 2:  # one trial shows nothing
         return 1.0
-    found = stats.permutation_test(
-        known, _means, vectorized=True, n_resamples=_DRAWS, alternative=alternative,
+    result = stats.permutation_test(
+        samples, _means, vectorized=True, n_resamples=_DRAWS, alternative=alternative,
         rng=np.random.default_rng(0), batch=1000,
     )  # fmt: skip
-    return float(found.pvalue)
+    return float(result.pvalue)
 
 
 def _means(first: FloatArray, second: FloatArray, axis: int) -> FloatArray:
