@@ -130,7 +130,7 @@ def test_a_command_is_accepted(words: str, whole: bool, monkeypatch: pytest.Monk
         for run in set(re.findall(r"runs/[\w-]+", words)) - {"runs/first"}:
             shutil.copytree("runs/first", run, dirs_exist_ok=True)
         with pytest.raises((Accepted, SystemExit)):  # help ends the program
-            farm.__main__._run(rest if whole else completed(*rest), own=False)
+            farm.__main__._run(rest if whole else completed(*rest), standalone=False)
     elif program == "python":
         script(rest, monkeypatch)
     elif program == "pip":

@@ -54,7 +54,7 @@ def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> 
     endpoint = free_endpoint().replace("tcp/", "tls/")
     farm.start_router(endpoint, "--tls", "certs/learner")
     join = ("--connect", endpoint, "--tls")
-    robot = farm.start_python(str(EXAMPLES / "robot_worker.py"), *join, "certs/worker-rig", "--clock", "20")
+    robot = farm.start_python(str(EXAMPLES / "robot_worker.py"), *join, "certs/worker-rig", "--clock", "100")
     farm.start("worker", *join, "certs/worker-w", "--processes", "2", "--allow-file", "rig.py")
     with connect((endpoint,), 20, lambda: False, find(farm.folder / "certs", "learner")) as looking:
         farm.wait_for(lambda: len(looking.tokens(keys.worker_token("farm", "**"), 1.0)) == 3)
