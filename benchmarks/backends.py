@@ -20,8 +20,8 @@ from farm.arrays import FloatArray
 from farm.net.session import free_endpoint
 from farm.runner import Runner
 from farm.sim.engines import BatchEngine
+from learner.run import setup
 from learner.run.launch import Placement, open_run
-from learner.run.setup import problem
 
 WORKERS: Final = 2
 
@@ -66,8 +66,8 @@ def of_loop() -> Opened:
         if kind == "zero":
             return evaluate(kind, rows)
         if kind not in runners:
-            subject = problem(evaluations.config(kind))
-            runners[kind] = Runner(subject.task, subject.policy, lambda model: BatchEngine(model, 200, WORKERS))
+            problem = setup.problem(evaluations.config(kind))
+            runners[kind] = Runner(problem.task, problem.policy, lambda model: BatchEngine(model, 200, WORKERS))
         return runners[kind].rollouts(rows, [(row // 2,) for row in range(len(rows))]).returns
 
     yield _pooled(call, None)

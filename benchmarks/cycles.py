@@ -27,8 +27,8 @@ from farm.arrays import FloatArray
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
 from learner.again.replay import LoadedPolicy, load
+from learner.run import setup
 from learner.run.config import configure
-from learner.run.setup import problem
 
 HERE: Final = Path(__file__).parent
 TASK: Final = f"{HERE.parent / 'examples/tasks/cycle.py'}:Cycle"
@@ -87,8 +87,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def _script(name: str) -> LoadedPolicy:
     """The grips' targets as they are."""
-    subject = problem(configure(TASK, **SEEN["script"], object=name, steps=STEPS))
-    return LoadedPolicy(subject, 0, np.zeros(subject.policy.size))
+    problem = setup.problem(configure(TASK, **SEEN["script"], object=name, steps=STEPS))
+    return LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
 
 
 def _learnt(name: str, state: str, seed: int, runs: Path) -> LoadedPolicy:
@@ -117,8 +117,8 @@ def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
     Fitted to the bar's place along the fingers' way [fingertip radii], with the readings' noise, on starts that neither
     learning nor the table uses.
     """
-    subject = problem(configure(TASK, **{**settings, **SEEN["script"]}))
-    task: Any = subject.task
+    problem = setup.problem(configure(TASK, **{**settings, **SEEN["script"]}))
+    task: Any = problem.task
     grips, observe = task.parts[0], task.observe
     averaged, places = [], []  # of each step (n, 36), averaged as the estimate will be, and (n,)
 
@@ -135,8 +135,8 @@ def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
         return observed
 
     task.observe = noted
-    policy = LoadedPolicy(subject, 0, np.zeros(subject.policy.size))
-    added = ADDED * np.random.default_rng(0).standard_normal((FITTED, subject.policy.size))
+    policy = LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
+    added = ADDED * np.random.default_rng(0).standard_normal((FITTED, problem.policy.size))
     policy.runner.rollouts(added, [streams.trial(3, i) for i in range(FITTED)])
     weights = np.linalg.lstsq(np.concatenate(averaged), np.concatenate(places))[0]
     return tuple(weights.round(2).tolist())  # hides how LAPACK rounds

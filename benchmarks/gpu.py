@@ -18,7 +18,7 @@ from farm import configure, seeds
 from farm.runner import Runner, make_backend
 from farm.sim.engines import BatchEngine
 from farm.sim.interfaces import MakeEngine
-from learner.run.setup import problem
+from learner.run import setup
 
 
 def main() -> None:
@@ -47,14 +47,14 @@ def threads(count: int, size: int) -> MakeEngine:
 
 def row(name: str, by: str, worlds: int, steps: int, make: MakeEngine, *, exact: bool = True) -> None:
     """Run once to compile, run again, and print."""
-    subject = problem(configure(name, policy="linear", steps=steps))
-    runner = Runner(subject.task, subject.policy, make, exact=exact)
+    problem = setup.problem(configure(name, policy="linear", steps=steps))
+    runner = Runner(problem.task, problem.policy, make, exact=exact)
     theta = 0.1 * np.random.default_rng(0).standard_normal((worlds, runner.size))
     starts: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(worlds)]
     runner.rollouts(theta, starts)
     start = time.perf_counter()
     done = runner.rollouts(theta, starts)
-    speed = subject.task.substeps * done.steps.sum() / (time.perf_counter() - start)
+    speed = problem.task.substeps * done.steps.sum() / (time.perf_counter() - start)
     print(f"| {name} | {by} | {worlds} | {speed:.3g} |", flush=True)
 
 

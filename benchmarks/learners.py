@@ -18,7 +18,7 @@ import numpy as np
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
-from farm.moments import merged, normaliser, usable
+from farm.moments import merged, normaliser_of, usable
 from farm.runner import Runner
 from farm.tasks import loop
 from farm.tasks.rollouts import Rollouts, Seed
@@ -79,7 +79,7 @@ class Search:
 
     def seen(self) -> FloatArray:
         """Mean and standard deviation of the observations so far, (2, d)."""
-        return normaliser(self.moments)
+        return normaliser_of(self.moments)
 
 
 class SideBySide:

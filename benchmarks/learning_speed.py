@@ -37,7 +37,7 @@ from running import keep, rows_of, script
 
 import farm
 from farm.arrays import FloatArray
-from farm.moments import normaliser
+from farm.moments import normaliser_of
 from farm.net.work import Jobs
 from farm.runner import Runner
 from learner.run.evaluation import evaluation_jobs
@@ -83,7 +83,7 @@ class Shared(Rollouts):
 
     def reached(self, mean: FloatArray) -> None:
         """Note it."""
-        self.means.append((self.done, time.perf_counter() - self._begun, mean, normaliser(self.moments)))
+        self.means.append((self.done, time.perf_counter() - self._begun, mean, normaliser_of(self.moments)))
 
 
 _runners: dict[str, Runner] = {}
@@ -102,17 +102,17 @@ def ready(config: dict[str, Any]) -> None:
     time.sleep(0.2)  # so that the other process takes the other call
 
 
-def _half(config: dict[str, Any], jobs: Jobs, constants: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _half(config: dict[str, Any], jobs: Jobs, normaliser: FloatArray) -> tuple[FloatArray, FloatArray]:
     runner = _runner(config)
-    results = runner.run(np.zeros(runner.size), jobs, normaliser=constants)
+    results = runner.run(np.zeros(runner.size), jobs, normaliser=normaliser)
     return results.returns, results.moments
 
 
 def reached(runner: Runner, means: Iterable[Mean], goal: float) -> tuple[int, float] | None:
     """Rollouts and seconds after which the means have the return; None if they never do."""
     good = list[tuple[int, float]]()
-    for rollouts, seconds, mean, constants in means:
-        results = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([constants, constants]))
+    for rollouts, seconds, mean, normaliser in means:
+        results = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([normaliser, normaliser]))
         good = [*good, (rollouts, seconds)] if results.returns[:STARTS].mean() >= goal else []
         if len(good) == IN_A_ROW:
             return good[0]

@@ -38,7 +38,7 @@ from running import keep, rows_of, script
 import farm
 from farm import seeds as streams
 from farm.arrays import FloatArray
-from farm.moments import merged, normaliser
+from farm.moments import merged, normaliser_of
 from farm.net.work import Jobs
 from farm.runner import Runner
 from learner.again.replay import loaded
@@ -73,7 +73,7 @@ class Rollouts:
         self.moments = np.zeros(1 + 2 * self.problem.spec.observation)
 
     def _normaliser(self) -> FloatArray:
-        return np.stack([normaliser(self.moments)] * 2)
+        return np.stack([normaliser_of(self.moments)] * 2)
 
     def __call__(self, thetas: FloatArray) -> FloatArray:
         """Returns (B,) of candidates (B, P)."""

@@ -30,7 +30,7 @@ import numpy as np
 from farm import seeds
 from farm.arrays import FloatArray, IntArray
 from farm.commands.signals import INTERRUPTED
-from farm.moments import merged, normaliser, usable
+from farm.moments import merged, normaliser_of, usable
 from farm.runner import Runner
 from farm.tasks import loop
 from farm.tasks.rollouts import Rollouts, Seed
@@ -157,7 +157,7 @@ class Search:
 
     def extended(self, theta: FloatArray) -> FloatArray:
         """Parameters (B, P), each row followed by mean and standard deviation of its observations, (B, P + 2 d)."""
-        return np.hstack([theta, np.tile(normaliser(self.moments).ravel(), (len(theta), 1))])
+        return np.hstack([theta, np.tile(normaliser_of(self.moments).ravel(), (len(theta), 1))])
 
 
 class SideBySide:

@@ -40,7 +40,7 @@ class Played:
 
     success: AnyArray
     """(B,)"""
-    seen: FloatArray
+    deflection: FloatArray
     """Targets less joint readings (B, T, 8) [rad], nan after a rollout's end."""
     true: FloatArray
     """The same without errors."""
@@ -68,20 +68,22 @@ class Zeroed:
         """Start rollouts."""
         self._memory = {"zero": np.zeros((count, len(JOINTS))), "force": np.zeros(count)}
 
-    def force(self, t: int, rows: AnyArray, error: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(self, t: int, rows: AnyArray, deflection: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
         """The estimated force of some rows (K,) [N], from targets less readings (K, 8) [rad] in step t."""
         zero, last = self._memory["zero"], self._memory["force"]
         if t < ZERO:
-            zero[rows] += error / ZERO
-            return np.zeros(len(error))
-        last[rows] = self.keep * last[rows] + (1.0 - self.keep) * (self.map[0] + (error - zero[rows]) @ self.map[1:])
+            zero[rows] += deflection / ZERO
+            return np.zeros(len(deflection))
+        last[rows] = self.keep * last[rows] + (1.0 - self.keep) * (
+            self.map[0] + (deflection - zero[rows]) @ self.map[1:]
+        )
         return last[rows]
 
     @classmethod
     def fitted(cls, played: Played, cell: Cell) -> "Iterator[Zeroed]":  # noqa: ARG003
         """With the map that fits best to rollouts, for each filter."""
-        zero = played.seen[:, :ZERO].mean(axis=1, keepdims=True)
-        x, force = (played.seen - zero)[:, ZERO:], played.force[:, ZERO:]
+        zero = played.deflection[:, :ZERO].mean(axis=1, keepdims=True)
+        x, force = (played.deflection - zero)[:, ZERO:], played.force[:, ZERO:]
         good = (force < BREAKS) & ~np.isnan(x).any(axis=-1)
         fit = np.linalg.lstsq(np.insert(x[good], 0, 1.0, axis=-1), force[good], rcond=None)[0]
         yield from (cls(fit, keep) for keep in _KEEPS)
@@ -108,12 +110,12 @@ class Kalman:
         """Start rollouts."""
         self._memory = {"d": np.tile(self.start, (count, 1)), "e": np.zeros((count, len(JOINTS)))}
 
-    def force(self, t: int, rows: AnyArray, error: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(self, t: int, rows: AnyArray, deflection: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
         """The estimated force of some rows (K,) [N]; `move` (K,) is what the last step commanded [rad]."""
         d, e = self._memory["d"][rows], self._memory["e"][rows]
         if t:
             d = d @ self.a.T + move[:, None] * self.b + self.c
-        change = (error - d - e) @ self.gains[t].T
+        change = (deflection - d - e) @ self.gains[t].T
         self._memory["d"][rows], self._memory["e"][rows] = d + change[:, : len(JOINTS)], e + change[:, len(JOINTS) :]
         return np.asarray(self.map[0] + self._memory["d"][rows] @ self.map[1:])
 
@@ -155,7 +157,7 @@ class Touch:
         """Start rollouts."""
         self._memory = {"force": np.zeros(count)}
 
-    def force(self, t: int, rows: AnyArray, error: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(self, t: int, rows: AnyArray, deflection: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
         """The read force of some rows (K,) [N]."""
         last = self._memory["force"]
         last[rows] = self.keep * last[rows] + (1.0 - self.keep) * felt

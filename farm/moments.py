@@ -64,7 +64,7 @@ def merged(total: FloatArray, table: FloatArray) -> FloatArray:
     return total
 
 
-def normaliser(total: FloatArray) -> FloatArray:
+def normaliser_of(total: FloatArray) -> FloatArray:
     """Mean and standard deviation (2, d) of moments (1 + 2 d,).
 
     Zeros and ones if there are no observations; a number that never changes gets the standard deviation 1.

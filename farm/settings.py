@@ -189,7 +189,7 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
 
 
 def read_json(path: Path, version: int | None = None, kinds: Mapping[str, type] = types.MappingProxyType({})) -> Any:  # noqa: ANN401
-    """What is in a JSON file; of a given version only a table of it, whose entries are of some types.
+    """What is in a JSON file. With a version: a table of that version, in which some entries have these types.
 
     Raises:
       ConfigError: it cannot be read, is not JSON, of another version, or lacks an entry.

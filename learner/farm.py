@@ -52,9 +52,9 @@ class Evaluated:
       import farm
 
       with farm.Farm("finger-gait", policy="constant", workers=1) as pool:
-          found = pool.evaluate(np.zeros((2, pool.size)), seeds=[0, 1])
-          assert isinstance(found, farm.Evaluated)
-          assert found.terms.shape == (2, len(pool.spec.terms))
+          results = pool.evaluate(np.zeros((2, pool.size)), seeds=[0, 1])
+          assert isinstance(results, farm.Evaluated)
+          assert results.terms.shape == (2, len(pool.spec.terms))
       ```
     """
 
@@ -172,11 +172,11 @@ class Farm:
           RunError: an evaluation failed on every worker that tried it, or the pool is closed.
         """
         theta = self._parameters(thetas)
-        words = self._seeds(seeds, len(theta))
+        starts = self._seeds(seeds, len(theta))
         if not len(theta):
             return np.empty(0)
         with self._turn():
-            self._begin(Jobs.exploring(theta, (1,), words))
+            self._begin(Jobs.exploring(theta, (1,), starts))
             return self._collected().returns.copy()
 
     def evaluate(
@@ -194,10 +194,10 @@ class Farm:
           traces: whether the channels' traces are wanted as well.
 
         Raises:
-          ConfigError: traces are wanted, but no channel of the task is traced.
+          ConfigError: traces are wanted, but no channel of the task has trace=True.
         """
         theta, spec = self._parameters(thetas), self._problem.spec
-        words = self._seeds(seeds, len(theta))
+        starts = self._seeds(seeds, len(theta))
         if traces and not spec.trace_channels:
             raise ConfigError("traces: no channel of the task has trace=True")
         count = len(theta)
@@ -207,7 +207,7 @@ class Farm:
             flags, empty = none.astype(bool), trace.astype("<f4") if traces else None
             return Evaluated(none, measures, flags if spec.success else None, flags, none.astype(int), terms, empty)
         with self._turn():
-            self._begin(Jobs.exploring(theta, (1,), words), "all" if traces else "none", terms=True)
+            self._begin(Jobs.exploring(theta, (1,), starts), "all" if traces else "none", terms=True)
             results = self._collected()
         return Evaluated(
             returns=results.returns,
@@ -225,8 +225,8 @@ class Farm:
         The call ends when its last pair was taken, or when the iterator is closed. Until then other calls wait.
         """
         theta = self._parameters(thetas)
-        words = self._seeds(seeds, len(theta))
-        return self._as_they_come(Jobs.exploring(theta, (1,), words)) if len(theta) else iter(())
+        starts = self._seeds(seeds, len(theta))
+        return self._as_they_come(Jobs.exploring(theta, (1,), starts)) if len(theta) else iter(())
 
     def _as_they_come(self, jobs: Jobs) -> Iterator[tuple[int, float]]:
         with self._turn():
@@ -242,9 +242,9 @@ class Farm:
     def rollout(self, theta: Any, seed: int | None = None) -> Trajectory:  # noqa: ANN401
         """One rollout at physics rate, with its channels, of parameters (P,)."""
         (one,) = self._parameters([theta])
-        words = self._seeds(None if seed is None else [seed], 1)
+        starts = self._seeds(None if seed is None else [seed], 1)
         with self._turn():
-            self._begin(Jobs.single(one, "physics", None if words is None else words[0]))
+            self._begin(Jobs.single(one, "physics", None if starts is None else starts[0]))
             trajectory = self._collected().trajectory(0)
         assert trajectory is not None
         return trajectory

@@ -66,18 +66,18 @@ class Cycle(HandTask):
 
     @property
     def parts(self):
-        seen = {"phase": 0, "joints": len(JOINTS), "estimate": 1, "touch": 1}[self.config.state]
-        return (len(CYCLE), *[seen] * len(CYCLE)) if seen else (len(CYCLE),)
+        width = {"phase": 0, "joints": len(JOINTS), "estimate": 1, "touch": 1}[self.config.state]
+        return (len(CYCLE), *[width] * len(CYCLE)) if width else (len(CYCLE),)
 
     @property
     def observations(self):
         return ()
 
     def setup(self, sim):
-        wanted = len(CYCLE) * (len(JOINTS) + 1) if self.config.state == "estimate" else 0
-        if len(self.config.weights) != wanted:
+        count = len(CYCLE) * (len(JOINTS) + 1) if self.config.state == "estimate" else 0
+        if len(self.config.weights) != count:
             raise farm.ConfigError(
-                f"weights has {len(self.config.weights)} numbers; state {self.config.state} needs {wanted}"
+                f"weights has {len(self.config.weights)} numbers; state {self.config.state} needs {count}"
             )
         (grasping,) = self._find_start(sim)
         self.commands = np.stack([grasping.command(GRIPS[grip]) for grip in CYCLE])
@@ -92,8 +92,8 @@ class Cycle(HandTask):
 
     def observe(self, sim):
         phase = np.eye(len(CYCLE))[sim.own["changes"] % len(CYCLE)]
-        seen = SCALE * self.seen(sim)  # what helps in one phase harms in another, so each has weights of its own
-        return np.concatenate([phase, *(seen * phase[:, [i]] for i in range(len(CYCLE)))], axis=1)
+        x = SCALE * self.seen(sim)  # what helps in one phase harms in another, so each has weights of its own
+        return np.concatenate([phase, *(x * phase[:, [i]] for i in range(len(CYCLE)))], axis=1)
 
     def seen(self, sim):
         """What a state sees beside the phase, (B, n): deflections [rad], or a place on the pad [fingertip radii]."""
@@ -123,12 +123,12 @@ class Cycle(HandTask):
 
     def reward(self, sim, action):
         force = force_of(contact_sensors(sim))
-        there = (pressing(force) == PRESS[sim.own["changes"] % len(CYCLE)]).all(axis=1)
-        felt = np.where(there, sim.own["felt"] + 1, 0)
+        pressed = (pressing(force) == PRESS[sim.own["changes"] % len(CYCLE)]).all(axis=1)
+        felt = np.where(pressed, sim.own["felt"] + 1, 0)
         changed = felt == FELT
         sim.own["felt"], sim.own["changes"] = np.where(changed, 0, felt), sim.own["changes"] + changed
-        kept = 1.0 - motion(sim.qpos[:, POSE], self.model.qpos0[POSE]) / MOST_MOTION
-        return changed * kept  # nothing for a hand that holds still
+        stillness = 1.0 - motion(sim.qpos[:, POSE], self.model.qpos0[POSE]) / MOST_MOTION
+        return changed * stillness  # nothing for a hand that holds still
 
     def ended(self, sim):
         return dropped(sim) | ~stayed(sim.qpos[:, POSE], sim.own["released"])

@@ -39,7 +39,7 @@ class Events:
     def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> bool:
         """Append an event unless the queue is full, or has `most` with this key; return whether it did.
 
-        Thread: Zenoh's. Liveliness events have twice the room, because they are never repeated.
+        Thread: Zenoh's, or main. Liveliness events have twice the room, because they are never repeated.
         """
         size = _size(event)
         with self._came:

@@ -156,7 +156,7 @@ class Session:
         return True
 
     def _silence(self, name: str) -> None:
-        """Find a machine's connections, which callbacks of Zenoh's must not. Thread: helper."""
+        """Silence a machine's connections: callbacks of Zenoh's must not list them. Thread: helper."""
         silence({_address(link) for link in self._session.info.links() if link.auth_identifier == name})
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:

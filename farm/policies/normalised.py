@@ -11,8 +11,8 @@ class Normalised(Policy):
 
     def __init__(self, policy: Policy, normaliser: FloatArray) -> None:
         """Take the policy, and mean and standard deviation (2, d)."""
-        moments = {"observation_mean": normaliser[0], "observation_deviation": normaliser[1]}
-        super().__init__(policy.config, policy.spec, {**policy.constants, **moments})
+        constants = {"observation_mean": normaliser[0], "observation_deviation": normaliser[1]}
+        super().__init__(policy.config, policy.spec, {**policy.constants, **constants})
         self._policy, (self._mean, self._deviation) = policy, normaliser
 
     @property

@@ -51,9 +51,11 @@ class Trajectory:
     def of(cls, *, channels: Mapping[str, FloatArray], times: FloatArray, value: float, success: bool | None,
            **arrays: FloatArray) -> "Trajectory":  # fmt: skip
         """Make one of numbers in double precision; those that are not finite become large."""
-        traces = {name: single(values) for name, values in channels.items()}
         frames = {name: single(values) for name, values in arrays.items()}
-        return cls(value=value, success=success, channels=traces, times=times, **frames)
+        return cls(
+            value=value, success=success, times=times, **frames,
+            channels={name: single(values) for name, values in channels.items()},
+        )  # fmt: skip
 
     def arrays(self) -> dict[str, AnyArray]:
         """Every array over the frames but the times: bodies, actions, terms, then `channels/NAME`."""

@@ -178,9 +178,9 @@ class Batch:
         sim.t += 1
         failed = sim.blown_up()
         self._reward(action, t, failed)
-        ends = task.ended(sim)
-        ends = np.zeros(len(sim), dtype=bool) if ends is None else shaped("ended", ends, (len(sim),)).astype(bool)
-        self._conclude(failed, ends & ~failed, t)
+        ended = task.ended(sim)
+        ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)
+        self._conclude(failed, ended & ~failed, t)
 
     def _measured(self) -> dict[str, FloatArray]:
         """The values kept of this frame, (n, ...) each."""
@@ -218,9 +218,9 @@ class Batch:
             raise TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine")
         self.terms[self.rows, t] = values
 
-    def _conclude(self, failed: BoolArray, ends: BoolArray, t: int) -> None:
+    def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
         """Remove the finished rollouts; all end with the last step."""
-        over, last = failed | ends, t + 1 == self.task.steps
+        over, last = failed | ended, t + 1 == self.task.steps
         any_over = bool(over.any())
         if any_over or last:
             success = None if scores(self.task) else self.task.success(self.sim)
@@ -231,7 +231,7 @@ class Batch:
         if not any_over:
             return
         self._steps[self.active[over]] = t + 1
-        self._failed[self.active[failed]], self._ended[self.active[ends]] = True, True
+        self._failed[self.active[failed]], self._ended[self.active[ended]] = True, True
         frames = slice(t * self._parts, (t + 1) * self._parts)
         for values in self.frames.values():
             values[self.active[failed], frames] = 0.0  # discard the numbers of unstable states

@@ -23,7 +23,7 @@ import numpy as np
 
 from farm import fingerprint, plugins, seeds
 from farm.errors import ConfigError, RunError, writing
-from farm.moments import normaliser
+from farm.moments import normaliser_of
 from farm.net.work import Jobs
 from farm.settings import read_json
 from farm.tasks.rollouts import steps_shape
@@ -134,7 +134,7 @@ class Work:
         self.problem, self._of, self._judged = problem, of, judged
         config, last = of.run.read_config(), int(at.state["generation"])
         self._mu = of.run.parameters.average(last, at.state["mu"], config.average)
-        self._normaliser = np.stack([normaliser(at.moments)] * 2)
+        self._normaliser = np.stack([normaliser_of(at.moments)] * 2)
         self.format = Format(of.path, problem.spec, _wire("tasks", config.task))
         self.file = of.path / "unfinished.json"
         size = int(np.prod(steps_shape(problem.spec))) * 4

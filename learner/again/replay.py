@@ -18,7 +18,7 @@ import numpy as np
 from farm import plugins, settings
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.moments import normaliser
+from farm.moments import normaliser_of
 from farm.policies.normalised import Normalised
 from farm.runner import Runner, build_task
 from farm.sim.model_files import Content, Files
@@ -125,11 +125,11 @@ def loaded(
     at = checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     number = last if generation is None else generation
-    scaling = normaliser(at.moments)
-    mu, scaling = (at.state["mu"], scaling) if number == last else _earlier(folder, at, number, scaling)
+    normaliser = normaliser_of(at.moments)
+    mu, normaliser = (at.state["mu"], normaliser) if number == last else _earlier(folder, at, number, normaliser)
     default = config.average if generation is None else 1
     mu = folder.parameters.average(number, mu, default if average is None else average)
-    return LoadedPolicy(seeing(restored(folder, at, task), scaling), number, mu)
+    return LoadedPolicy(seeing(restored(folder, at, task), normaliser), number, mu)
 
 
 def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
@@ -151,9 +151,9 @@ def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  #
     return problem
 
 
-def seeing(problem: Problem, scaling: FloatArray) -> Problem:
+def seeing(problem: Problem, normaliser: FloatArray) -> Problem:
     """The problem with the policy's observations normalised by (2, d); unchanged if d is 0."""
-    return replace(problem, policy=Normalised(problem.policy, scaling)) if scaling.size else problem
+    return replace(problem, policy=Normalised(problem.policy, normaliser)) if normaliser.size else problem
 
 
 def _files(old: RunConfig, new: RunConfig, files: Files) -> dict[str, Content]:
@@ -170,4 +170,4 @@ def _earlier(folder: RunFolder, at: Checkpoint, generation: int, last: FloatArra
     config = folder.read_config()
     if config.init_from is not None:
         raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
-    return setup.start(config, folder.name, folder.files(at))[1].state["mu"], normaliser(np.zeros(1 + last.size))
+    return setup.start(config, folder.name, folder.files(at))[1].state["mu"], normaliser_of(np.zeros(1 + last.size))

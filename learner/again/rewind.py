@@ -18,7 +18,7 @@ import numpy as np
 from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.moments import merged, normaliser
+from farm.moments import merged, normaliser_of
 from farm.tasks.rollouts import Rollouts, Seed
 from learner import algorithms
 from learner.again.replay import LoadedPolicy, Replay, restored, seeing
@@ -110,19 +110,19 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
         behind = f"it has done generations 1 to {last}" if last else "it has done no generation"
         raise ConfigError(f"generation {number} of the run in {folder.path} has no rollouts: {behind}")
     problem = restored(folder, at)
-    state, scaling = before(folder, at, problem, number)
-    policy = LoadedPolicy(seeing(problem, scaling), number - 1, state.mu)
+    state, normaliser = before(folder, at, problem, number)
+    policy = LoadedPolicy(seeing(problem, normaliser), number - 1, state.mu)
     jobs = explored(config, state, pairs_of(folder, number))[1]
     theta, seeds = jobs.theta(state.mu), jobs.seeds()
-    batch = Rewound(policy, scaling, number, theta, seeds, policy.runner.rollouts(theta, seeds))
-    _compare(folder, batch)
-    return batch
+    rewound = Rewound(policy, normaliser, number, theta, seeds, policy.runner.rollouts(theta, seeds))
+    _compare(folder, rewound)
+    return rewound
 
 
-def under(folder: RunFolder, batch: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
+def under(folder: RunFolder, rewound: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
     """The policy of a repeated generation with other settings of its task; a ConfigError if that is impossible."""
     problem = restored(folder, checkpoints.load(folder.checkpoint), task)
-    return LoadedPolicy(seeing(problem, batch.seen), batch.policy.generation, batch.policy.mu)
+    return LoadedPolicy(seeing(problem, rewound.seen), rewound.policy.generation, rewound.policy.mu)
 
 
 def before(folder: RunFolder, at: Checkpoint, problem: Problem, generation: int) -> tuple[SearchState, FloatArray]:
@@ -131,13 +131,13 @@ def before(folder: RunFolder, at: Checkpoint, problem: Problem, generation: int)
     algorithm: Any = config.algorithm_config
     fresh = problem.begin()
     if done == 0 and config.init_from is None:
-        return fresh, normaliser(np.zeros_like(at.moments))
+        return fresh, normaliser_of(np.zeros_like(at.moments))
     if done and _draws_alike(algorithm, fresh, algorithm.restore(at.state)):
         rows = folder.parameters.rows()
         if done in rows["generation"]:
-            mu, scaling = folder.parameters.mean(done)
+            mu, normaliser = folder.parameters.mean(done)
             sigma = rows["sigma"][rows["generation"] == done][0]
-            return replace(fresh, mu=mu, sigma=sigma, generation=done), scaling
+            return replace(fresh, mu=mu, sigma=sigma, generation=done), normaliser
     return _learn_again(folder, problem, done)
 
 
@@ -177,23 +177,23 @@ def _learn_again(folder: RunFolder, problem: Problem, until: int) -> tuple[Searc
     with closing(problem.runner()) as runner:
         while state.generation < until:
             eps, jobs = explored(config, state, pairs)
-            results = runner.run(state.mu, jobs, "none", np.stack([normaliser(moments)] * 2))
+            results = runner.run(state.mu, jobs, "none", np.stack([normaliser_of(moments)] * 2))
             returns = learnt_from(config, problem.task, results.returns, results.steps)
             state = algorithms.tell(config.algorithm_of(pairs), state, eps, returns)
             moments = merged(moments, results.moments)
             pairs = config.pairs_after(pairs, int(results.steps.sum()))
-    return state, normaliser(moments)
+    return state, normaliser_of(moments)
 
 
-def _compare(folder: RunFolder, batch: Rewound) -> None:
+def _compare(folder: RunFolder, rewound: Rewound) -> None:
     """Warn if the returns differ from the run's mean, extremes and spread in progress.jsonl."""
-    values = batch.returns
+    values = rewound.returns
     for line in folder.progress():
-        if line.generation == batch.generation:
+        if line.generation == rewound.generation:
             stored = (line.return_mean, line.return_min, line.return_max, line.return_std)
             if stored != (float(values.mean()), float(values.min()), float(values.max()), float(values.std())):
                 log.warning(
                     "%s: these are not the rollouts of generation %d to the last bit: their mean return was %.6g and "
                     "is %.6g here; code or --init-from run have changed, or this processor rounds differently",
-                    folder.path, batch.generation, line.return_mean, values.mean(),
+                    folder.path, rewound.generation, line.return_mean, values.mean(),
                 )  # fmt: skip

@@ -30,7 +30,7 @@ from learner.run.config import RunConfig
 from learner.run.evaluation import outcome
 from learner.run.files import NONE
 from learner.run.folder import RunFolder
-from learner.run.hash_chain import Entry
+from learner.run.hash_chain import ChainEntry
 from learner.run.launch import Placement, connected, dispatch, open_run
 from learner.run.learner import explored
 from learner.run.setup import Problem
@@ -61,7 +61,7 @@ class Stored:
     """Of progress.jsonl, by generation."""
     rows: Mapping[int, Any]
     """Of parameters: mu and sigma after those generations that are kept."""
-    entries: Mapping[int, Entry]
+    entries: Mapping[int, ChainEntry]
     """Of chain, by generation."""
     summary: Mapping[str, Any] | None
 
@@ -99,8 +99,8 @@ def stored(folder: RunFolder) -> Stored:
     lines = {line.generation: line for line in folder.progress() if line.generation <= last}
     table = folder.parameters.rows() if folder.parameters.path.exists() else np.empty(0, [("generation", "<i8")])
     rows = {int(row["generation"]): row for row in table if row["generation"] <= last}
-    observations = problem.spec.observation if config.policy_config.normalise else 0
-    every = folder.parameters.every(len(at.state["mu"]), config.generations, observations)
+    observation = problem.spec.observation if config.policy_config.normalise else 0
+    every = folder.parameters.every(len(at.state["mu"]), config.generations, observation)
     entries, before = folder.chain.read(), hash_chain.first(config, at.config)
     for generation in range(1, last + 1):
         if generation not in lines:
@@ -221,7 +221,7 @@ def _linked(
     before: str,
     line: GenerationStats,
     row: Any,  # noqa: ANN401  an array's row, or None
-    entries: Mapping[int, Entry],
+    entries: Mapping[int, ChainEntry],
 ) -> str:
     """The digest of a generation in chain, if it is that of its line, its row and the generation before it."""
     where = f"{folder.path}: generation {generation} differs"

@@ -32,8 +32,8 @@ class Algorithm(Protocol[State]):
       state = algorithm.init(5)  # P parameters
       for _ in range(30):
           eps = algorithm.ask(state, rng)  # (rows, P)
-          tried = [state.mu + sign * eps for sign in algorithm.signs()]
-          returns = np.stack([-((each - 1.0) ** 2).sum(axis=1) for each in tried], axis=1)  # (rows, signs)
+          candidates = [state.mu + sign * eps for sign in algorithm.signs()]
+          returns = np.stack([-((each - 1.0) ** 2).sum(axis=1) for each in candidates], axis=1)  # (rows, signs)
           state = algorithm.tell(state, eps, returns)
       assert state.generation == 30
       assert ((state.mu - 1.0) ** 2).sum() < 1.0  # it began with 5

@@ -38,8 +38,8 @@ class CMAState(SearchState):
         size = self.mu.size
         sizes = {"sigma": (size,), "step": (1,), "covariance": (size, size * (size + 1) // 2)}
         for name in self._vectors()[1:]:
-            if (entries := getattr(self, name).size) not in sizes.get(name, (size,)) or not entries:
-                raise ValueError(f"state: {name} has {entries} entries, with {size} parameters")
+            if (count := getattr(self, name).size) not in sizes.get(name, (size,)) or not count:
+                raise ValueError(f"state: {name} has {count} entries, with {size} parameters")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -228,5 +228,5 @@ class PGPE(Settings):
     def _check_memory(self, state: PGPEState) -> None:
         for name in ("velocity", "first_moment", "second_moment"):
             expected = state.mu.size if name in self._memory() else 0
-            if (entries := getattr(state, name).size) != expected:
-                raise ValueError(f"state: {name} has {entries} entries, expected {expected} with {self.optimiser}")
+            if (count := getattr(state, name).size) != expected:
+                raise ValueError(f"state: {name} has {count} entries, expected {expected} with {self.optimiser}")

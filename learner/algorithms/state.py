@@ -81,8 +81,8 @@ class SearchState:
         if self.sigma.size != size:
             raise ValueError(f"state: sigma must have mu's size {size}, not {self.sigma.size}")
         for name in self._vectors()[2:]:
-            if (entries := getattr(self, name).size) not in (0, size):
-                raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {entries}")
+            if (count := getattr(self, name).size) not in (0, size):
+                raise ValueError(f"state: {name} must be empty or of mu's size {size}, not {count}")
 
     def to_dict(self) -> dict[str, StateValue]:
         """Every field by its name, for a checkpoint; `from_dict` restores the same bits."""

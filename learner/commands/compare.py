@@ -44,12 +44,12 @@ def main(words: Sequence[str]) -> int:
     recordings.target(command.to)
     folders = [RunFolder.open(path) for path in command.runs]
     runs = read(folders)
-    replays = []
+    sides = []
     for folder, run in zip(folders, runs, strict=True):
         policy = loaded(folder)
-        replays.append(Side(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
+        sides.append(Side(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
     with writing(command.to):
-        record_comparison(command.to, replays, table(runs))
+        record_comparison(command.to, sides, table(runs))
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.view:
         view.check_display(str(command.to))

@@ -98,8 +98,8 @@ def _announcement(run: Run, place: Placement) -> list[str]:
     if (config := run.learner.config).start == "fitted":
         width, sigma = config.policy_config.bandwidth, config.algorithm_config.initial_sigma  # type: ignore[attr-defined]
         lines.append(f"fitted to the observation: bandwidth {width:.4g}, initial sigma {sigma:.4g}")
-    observations = run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
-    every = folder.parameters.every(run.learner.state.mu.size, run.learner.config.generations, observations)
+    observation = run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
+    every = folder.parameters.every(run.learner.state.mu.size, run.learner.config.generations, observation)
     if every > 1:
         lines.append(f"parameters: one generation in {every} is kept, to stay below 100 MB")
     return lines

@@ -120,42 +120,42 @@ def _rollouts(
     from learner.recording.comparison import Side, record_comparison
     from learner.recording.drawing import Drawing
 
-    batch = rewind(folder.path, command.generation)
-    policy = under(folder, batch, command.task) if changed else batch.policy  # chosen by the run's own results
-    indices = _indices(command, batch, ending)
-    replays = batch.again(indices, policy)
+    rewound = rewind(folder.path, command.generation)
+    policy = under(folder, rewound, command.task) if changed else rewound.policy  # chosen by the run's own results
+    indices = _indices(command, rewound, ending)
+    replays = rewound.again(indices, policy)
     names = [f"rollout {index}" for index in indices]
     lines = [f"return {each.trajectory.value:.3f}{_succeeds(each)}" for each in replays]
-    title = f"generation {batch.generation}" + (f", {changed}" if changed else "")
+    title = f"generation {rewound.generation}" + (f", {changed}" if changed else "")
     if len(replays) == 1:
         recordings.record(path, folder.name, policy.problem, f"{names[0]} of {title}", replays[0].trajectory)
     else:
         drawing = Drawing.of(policy.problem)
         rows = [f"| {name} | {line} |" for name, line in zip(names, lines, strict=True)]
-        again = f"`farm replay {command.run} --generation {batch.generation} --rollout I`"
+        again = f"`farm replay {command.run} --generation {rewound.generation} --rollout I`"
         table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
-        side = [Side(name, drawing, (), each.trajectory) for name, each in zip(names, replays, strict=True)]
+        sides = [Side(name, drawing, (), each.trajectory) for name, each in zip(names, replays, strict=True)]
         with writing(path):
-            record_comparison(path, side, table, rollouts_of=folder.name)
+            record_comparison(path, sides, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
     return policy, replays
 
 
-def _indices(command: ReplayCommand, batch: "Rewound", ending: str) -> list[int]:
+def _indices(command: ReplayCommand, rewound: "Rewound", ending: str) -> list[int]:
     """Indices of the rollouts: given ones, the best, the worst, those that ended; each once, at most MOST.
 
     Raises:
       ConfigError: too many are requested.
       RunError: none ended.
     """
-    ends = batch.ended(command.ended or 0)
-    if command.ended and not ends:
+    ended = rewound.ended(command.ended or 0)
+    if command.ended and not ended:
         raise RunError(
-            f"no rollout of generation {batch.generation} {ending if ending != Task.ending else 'was ended'}"
+            f"no rollout of generation {rewound.generation} {ending if ending != Task.ending else 'was ended'}"
         )
-    if command.ended and len(ends) < command.ended:
-        say(f"{len(ends)} of the {len(batch.returns)} rollouts of generation {batch.generation} {_were(ending)}")
-    requests = [*command.rollout, *batch.best(command.best or 0), *batch.worst(command.worst or 0), *ends]
+    if command.ended and len(ended) < command.ended:
+        say(f"{len(ended)} of the {len(rewound.returns)} rollouts of generation {rewound.generation} {_were(ending)}")
+    requests = [*command.rollout, *rewound.best(command.best or 0), *rewound.worst(command.worst or 0), *ended]
     indices = list(dict.fromkeys(requests))
     if len(indices) > MOST:
         raise ConfigError(f"{len(indices)} rollouts are requested; at most {MOST} are shown side by side")

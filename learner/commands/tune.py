@@ -155,17 +155,17 @@ def _rollouts(command: TuneCommand, entries: Sequence[Entry], path: Path) -> int
 
 def _conclude(race: Race, *, recorded: bool) -> None:
     """Write the page and the figure, and say who has won."""
-    picture = figure.available()
+    drawable = figure.available()
     with writing(f"to {race.path}"):
-        if picture:
+        if drawable:
             figure.draw(result.curves(race), race.path / "figure.svg", [rung.rollouts for rung in race.rungs])
-        replace_text(race.path / "result.md", result.page(race, figure=picture))
+        replace_text(race.path / "result.md", result.page(race, figure=drawable))
     wide().print(_table(race))
     folder = race.folder(race.winner)
     say(f"{race.winner.name} wins; the numbers are mean returns from perturbed starts: {race.path}/result.md")
     say(f"without the race: {result.command(race)}")
     say(f"look at it with: farm {'view' if recorded else 'replay'} {folder}")
-    if not picture:
+    if not drawable:
         say(f"no figure: {figure.INSTALL}")
 
 

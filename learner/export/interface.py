@@ -49,12 +49,12 @@ def _actions(task: Task, count: int) -> tuple[Quantity, ...]:
     return tuple(Quantity(name, "", *bounds) for name in names)
 
 
-def _rows(values: Sequence[Quantity]) -> list[dict[str, Any]]:
+def _rows(quantities: Sequence[Quantity]) -> list[dict[str, Any]]:
     """Quantities as data."""
-    bounds = [[value if math.isfinite(value) else None for value in (each.low, each.high)] for each in values]
+    bounds = [[value if math.isfinite(value) else None for value in (each.low, each.high)] for each in quantities]
     return [
         {"name": each.name, "unit": each.unit, "low": low, "high": high}
-        for each, (low, high) in zip(values, bounds, strict=True)
+        for each, (low, high) in zip(quantities, bounds, strict=True)
     ]
 
 

@@ -54,7 +54,7 @@ def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
 def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
     """The part of GenerationStats that follows from a round: exploring rollouts, then the mean policy's."""
     returns, flags = results.returns[:rollouts], results.flags[:rollouts]
-    _, ends, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
+    _, ended, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
     return {
         "return_mean": float(returns.mean()),
         "return_min": float(returns.min()),
@@ -63,7 +63,7 @@ def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) ->
         "mean_policy_return": float(results.returns[rollouts]),
         "mean_policy_success": bool(results.flags[rollouts, 0]) if spec.success else None,
         "success_rate": success_rate(spec, flags),
-        "ended": ends,
+        "ended": ended,
         "failed": failed,
         "clamped": clamped,
         "measures": means_of_measures(spec, results, slice(rollouts)),

@@ -56,7 +56,7 @@ class ProgressFile:
             readable, damaged, torn = self._lines()
         except FileNotFoundError:
             readable, damaged, torn = [], [], False
-        older = [stats for _, stats in readable if stats.generation <= generation]
+        remaining = [stats for _, stats in readable if stats.generation <= generation]
         if torn and (not readable or readable[-1][1].generation < generation):
             damaged.append(path.read_bytes().count(b"\n") + 1)  # otherwise it is of a later generation
         if damaged:
@@ -64,9 +64,9 @@ class ProgressFile:
             which = ", ".join(map(str, damaged[:10])) + (", ..." if len(damaged) > 10 else "")
             log.warning(
                 "%s: %d damaged line(s) dropped (line %s), %d kept; all of it is in %s",
-                path, len(damaged), which, len(older), copy,
+                path, len(damaged), which, len(remaining), copy,
             )  # fmt: skip
-        replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in older))
+        replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in remaining))
 
     def _lines(self) -> tuple[list[tuple[int, GenerationStats]], list[int], bool]:
         """Readable lines by number; numbers of unreadable ones; whether the last one is incomplete.

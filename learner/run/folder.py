@@ -39,7 +39,7 @@ from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.files import NONE, ParametersFile, ProgressFile, replace_text
-from learner.run.hash_chain import ChainFile, Entry
+from learner.run.hash_chain import ChainEntry, ChainFile
 from learner.run.states import States
 
 log = logging.getLogger(__name__)
@@ -192,7 +192,7 @@ class RunFolder:
         sigma: FloatArray,
         generations: int,
         normaliser: FloatArray = NONE,
-        entry: Entry | None = None,
+        entry: ChainEntry | None = None,
     ) -> None:
         """Add a generation to progress.jsonl, parameters and chain: mu and sigma (P,), and a normaliser (2, d)."""
         if entry is not None:

@@ -25,7 +25,7 @@ OF_MACHINES: Final = ("reissued", "workers", "seconds")
 
 
 @dataclass(frozen=True)
-class Entry:
+class ChainEntry:
     """A generation's entry."""
 
     digest: str
@@ -84,26 +84,26 @@ class ChainFile:
 
     path: Path
 
-    def append(self, generation: int, entry: Entry) -> None:
+    def append(self, generation: int, entry: ChainEntry) -> None:
         """Add a generation."""
         with self.path.open("a", encoding="utf-8") as file:
             file.write(_line(generation, entry))
 
-    def read(self) -> Mapping[int, Entry]:
+    def read(self) -> Mapping[int, ChainEntry]:
         """Every readable line, by generation; the last one of several."""
-        entries: dict[int, Entry] = {}
+        entries: dict[int, ChainEntry] = {}
         with suppress(OSError):
             for words in map(str.split, self.path.read_text("utf-8", "replace").splitlines()):
                 if len(words) == 3 and words[0].isdecimal() and len(words[0]) < 20:
-                    entries[int(words[0])] = Entry(*words[1:])
+                    entries[int(words[0])] = ChainEntry(*words[1:])
         return entries
 
     def rewind(self, generation: int) -> None:
         """Remove what is newer than a generation."""
         if self.path.exists():
-            older = ((at, entry) for at, entry in sorted(self.read().items()) if at <= generation)
-            replace_text(self.path, "".join(_line(at, entry) for at, entry in older))
+            remaining = ((at, entry) for at, entry in sorted(self.read().items()) if at <= generation)
+            replace_text(self.path, "".join(_line(at, entry) for at, entry in remaining))
 
 
-def _line(generation: int, entry: Entry) -> str:
+def _line(generation: int, entry: ChainEntry) -> str:
     return f"{generation} {entry.digest} {entry.state}\n"

@@ -15,7 +15,7 @@ import numpy as np
 from farm import seeds
 from farm.arrays import FloatArray, IntArray
 from farm.errors import CheckpointError, RunError
-from farm.moments import merged, normaliser
+from farm.moments import merged, normaliser_of
 from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report
@@ -199,11 +199,11 @@ class Learner:
         with suppress(OSError):  # if the disk is full, the generation's end says so
             self.folder.save(self._at)
         if (generation := goes_back_to(self._at)) is not None:
-            outcome = (
+            message = (
                 f"the run goes back to generation {generation}, before the first answer of a host that is expelled"
             )
-            log.warning("%s; what follows is repeated", outcome)
-            raise RolledBack(f"{outcome}: --resume {self.folder.path} repeats what follows")
+            log.warning("%s; what follows is repeated", message)
+            raise RolledBack(f"{message}: --resume {self.folder.path} repeats what follows")
 
     def evaluate(self, dispatcher: Dispatcher) -> Evaluation:
         """The mean policy at the end of the run, averaged over its last generations if the run says so."""
@@ -287,7 +287,7 @@ class Learner:
 
     def _normalisers(self) -> FloatArray:
         """Normalisers of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
-        now, best = normaliser(self._at.moments), self._at.best
+        now, best = normaliser_of(self._at.moments), self._at.best
         return np.stack([now, now if best is None else best.normaliser])
 
     def _replay_job(self) -> list[Jobs]:
@@ -313,7 +313,7 @@ class Learner:
             episode = int(returns.reshape(-1, *scores.shape)[:, row, column].argmax())  # the best one of the best
             job = results.jobs.take([episode * len(scores) + row])
             seed, theta = job.seeds()[column], job.theta(before.mu)[column]
-            best = BestRollout(seed=seed, theta=theta, normaliser=normaliser(self._at.moments))
+            best = BestRollout(seed=seed, theta=theta, normaliser=normaliser_of(self._at.moments))
             generation, replayed = self.state.generation, False
         self._at = replace(
             self._at,
@@ -353,11 +353,11 @@ class Learner:
     def _save(self, progress: GenerationStats, last: Checkpoint) -> None:
         if self._at.first != last.first:
             self.folder.states.keep(last)
-        mu, sigma, statistics = self.state.mu, self.state.sigma, normaliser(self._at.moments)
+        mu, sigma, normaliser = self.state.mu, self.state.sigma, normaliser_of(self._at.moments)
         state = hash_chain.state_of(self._at)
-        entry = hash_chain.Entry(hash_chain.following(last.chain, progress, mu, sigma, statistics, state), state)
+        entry = hash_chain.ChainEntry(hash_chain.following(last.chain, progress, mu, sigma, normaliser, state), state)
         self._at = replace(self._at, chain=entry.digest)
-        self.folder.append(progress, mu, sigma, self.config.generations, statistics, entry)
+        self.folder.append(progress, mu, sigma, self.config.generations, normaliser, entry)
         now = time.monotonic()
         durable = now - self._durable > DURABLE_EVERY
         self._durable = now if durable else self._durable
@@ -372,11 +372,11 @@ def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[Flo
     """
     algorithm, episodes = config.algorithm_of(pairs), config.episodes
     eps = algorithms.ask(algorithm, state, seeds.exploration(config.seed, state.generation))
-    starts = range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
-    words = None
+    indices = range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
+    starts = None
     if config.task_config.perturb:
-        words = [seeds.training(config.seed, state.generation, start) for start in starts]
-    return eps, Jobs.exploring(eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), words)
+        starts = [seeds.training(config.seed, state.generation, start) for start in indices]
+    return eps, Jobs.exploring(eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), starts)
 
 
 def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:

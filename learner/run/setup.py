@@ -195,19 +195,19 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
       ConfigError: the task is not available here, or the run to start from cannot be used.
     """
     other = None if config.init_from is None else _other(config)
-    subject = problem(config, other.constants if other else None, files)
-    state = subject.begin()
+    result = problem(config, other.constants if other else None, files)
+    state = result.begin()
     if other is not None:
         state = _taken_over(config, state, other)
-    moments = np.zeros(1 + 2 * subject.spec.observation if config.policy_config.normalise else 0)
-    texts, assets = split(subject.task.sources)
+    moments = np.zeros(1 + 2 * result.spec.observation if config.policy_config.normalise else 0)
+    texts, assets = split(result.task.sources)
     checkpoint = Checkpoint(
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
         solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True,
-        code=subject.code, files=texts, assets=assets, constants=dict(subject.policy.constants),
+        code=result.code, files=texts, assets=assets, constants=dict(result.policy.constants),
         moments=other.moments if other else moments, chain=hash_chain.first(config),
     )  # fmt: skip
-    return subject, checkpoint
+    return result, checkpoint
 
 
 def resumed(
@@ -226,16 +226,16 @@ def resumed(
         )
     if not at.canary.startswith(numbers):
         raise CheckpointError(f"--numbers {numbers}: the run in {folder.path} began with {at.canary}, and keeps it")
-    subject = problem(config, at.constants, folder.files(at))
-    if len(at.moments) != (1 + 2 * subject.spec.observation if config.policy_config.normalise else 0):
+    result = problem(config, at.constants, folder.files(at))
+    if len(at.moments) != (1 + 2 * result.spec.observation if config.policy_config.normalise else 0):
         raise CheckpointError(f"{folder.checkpoint}: its statistics are of other observations than its task's")
-    changed = [name for name, digest in subject.code.items() if at.code.get(name) != digest]
+    changed = [name for name, digest in result.code.items() if at.code.get(name) != digest]
     if changed and not mixed:
         raise CheckpointError(
             f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back, "
             "begin a new run with --init-from, or continue with --mixed (then the run is not reproducible)"
         )
-    return subject, at
+    return result, at
 
 
 def _other(config: RunConfig) -> Checkpoint:

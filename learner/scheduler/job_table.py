@@ -197,8 +197,8 @@ class JobTable:
         if state is None or index not in self.given[worker]:
             return False, False
         state.benched = True
-        holder = state.held.pop(index, None) is not None
-        if index not in self.open or (not holder and worker in self.errors[index]):
+        holds = state.held.pop(index, None) is not None
+        if index not in self.open or (not holds and worker in self.errors[index]):
             return False, False  # done in the meantime, or a duplicate message
         self.errors[index][worker] += 1
         if not self._leave(worker, index, now):

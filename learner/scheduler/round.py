@@ -30,14 +30,14 @@ class Shapes:
     substeps: int = 1
     """Physics steps of a control step"""
 
-    def answer_bytes(self, *, trajectory: bool = True, traced: bool = True) -> int:
+    def answer_bytes(self, *, trajectory: bool = True, traces: bool = True) -> int:
         """At most so many bytes answer one job: two rollouts, their traces, and a trajectory at physics rate."""
         terms = int(np.prod(self.frame.get("terms", (0,))))
         numbers = 8 * (2 + 1 + 2 * self.observation + self.measures + terms) + 4  # returns, steps, moments...; flags
         frame = 8 + 4 * sum(int(np.prod(shape)) for shape in self.frame.values())
         trace = 4 * self.trace[0] * self.trace[1]
         frames = self.trace[0] * self.substeps + 1
-        return 2 * (numbers + traced * trace) + trajectory * frames * frame
+        return 2 * (numbers + traces * trace) + trajectory * frames * frame
 
     @property
     def largest_message(self) -> int:
@@ -73,7 +73,7 @@ class RoundResults:
         self._trajectories: dict[int, Trajectory] = {}
         count, measures = len(self._exploring), shapes.measures
         whole = traces in ("all", "steps")  # the two traces of `extremes` are one message's, not a job's
-        with_trajectory, plain = (shapes.answer_bytes(trajectory=one, traced=whole) for one in (True, False))
+        with_trajectory, plain = (shapes.answer_bytes(trajectory=one, traces=whole) for one in (True, False))
         self._bytes = np.maximum(np.where(self._seen, with_trajectory, plain), jobs.eps.nbytes // max(1, len(jobs.eps)))
         self.returns: FloatArray = np.zeros(count)
         """(S,)"""

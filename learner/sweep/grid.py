@@ -126,10 +126,9 @@ def _plain(values: Mapping[str, str]) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", "-".join(parts))
 
 
-def _words(vary: object) -> str:
-    if not isinstance(vary, dict) or not vary:
-        return "nothing"
-    return " and ".join(f"{name}={','.join(map(str, values))}" for name, values in vary.items())
+def _words(vary: Mapping[str, object]) -> str:
+    lists = {name: values if isinstance(values, list) else [values] for name, values in vary.items()}
+    return " and ".join(f"{name}={','.join(map(str, values))}" for name, values in lists.items()) or "nothing"
 
 
 def parse_vary(words: Sequence[str]) -> dict[str, list[str]]:

@@ -43,7 +43,7 @@ _GRACE: Final = 20.0  # [s] for learners to save and leave
 
 
 class RunWatcher(Protocol):
-    """Who is told how the runs go. Thread: readers, several."""
+    """Who is told how the runs go. Thread: readers, several; main for `ended`."""
 
     def progress(self, run: str, generation: int, of: int, returned: float) -> None:
         """A generation has ended, with this return of the mean policy."""
@@ -216,7 +216,7 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], wat
 
 
 def _listen(learner: _Learner, watcher: RunWatcher) -> None:
-    """Forward a learner's output; if it ended, the learner would block on a full pipe. Thread: reader."""
+    """Forward a learner's output; if this thread ended, the learner would block on a full pipe. Thread: reader."""
     assert learner.process.stdout
     generations = 0
     for line in learner.process.stdout:

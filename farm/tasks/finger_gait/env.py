@@ -83,10 +83,10 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
     ) -> tuple[FloatArray, dict[str, Any]]:
         """Release the object; with perturb=True under conditions drawn from the seed."""
         super().reset(seed=seed, options=options)
-        words = None
+        start = None
         if self._task.config.perturb:  # as the farm has seeds: four words
-            words = tuple(self.np_random.integers(0, 2**32, 4).tolist())
-        self._batch = Batch(self._task, self._sim, [words])
+            start = tuple(self.np_random.integers(0, 2**32, 4).tolist())
+        self._batch = Batch(self._task, self._sim, [start])
         self._x = self._look()
         return self._x.copy(), self._info(np.zeros(len(self._terms)), success=False)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from farm.moments import Moments, merged, normaliser, usable
+from farm.moments import Moments, merged, normaliser_of, usable
 
 RNG = np.random.default_rng(2)
 SIZE = 4
@@ -32,7 +32,7 @@ def test_of_one_rollout_and_of_all():
         assert row[0] == len(x)
         np.testing.assert_allclose(row[1 : 1 + SIZE], x.mean(axis=0), rtol=1e-12)
         np.testing.assert_allclose(row[1 + SIZE :], x.var(axis=0) * len(x), rtol=1e-9)
-    mean, deviation = normaliser(total)
+    mean, deviation = normaliser_of(total)
     np.testing.assert_allclose(mean, np.concatenate(parts).mean(axis=0), rtol=1e-12)
     np.testing.assert_allclose(deviation, np.concatenate(parts).std(axis=0), rtol=1e-9)
 
@@ -50,13 +50,13 @@ def test_far_from_zero_nothing_is_lost():
     moments = Moments(1, 1)
     for value in x:
         moments.add(np.array([0]), value[None])
-    assert normaliser(moments.table[0])[1, 0] == pytest.approx(x.std(), rel=1e-6)
+    assert normaliser_of(moments.table[0])[1, 0] == pytest.approx(x.std(), rel=1e-6)
 
 
 def test_of_nothing():
     zeros = np.zeros(1 + 2 * SIZE)
-    assert normaliser(zeros).tolist() == [[0.0] * SIZE, [1.0] * SIZE]
-    assert normaliser(np.empty(0)).shape == (2, 0)
+    assert normaliser_of(zeros).tolist() == [[0.0] * SIZE, [1.0] * SIZE]
+    assert normaliser_of(np.empty(0)).shape == (2, 0)
     assert merged(zeros, np.zeros((3, 1 + 2 * SIZE))).tobytes() == zeros.tobytes()
     rows = table(rollouts(2))
     assert merged(zeros, rows[:1]).tobytes() == merged(zeros, np.insert(rows[:1], 0, 0.0, axis=0)).tobytes()
@@ -68,7 +68,7 @@ def test_a_number_that_never_changes_is_left_at_zero():
     for _ in range(50):
         moments.add(np.arange(2), np.array([[0.1, -7.0]] * 2))
     total = merged(np.zeros(5), moments.table)
-    assert normaliser(total).tolist() == [[0.1, -7.0], [1.0, 1.0]]
+    assert normaliser_of(total).tolist() == [[0.1, -7.0], [1.0, 1.0]]
 
 
 @pytest.mark.filterwarnings("error")

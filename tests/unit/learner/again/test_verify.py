@@ -57,7 +57,7 @@ def forged(folder: RunFolder) -> None:
     for generation, entry in entries.items():
         row, state = rows[generation], hash_chain.state_of(at) if generation == len(entries) else entry.state
         before = hash_chain.following(before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state)
-        folder.chain.append(generation, hash_chain.Entry(before, state))
+        folder.chain.append(generation, hash_chain.ChainEntry(before, state))
     checkpoints.save(folder.checkpoint, replace(at, chain=before, config=configs.to_dict(config)))
 
 

@@ -9,7 +9,7 @@ import pytest
 from alone import Alone, learnt, new_run, state, taken_up
 
 from farm.errors import CheckpointError, ConfigError
-from farm.moments import normaliser
+from farm.moments import normaliser_of
 from farm.net.work import Jobs
 from farm.policies.normalised import Normalised
 from learner.again.replay import load
@@ -52,11 +52,11 @@ def test_observations_are_normalised_by_all_generations_before(pole: str, tmp_pa
     assert at.moments[0] == len(x) == 3 * 8 * 4, "exploring rollouts alone count"
     np.testing.assert_allclose(at.moments[1:3], x.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(at.moments[3:], x.var(axis=0) * len(x), rtol=1e-6)
-    expected = [normaliser(np.zeros(5)), *learner.folder.parameters.rows()["normaliser"]]
+    expected = [normaliser_of(np.zeros(5)), *learner.folder.parameters.rows()["normaliser"]]
     for (_, jobs, _), normalisers, row in zip(alone.rounds, alone.normalisers, expected, strict=False):
         assert normalisers[0].tobytes() == row.tobytes()
         assert jobs.rollouts.sum() >= 9
-    assert expected[-1].tobytes() == normaliser(at.moments).tobytes()
+    assert expected[-1].tobytes() == normaliser_of(at.moments).tobytes()
 
 
 def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(pole: str, tmp_path: Path) -> None:

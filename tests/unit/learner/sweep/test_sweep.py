@@ -162,12 +162,13 @@ def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
         "{}",
         '{"version": 2}',
         '{"version": 1, "vary": 3}',
+        '{"version": 1, "vary": {"initial_sigma": 3}, "seeds": [], "settings": []}',
         '{"version": 1, "vary": {"initial_sigma": ["0.1"]}, "seeds": [], "settings": 3}',
         '{"version": 1, "vary": {"initial_sigma": ["0.1"]}, "seeds": [], "settings": [3]}',
         '{"version": 1, "vary": {"initial_sigma": ["0.1"]}, "seeds": [], "settings": []}',
         "[" * 100_000,
     ],
-    ids=range(9),
+    ids=range(10),
 )
 def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "sweep.json").write_text(text)
