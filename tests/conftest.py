@@ -38,15 +38,15 @@ def grips_found_once() -> Iterator[None]:
 
     tests/unit/farm/tasks/finger_gait/test_rollouts.py says that what it finds does not depend on earlier questions.
     """
-    known: dict[tuple[bytes, str], Grasping] = {}
+    searches: dict[tuple[bytes, str], Grasping] = {}
 
     def find(hand: Hand) -> Grasping:
         model = np.empty(mujoco.mj_sizeModel(hand.model), np.uint8)
         mujoco.mj_saveModel(hand.model, None, model)
         key = model.tobytes(), f"{hand.object_name} {hand.pose}"
-        if key not in known:
-            known[key] = Grasping(replace(hand, model=copy.copy(hand.model)))  # tests may change the model
-        return known[key]
+        if key not in searches:
+            searches[key] = Grasping(replace(hand, model=copy.copy(hand.model)))  # tests may change the model
+        return searches[key]
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(holding, "Grasping", find)

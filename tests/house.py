@@ -35,16 +35,16 @@ def circles() -> list[str]:
     """Import circles, each as its modules; imports within functions count, those for annotations alone do not."""
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sources()}
     graph = {name: {each for each in _imported(path) if each in names and each != name} for name, path in names.items()}
-    found = []
+    loops = []
     while True:
         try:
             TopologicalSorter(graph).prepare()
         except CycleError as error:
             circle = error.args[1]
-            found.append(" -> ".join(circle))
+            loops.append(" -> ".join(circle))
             graph[circle[1]] = graph[circle[1]] - {circle[0]}
         else:
-            return found
+            return loops
 
 
 def _imported(path: Path) -> Iterator[str]:
@@ -92,8 +92,8 @@ def private_uses() -> int:
 def items(*words: str) -> int:
     """Tests that pytest collects."""
     command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-m", "", *words]
-    said = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    return sum("::" in line for line in said.splitlines())
+    output = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    return sum("::" in line for line in output.splitlines())
 
 
 def words() -> int:
@@ -124,11 +124,11 @@ def measured() -> dict[str, tuple[int, int]]:
 
 def main() -> int:
     """Print the table; 1 if an aim is missed."""
-    found = measured()
-    for name, (count, most) in found.items():
+    table = measured()
+    for name, (count, most) in table.items():
         sys.stdout.write(f"{'ok    ' if count <= most else 'MISSED'}  {name}: {count} (at most {most})\n")
     sys.stdout.writelines(f"        {circle}\n" for circle in circles())
-    return int(any(count > most for count, most in found.values()))
+    return int(any(count > most for count, most in table.values()))
 
 
 if __name__ == "__main__":

@@ -93,8 +93,8 @@ def _imports(node: ast.AST) -> list[str]:
 
 
 TREES = dict(modules())
-IMPORTS = {name: [found for node in ast.walk(tree) for found in _imports(node)] for name, tree in TREES.items()}
-TOPS = {name: {found.partition(".")[0] for found in imports} for name, imports in IMPORTS.items()}
+IMPORTS = {name: [module for node in ast.walk(tree) for module in _imports(node)] for name, tree in TREES.items()}
+TOPS = {name: {module.partition(".")[0] for module in imports} for name, imports in IMPORTS.items()}
 
 
 def _run_elsewhere(tree: ast.Module) -> Iterator[ast.FunctionDef]:
@@ -103,23 +103,23 @@ def _run_elsewhere(tree: ast.Module) -> Iterator[ast.FunctionDef]:
     for node in ast.walk(tree):
         name = ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
         if isinstance(node, ast.Call) and name in ("Thread", "_callback", "answer", "answer_asked"):
-            given = [each.value for each in node.keywords if each.arg == "target"] if name == "Thread" else node.args
-            names = (ast.unparse(each).rpartition(".")[2] for each in given)
+            targets = [each.value for each in node.keywords if each.arg == "target"] if name == "Thread" else node.args
+            names = (ast.unparse(each).rpartition(".")[2] for each in targets)
             yield from (functions[each] for each in names if each in functions)
 
 
 def test_a_function_says_on_which_other_thread_it_runs() -> None:
-    found = [(name, node) for name, tree in TREES.items() for node in _run_elsewhere(tree)]
-    assert len(found) >= 8
-    silent = [f"{name}:{node.name}" for name, node in found if "Thread: " not in (ast.get_docstring(node) or "")]
+    functions = [(name, node) for name, tree in TREES.items() for node in _run_elsewhere(tree)]
+    assert len(functions) >= 8
+    silent = [f"{name}:{node.name}" for name, node in functions if "Thread: " not in (ast.get_docstring(node) or "")]
     assert not silent
 
 
 def test_the_page_names_what_exists() -> None:
     page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
-    named = re.findall(r"`([\w/]+\.py):([\w.]+)`", page)
-    assert len(named) > 20
-    for module, name in named:
+    references = re.findall(r"`([\w/]+\.py):([\w.]+)`", page)
+    assert len(references) > 20
+    for module, name in references:
         scope: ast.AST = TREES[module]
         for part in name.split("."):
             inside = {n.name: n for n in ast.iter_child_nodes(scope) if isinstance(n, ast.ClassDef | ast.FunctionDef)}

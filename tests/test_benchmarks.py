@@ -69,8 +69,8 @@ def test_the_cycles_estimate_tells_where_the_bar_is(monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(FOLDER)
     import cycles
 
-    given: dict[str, Any] = {"object": "crowned-bar", "state": "estimate"}
-    runner = problem(configure(cycles.TASK, weights=cycles.estimate(given), **given)).runner()
+    settings: dict[str, Any] = {"object": "crowned-bar", "state": "estimate"}
+    runner = problem(configure(cycles.TASK, weights=cycles.estimate(settings), **settings)).runner()
     observe, estimates, places = runner.task.observe, [], []
 
     def noted(sim: Sim) -> np.ndarray:
@@ -97,8 +97,8 @@ def test_a_return_is_reached_by_three_means_in_a_row(monkeypatch: pytest.MonkeyP
 
     def reached(returns: list[float]) -> tuple[int, float] | None:
         means = [(10 * (i + 1), float(i), np.array([each]), np.empty((2, 0))) for i, each in enumerate(returns)]
-        found: tuple[int, float] | None = learning_speed.reached(Known(), iter(means), 1.0)
-        return found
+        result: tuple[int, float] | None = learning_speed.reached(Known(), iter(means), 1.0)
+        return result
 
     assert reached([0.0, 1.0, 2.0, 0.9, 1.0, 1.0, 3.0, 0.0]) == (50, 4.0)
     assert reached([1.0, 1.0, 0.0, 1.0, 1.0]) is None
@@ -109,9 +109,9 @@ def test_the_pages_show_the_recorded_comparison(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.syspath_prepend(FOLDER)
     import peers
 
-    found = json.loads((FOLDER.parent / "docs/results/tables/peers.json").read_text("utf-8"))
-    assert "\n".join(peers.first_page(found)) in (FOLDER.parent / "README.md").read_text("utf-8")
-    _, _, *tables = peers.table(found)
+    data = json.loads((FOLDER.parent / "docs/results/tables/peers.json").read_text("utf-8"))
+    assert "\n".join(peers.first_page(data)) in (FOLDER.parent / "README.md").read_text("utf-8")
+    _, _, *tables = peers.table(data)
     assert "\n".join(tables) in (FOLDER / "README.md").read_text("utf-8")
 
 
@@ -120,8 +120,8 @@ def test_the_map_of_touch_shows_the_recorded_numbers(monkeypatch: pytest.MonkeyP
     import touch_map
 
     results = FOLDER.parent / "docs/results"
-    found = json.loads((results / "touch/map.json").read_text("utf-8"))
-    assert touch_map.tables(found) in (results / "touch.md").read_text("utf-8")
+    data = json.loads((results / "touch/map.json").read_text("utf-8"))
+    assert touch_map.tables(data) in (results / "touch.md").read_text("utf-8")
     assert touch_map.least(200, 146) == pytest.approx(0.2, abs=0.02), "of 1.0 - 0.73"
 
 
@@ -205,11 +205,11 @@ def test_the_gallery_shows_the_recorded_scores(tmp_path: Path) -> None:
     shutil.copy(docs / table, tmp_path / table)
     words = ["--only", "none", "--docs", tmp_path]
     subprocess.run([sys.executable, FOLDER / "gallery.py", *words], check=True)
-    shown = (tmp_path / "gallery.md").read_text("utf-8")
-    assert shown == (docs / "gallery.md").read_text("utf-8")
-    assert shown.count("](pictures/gallery/") == 8
+    page = (tmp_path / "gallery.md").read_text("utf-8")
+    assert page == (docs / "gallery.md").read_text("utf-8")
+    assert page.count("](pictures/gallery/") == 8
     assert sum(film.stat().st_size for film in (docs / "pictures/gallery").iterdir()) < 6e6
-    kept = [each.stat().st_size for part in ("pictures", "results") for each in (docs / part).rglob("*.*")]
-    assert sum(kept) < 8e6
+    sizes = [each.stat().st_size for part in ("pictures", "results") for each in (docs / part).rglob("*.*")]
+    assert sum(sizes) < 8e6
     for row in map(json.loads, (docs / table).read_text().splitlines()):
         assert row["learnt"] > max(row["constant"], row["still"]), row["task"]

@@ -78,9 +78,9 @@ FOUND = [
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A reader's folder: a run, a task, certificates."""
-    made = tmp_path_factory.mktemp("reader")
+    path = tmp_path_factory.mktemp("reader")
     with pytest.MonkeyPatch.context() as patched:
-        patched.chdir(made)
+        patched.chdir(path)
         assert farm.__main__.main(["new-task", "pendulum"]) == 0
         names = ["--learner", "learner.lab", *(f"--worker=lab-{i}" for i in (1, 2, 7))]
         assert farm.__main__.main(["certificates", "new", "certs", *names]) == 0
@@ -89,7 +89,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             farm.configure("finger-gait", generations=1, pairs=1), "runs/first", workers=1, record=False
         ):
             pass
-    return made
+    return path
 
 
 @pytest.fixture
@@ -97,8 +97,8 @@ def reader(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Work there, and stop each program as soon as it has read its arguments."""
     parse = settings.parse
 
-    def read(*given: Any, **more: Any) -> NoReturn:
-        parse(*given, **more)
+    def read(*arguments: Any, **more: Any) -> NoReturn:
+        parse(*arguments, **more)
         raise Accepted
 
     read_by_script = argparse.ArgumentParser.parse_args
@@ -134,8 +134,8 @@ def test_a_command_is_accepted(words: str, whole: bool, monkeypatch: pytest.Monk
     elif program == "python":
         script(rest, monkeypatch)
     elif program == "pip":
-        known = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
-        assert extras <= known.keys()
+        groups = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+        assert extras <= groups.keys()
     else:
         services = re.findall(r"^  (\w+):$", "".join(p.read_text("utf-8") for p in ROOT.glob("compose*.yaml")), re.M)
         assert {a or b for a, b in re.findall(r"(\w+):/|--scale (\w+)=", words)} <= set(services)

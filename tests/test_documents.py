@@ -45,8 +45,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
 def test_tests_that_pages_name_exist(page: Path) -> None:
-    known = {path.name for path in (ROOT / "tests").rglob("*.py")}
-    assert set(re.findall(r"\btest_\w+\.py\b", page.read_text("utf-8"))) <= known
+    names = {path.name for path in (ROOT / "tests").rglob("*.py")}
+    assert set(re.findall(r"\btest_\w+\.py\b", page.read_text("utf-8"))) <= names
 
 
 def anchors(text: str) -> set[str]:
@@ -69,14 +69,14 @@ PAGES = [page for folder in (".", "docs", "examples") for page in (ROOT / folder
 def test_flags_that_pages_name_exist(page: Path) -> None:
     """Those in commands `farm ...`, in lines of code or in the text, and those that the text names alone."""
     text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.S | re.M)
-    said = re.findall(r"`((?:farm |--)[^`]*)`", text) + re.findall(r"^    (?:\S*/)?(farm .*)$", text, re.M)
-    named = {flag for part in said for flag in re.findall(r"(?<![\w-])--([a-z][a-z-]*)", part)}
-    assert {flag for flag in named if flag.removeprefix("no-") not in FLAGS} == set()
+    spans = re.findall(r"`((?:farm |--)[^`]*)`", text) + re.findall(r"^    (?:\S*/)?(farm .*)$", text, re.M)
+    flags = {flag for part in spans for flag in re.findall(r"(?<![\w-])--([a-z][a-z-]*)", part)}
+    assert {flag for flag in flags if flag.removeprefix("no-") not in FLAGS} == set()
 
 
 def test_the_task_in_the_readme_is_the_one_that_new_task_writes() -> None:
-    [shown] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
-    assert parts(shown) == parts((ROOT / "learner/commands/task_template.py.txt").read_text("utf-8"))
+    [program] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+    assert parts(program) == parts((ROOT / "learner/commands/task_template.py.txt").read_text("utf-8"))
 
 
 def test_the_pendulum_of_the_examples_is_the_one_that_new_task_writes() -> None:
@@ -104,9 +104,9 @@ def test_the_pages_of_results_are_what_the_recorded_data_says(tmp_path: Path) ->
         os.utime(copy, (0, 0))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}  # benchmarks/ is in the checkout alone
     subprocess.run([sys.executable, tmp_path / "results.py", tmp_path / "results"], env=environment, check=True)
-    made = [page.relative_to(tmp_path) for page in tmp_path.rglob("*.md") if page.stat().st_mtime > 0]
-    assert {Path("results.md"), Path("results/chain.md"), Path("results/future-work.md")} < set(made)
-    for page in made:
+    pages = [page.relative_to(tmp_path) for page in tmp_path.rglob("*.md") if page.stat().st_mtime > 0]
+    assert {Path("results.md"), Path("results/chain.md"), Path("results/future-work.md")} < set(pages)
+    for page in pages:
         assert (tmp_path / page).read_text("utf-8") == (docs / page).read_text("utf-8"), page
     assert len((docs / "results.md").read_text("utf-8").splitlines()) <= 120
     assert {f.name for f in (tmp_path / "results").glob("*.svg")} == {f.name for f in (docs / "results").glob("*.svg")}

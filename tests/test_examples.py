@@ -27,9 +27,9 @@ def _learn(folder: Path) -> "subprocess.CompletedProcess[str]":
 
 
 def test_learn_runs_and_says_what_came_out(tmp_path: Path) -> None:
-    ended = _learn(tmp_path)
-    assert ended.returncode == 0, ended.stderr
-    lines = ended.stdout.splitlines()
+    process = _learn(tmp_path)
+    assert process.returncode == 0, process.stderr
+    lines = process.stdout.splitlines()
     assert len(lines) == 4
     assert lines[-1].startswith("finished: robust success")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -38,32 +38,32 @@ def test_learn_runs_and_says_what_came_out(tmp_path: Path) -> None:
 
 def test_learn_overwrites_nothing(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
-    ended = _learn(tmp_path)
-    assert ended.returncode == 1
-    assert "never overwritten" in ended.stderr
-    assert "Traceback" not in ended.stderr
+    process = _learn(tmp_path)
+    assert process.returncode == 1
+    assert "never overwritten" in process.stderr
+    assert "Traceback" not in process.stderr
 
 
 def test_random_actions_play_episodes(tmp_path: Path) -> None:
     command = [sys.executable, LEARN.parent / "gymnasium_random.py", "--episodes", "2"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert [line.split(":")[0] for line in said.splitlines()] == ["episode 0", "episode 1"]
-    assert all(line.endswith(("dropped", "success", "held")) for line in said.splitlines())
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert [line.split(":")[0] for line in output.splitlines()] == ["episode 0", "episode 1"]
+    assert all(line.endswith(("dropped", "success", "held")) for line in output.splitlines())
 
 
 def test_a_cycle_makes_its_grips_in_turn() -> None:
     task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
     runner = problem(configure(task, steps=51)).runner()
-    found = runner.rollouts(np.zeros((2, runner.size)), [None, trial(1, 0)])
-    assert found.measures[:, 0].tolist() == [4.0, 4.0]
-    pressing = found.frames["force"].sum(axis=-1) >= 0.1
-    last = np.flatnonzero(np.diff(found.frames["changes"][0]))  # of each grip's control steps
+    rollouts = runner.rollouts(np.zeros((2, runner.size)), [None, trial(1, 0)])
+    assert rollouts.measures[:, 0].tolist() == [4.0, 4.0]
+    pressing = rollouts.frames["force"].sum(axis=-1) >= 0.1
+    last = np.flatnonzero(np.diff(rollouts.frames["changes"][0]))  # of each grip's control steps
     assert np.diff(last).tolist() == [3] * 15, "a grip is felt for three steps, then the next one is made"
     four = [[True, True, True], [False, True, True], [True, True, True], [True, False, True]]
     assert pressing[0, last].tolist() == four * 4
-    assert found.success.all()
-    assert found.returns[0] == pytest.approx(16.0, abs=2.0), "1 for each change, less for a bar that has moved"
-    assert found.returns[1] < found.returns[0], "this one was displaced from its nominal place"
+    assert rollouts.success.all()
+    assert rollouts.returns[0] == pytest.approx(16.0, abs=2.0), "1 for each change, less for a bar that has moved"
+    assert rollouts.returns[1] < rollouts.returns[0], "this one was displaced from its nominal place"
     open_hand = np.zeros((8, 8))
     open_hand[3:6, 0] = -0.3  # [rad], of the middle finger's joints while it should press
     still = runner.rollouts(open_hand.reshape(1, -1), [None])
@@ -75,31 +75,31 @@ def test_a_cycle_makes_its_grips_in_turn() -> None:
 def test_a_cycle_sees_its_phase_and_something_in_each(state: str, count: int) -> None:
     task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
     weights = np.random.default_rng(0).standard_normal((4, 9)) if state == "estimate" else np.empty(0)
-    given = {"state": state, "weights": tuple(weights.ravel().tolist())}
-    runner = problem(configure(task, **given, steps=24, joint_noise=0.0)).runner()
+    settings = {"state": state, "weights": tuple(weights.ravel().tolist())}
+    runner = problem(configure(task, **settings, steps=24, joint_noise=0.0)).runner()
 
     def play() -> tuple[np.ndarray, ...]:
-        batch, seen, lag = Batch(runner.task, runner.sim, [None]), [], []
+        batch, observations, lag = Batch(runner.task, runner.sim, [None]), [], []
         while not batch.over:
-            seen.append(batch.observe()[0])
+            observations.append(batch.observe()[0])
             lag.append(runner.sim.qpos[0, :8] - runner.sim.own["target"][0])
             batch.step(np.zeros((1, 8)))
-        return np.array(seen), np.array(lag), batch.frames["changes"][0]
+        return np.array(observations), np.array(lag), batch.frames["changes"][0]
 
-    seen, lag, changes = again(play)
-    phase, own = seen[:, :4].astype(bool), seen[:, 4:].reshape(24, 4, count)
+    observations, lag, changes = again(play)
+    phase, blocks = observations[:, :4].astype(bool), observations[:, 4:].reshape(24, 4, count)
     assert (phase.sum(axis=1) == 1).all()
     assert (phase.argmax(axis=1) == changes % 4).all()
-    assert (own[~phase] == 0.0).all()
+    assert (blocks[~phase] == 0.0).all()
     if state == "joints":
-        np.testing.assert_allclose(own[phase], 5.0 * lag)
+        np.testing.assert_allclose(blocks[phase], 5.0 * lag)
     if state == "estimate":
         now = (weights[phase.argmax(axis=1)] * np.column_stack([lag, np.ones(24)])).sum(axis=1)
         averaged = [sum(0.05 * 0.95 ** (t - s) * now[s] for s in range(t + 1)) for t in range(24)]
-        np.testing.assert_allclose(own[phase][:, 0], 5.0 * np.array(averaged))
+        np.testing.assert_allclose(blocks[phase][:, 0], 5.0 * np.array(averaged))
     if state == "touch":
-        assert np.abs(own[phase]).max() < 5.0, "within the fingertips' half spheres"
-        assert len(np.unique(own[phase])) == 24
+        assert np.abs(blocks[phase]).max() < 5.0, "within the fingertips' half spheres"
+        assert len(np.unique(blocks[phase])) == 24
 
 
 def test_a_cycle_needs_the_weights_of_its_estimate() -> None:
@@ -130,8 +130,8 @@ def test_a_cycle_remembers_where_a_finger_was_touched() -> None:
 def test_curves_in_tensorboard(tmp_path: Path) -> None:
     pytest.importorskip("tensorboardX")
     command = [sys.executable, LEARN.parent / "log_tensorboard.py"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert said == "logged 30 generations: tensorboard --logdir runs/logged\n"
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert output == "logged 30 generations: tensorboard --logdir runs/logged\n"
     assert list((tmp_path / "runs/logged/tensorboard").glob("events.*"))
 
 
@@ -148,8 +148,8 @@ def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str)
     if importlib.util.find_spec(SEARCHES[name]) is None:
         pytest.skip(f"{SEARCHES[name]} is not installed")
     command = [sys.executable, LEARN.parent / f"{name}.py"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
-    returns = [float(value) for value in re.findall(r"return (-?[0-9.]+)", said)]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    returns = [float(value) for value in re.findall(r"return (-?[0-9.]+)", output)]
     assert len(returns) == {"optuna_search": 5, "differential_evolution": 1}.get(name, 10)
     assert returns[-1] > -1.0, "standing still returns -5.4"
     assert returns[-1] >= returns[0]
@@ -159,12 +159,12 @@ def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str)
 def test_map_elites_fills_an_archive_and_repeats_its_elites(tmp_path: Path) -> None:
     pytest.importorskip("ribs")
     command = [sys.executable, LEARN.parent / "map_elites.py"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
-    counts = [int(count) for count in re.findall(r"(\d+) grips", said)]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    counts = [int(count) for count in re.findall(r"(\d+) grips", output)]
     assert len(counts) == 4
     assert counts == sorted(counts)
     assert counts[-1] > 70, "of 144 cells"
-    assert said.splitlines()[-1] == "every tenth elite again from its seed: the same returns"
+    assert output.splitlines()[-1] == "every tenth elite again from its seed: the same returns"
     with np.load(tmp_path / "archive.npz") as archive:
         assert len(archive["solution"]) == counts[-1] == len(np.unique(archive["seed"]))
         assert (archive["measures"] >= 0.0).all()
@@ -177,8 +177,10 @@ def test_map_elites_fills_an_archive_and_repeats_its_elites(tmp_path: Path) -> N
 def test_nsga2_finds_a_front_within_its_constraint(tmp_path: Path) -> None:
     pytest.importorskip("pymoo")
     command = [sys.executable, LEARN.parent / "nsga2.py"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
-    front = [tuple(map(float, pair)) for pair in re.findall(r"shift ([0-9.]+) mm, largest offset ([0-9.]+) rad", said)]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    front = [
+        tuple(map(float, pair)) for pair in re.findall(r"shift ([0-9.]+) mm, largest offset ([0-9.]+) rad", output)
+    ]
     assert len(front) >= 5
     assert front == sorted(front)
     assert [offset for _, offset in front] == sorted((offset for _, offset in front), reverse=True), "a front"
@@ -194,11 +196,11 @@ def test_a_search_takes_ten_lines(name: str) -> None:
 
 def test_a_robot_with_meshes_of_a_package(tmp_path: Path) -> None:
     """The arm of dm_control, copied as the page says, learnt by a worker that has neither package nor files."""
-    found = importlib.util.find_spec("dm_control")
-    if found is None or not found.submodule_search_locations:
+    package = importlib.util.find_spec("dm_control")
+    if package is None or not package.submodule_search_locations:
         pytest.skip("dm_control is not installed")
-    theirs = Path(found.submodule_search_locations[0]) / "third_party/kinova"
-    shutil.copytree(theirs, tmp_path / "mine/kinova")
+    source = Path(package.submodule_search_locations[0]) / "third_party/kinova"
+    shutil.copytree(source, tmp_path / "mine/kinova")
     task = Path(shutil.copy(LEARN.parent / "tasks/jaco.py", tmp_path / "mine"))
     config = configure(f"{task}:Jaco", generations=8, pairs=10)
     summary = learnt(config, tmp_path / "r", 1, Path(shutil.copy(task, tmp_path)))
@@ -247,8 +249,8 @@ def test_a_script_beside_folders_of_ones_own_named_like_ours(tmp_path: Path) -> 
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('not this one')")
     (tmp_path / "script.py").write_text(_SCRIPT)
     command = [sys.executable, "script.py"]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stdout.splitlines()[0] == "1"
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.splitlines()[0] == "1"
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert float(ended.stdout.splitlines()[1]) == summary["mean_policy_return"]
+    assert float(process.stdout.splitlines()[1]) == summary["mean_policy_return"]

@@ -37,9 +37,9 @@ def commands(section: str, *names: str) -> list[list[str]]:
 
 def farm(folder: Path, *words: str, status: int = 0) -> str:
     command = [sys.executable, "-P", "-m", "farm", *words]
-    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=170, check=False)
-    assert ended.returncode == status, ended.stderr
-    return ended.stdout + ended.stderr
+    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=170, check=False)
+    assert process.returncode == status, process.stderr
+    return process.stdout + process.stderr
 
 
 def write(folder: Path, *sections: str) -> None:
@@ -62,9 +62,9 @@ def test_the_page_shows_the_file_that_new_task_writes() -> None:
 
 
 def test_every_section_has_its_example() -> None:
-    wanted = {"A policy": "linear.py", "An algorithm": "elite.py", "A backend": "threads.py", "A channel": "swing.py"}
-    wanted |= {"A logger": "lines.py", "A policy with memory": "leaky.py"}
-    for section, name in wanted.items():
+    examples = {"A policy": "linear.py", "An algorithm": "elite.py", "A backend": "threads.py", "A channel": "swing.py"}
+    examples |= {"A logger": "lines.py", "A policy with memory": "leaky.py"}
+    for section, name in examples.items():
         assert list(files(section)) == [name]
         assert commands(section, "run")
 
@@ -74,7 +74,7 @@ def test_what_the_page_says_of_sim() -> None:
     [create] = re.findall(r"`(sim\.own\.setdefault.*?)`", SECTIONS[TASK])
     write = textwrap.dedent("".join(re.findall(r"^    (?:now|sim\.).*\n", SECTIONS[TASK], re.M)))
     assert len(write.splitlines()) == 3
-    found: dict[str, np.ndarray] = {}
+    record: dict[str, np.ndarray] = {}
 
     class Slides(Task):
         xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size="1"/></body>
@@ -87,7 +87,7 @@ def test_what_the_page_says_of_sim() -> None:
 
         def observe(self, sim: Any) -> np.ndarray:
             if sim.t == 0:
-                found["goal"] = sim.own["goal"].copy()
+                record["goal"] = sim.own["goal"].copy()
                 np.testing.assert_array_equal(sim.xpos[:, 1, 0], sim.qpos[:, 0])
             else:
                 lag = sim.qpos[:, 0] - sim.xpos[:, 1, 0]
@@ -112,16 +112,16 @@ def test_what_the_page_says_of_sim() -> None:
     for _ in range(task.steps):
         loop.again(batch.observe)
         batch.step(np.zeros((2, 1)))
-    assert found["goal"].shape == (2, 2)
-    assert (found["goal"][0] == 0.0).all()
-    assert (found["goal"][1] != 0.0).all()
+    assert record["goal"].shape == (2, 2)
+    assert (record["goal"][0] == 0.0).all()
+    assert (record["goal"][1] != 0.0).all()
 
 
 @pytest.mark.slow
 def test_a_task_in_a_file(tmp_path: Path) -> None:
     assert "farm check pendulum.py:Pendulum" in farm(tmp_path, "new-task", "pendulum")
-    said = farm(tmp_path, *commands(TASK, "check")[0])
-    assert "same bits together, in another order, one by one, and in another process" in said
+    output = farm(tmp_path, *commands(TASK, "check")[0])
+    assert "same bits together, in another order, one by one, and in another process" in output
     [learn] = commands(TASK, "run")
     farm(tmp_path, *learn)
     learnt = summary(tmp_path, "pendulum")
@@ -133,8 +133,8 @@ def test_a_task_in_a_file(tmp_path: Path) -> None:
     assert f"return {learnt['mean_policy_return']:.3f}" in farm(tmp_path, *commands(TASK, "replay")[0])
     text = (tmp_path / "pendulum.py").read_text()
     (tmp_path / "pendulum.py").write_text(text.replace("np.cos(sim.qpos[:, 0])", "2 * np.cos(sim.qpos[:, 0])"))
-    said = farm(tmp_path, "run", "--resume", "runs/pendulum", "--generations", "90", status=2)
-    assert "the code of its task has changed since the run began" in said
+    output = farm(tmp_path, "run", "--resume", "runs/pendulum", "--generations", "90", status=2)
+    assert "the code of its task has changed since the run began" in output
 
 
 @pytest.mark.slow
@@ -185,11 +185,11 @@ def test_a_task_in_a_package(tmp_path: Path) -> None:
     def call(*words: str) -> str:
         command = [sys.executable, "-P", "-c", code, *words]
         environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin"}
-        ended = subprocess.run(
+        process = subprocess.run(
             command, cwd=elsewhere, capture_output=True, text=True, env=environment, timeout=120, check=False
         )
-        assert ended.returncode == 0, ended.stderr
-        return ended.stdout
+        assert process.returncode == 0, process.stderr
+        return process.stdout
 
     assert re.search(r"--task +pendulum +swings 1\.0", call("tasks"))
     [learn] = commands("A task in a package", "run")

@@ -47,7 +47,7 @@ def test_they_are_the_ones_that_the_pages_speak_of() -> None:
 def test_an_altered_copy_is_noticed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(run, tmp_path / "r")
     lines = (run / "progress.jsonl").read_text().splitlines(keepends=True)
-    lines[40] = re.sub(r'"best": -?\d+\.\d', lambda found: found[0][:-1] + str((int(found[0][-1]) + 1) % 10), lines[40])
+    lines[40] = re.sub(r'"best": -?\d+\.\d', lambda match: match[0][:-1] + str((int(match[0][-1]) + 1) % 10), lines[40])
     (tmp_path / "r/progress.jsonl").write_text("".join(lines))
     assert main(["verify", str(tmp_path / "r")]) == 1
     assert "generation 41 differs" in capsys.readouterr().err

@@ -40,9 +40,9 @@ def test_only_the_jobs_that_publish_can_publish() -> None:
 
 def test_checks_before_a_commit_are_steps_of_ci() -> None:
     steps = re.sub(r'"\$work/venv/bin/(\w+)"', r"\1", (ROOT / ".ci/run").read_text("utf-8"))
-    [own] = read(".pre-commit-config.yaml")["repos"]
-    assert own["repo"] == "local"
-    for hook in own["hooks"]:
+    [repository] = read(".pre-commit-config.yaml")["repos"]
+    assert repository["repo"] == "local"
+    for hook in repository["hooks"]:
         assert f'step "{hook["name"]}" {hook["entry"]}' in steps
         assert hook["language"] == "system"
 
@@ -51,8 +51,8 @@ def test_a_report_of_a_bug_has_version_status_and_canary() -> None:
     fields = {each["id"]: each["attributes"] for each in read(".github/ISSUE_TEMPLATE/bug.yml")["body"] if "id" in each}
     assert {"version", "status", "canary"} <= set(fields)
     [program] = re.findall(r'python -c "([^"]+)"', fields["canary"]["description"])
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd="/")
-    assert re.fullmatch(r"[0-9a-f]{8}\n", said.stdout)
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd="/")
+    assert re.fullmatch(r"[0-9a-f]{8}\n", process.stdout)
     columns = re.findall(r"column `(\w+)`|and `(\w+)`", fields["status"]["description"])
     status = (ROOT / "farm/commands/status.py").read_text("utf-8")
     assert all(f'"{name}"' in status for pair in columns for name in pair if name)

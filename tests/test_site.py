@@ -24,9 +24,9 @@ SPEC.loader.exec_module(PAGES)
 
 def test_each_page_is_in_the_navigation() -> None:
     groups = PAGES.navigation((ROOT / "docs/README.md").read_text("utf-8"))
-    shown = [page for group in groups for pages in group.values() for page in pages]
-    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} - {"docs/README.md"} <= set(shown)
-    assert "examples/README.md" in shown
+    entries = [page for group in groups for pages in group.values() for page in pages]
+    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} - {"docs/README.md"} <= set(entries)
+    assert "examples/README.md" in entries
     assert "Start here" in groups[0]
 
 
@@ -62,8 +62,8 @@ def test_the_reference_finds_a_name_where_it_is_defined(name: str, where: str) -
 def example(name: str) -> str:
     """The program in a public name's description; empty if there is none."""
     described = inspect.getdoc(getattr(farm, name)) or ""
-    [shown] = re.findall(r"^Example:\n  ```python\n(.*?)^  ```$", described, re.S | re.M) or [""]
-    return textwrap.dedent(shown)
+    [program] = re.findall(r"^Example:\n  ```python\n(.*?)^  ```$", described, re.S | re.M) or [""]
+    return textwrap.dedent(program)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ KINDS = (
 
 def make(name: str = "projected", features: int = 50, size: int = 8, seed: int = 0, bandwidth: float = 1.0) -> Policy:
     kind, spec = KINDS[name], TaskSpec(observation=size, action=ACTIONS, steps=1, period=0.1)
-    own: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "kernel": {"bandwidth": bandwidth},
         "linear": {},
         "linear, no bias": {"bias": False},
@@ -35,8 +35,8 @@ def make(name: str = "projected", features: int = 50, size: int = 8, seed: int =
         "cpg": {},
     }.get(name, {"features": features, "bandwidth": bandwidth})
     if name in SINGLE:
-        own["precision"] = "single"
-    config, rng = kind.Config(**own), np.random.default_rng(seed)
+        settings["precision"] = "single"
+    config, rng = kind.Config(**settings), np.random.default_rng(seed)
     constants = kind.draw(config, spec, rng)
     if kind.standardised:
         constants |= {"origin": rng.normal(size=size), "spread": rng.uniform(0.1, 2.0, size)}
@@ -58,11 +58,11 @@ def memories(policy: Policy, x: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def act(policy: Policy, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-    given = policy.act(policy.prepare(theta), x, *memories(policy, x))
-    return given[0] if isinstance(given, tuple) else given
+    answer = policy.act(policy.prepare(theta), x, *memories(policy, x))
+    return answer[0] if isinstance(answer, tuple) else answer
 
 
 def acted(policy: Policy, prepared: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Actions, followed by the next memory if there is one, a row each."""
-    given = policy.act(prepared, x, *memories(policy, x))
-    return np.concatenate(given, axis=1) if isinstance(given, tuple) else given
+    answer = policy.act(prepared, x, *memories(policy, x))
+    return np.concatenate(answer, axis=1) if isinstance(answer, tuple) else answer

@@ -26,8 +26,8 @@ def covering(cases: Sequence[dict[str, Any]], strength: int) -> list[dict[str, A
     Each time the first case that adds most is taken, so the choice is always the same.
     """
     missing = {each for case in cases for each in together(case, strength)}
-    taken = []
+    selection = []
     while missing:
-        taken.append(max(cases, key=lambda case: len(missing.intersection(together(case, strength)))))
-        missing.difference_update(together(taken[-1], strength))
-    return taken
+        selection.append(max(cases, key=lambda case: len(missing.intersection(together(case, strength)))))
+        missing.difference_update(together(selection[-1], strength))
+    return selection

@@ -37,7 +37,7 @@ def in_the_world(force: np.ndarray, place: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def task(**options: Any) -> FingerGait:
-    made, rng = Touched(FingerGaitConfig(**options)), np.random.default_rng(0)
-    made.goals = [Felt(rng.uniform(0.3, 1.0, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))]
-    made.start_commands = np.linspace(0.3, 1.0, 8)[None]
-    return made
+    gait, rng = Touched(FingerGaitConfig(**options)), np.random.default_rng(0)
+    gait.goals = [Felt(rng.uniform(0.3, 1.0, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))]
+    gait.start_commands = np.linspace(0.3, 1.0, 8)[None]
+    return gait

@@ -49,10 +49,10 @@ class Forging:
 
 
 @contextmanager
-def host(endpoint: str, certs: Path, name: str, file: Path, forge: Forge = lambda said: said) -> Iterator[None]:
+def host(endpoint: str, certs: Path, name: str, file: Path, forge: Forge = lambda message: message) -> Iterator[None]:
     """A host with this certificate, on a thread; it has asked for work when this returns."""
     config = WorkerConfig(connect=(endpoint,), tls=certs, name=name, allow_file=(file,))
-    stop, asked, failed = threading.Event(), threading.Event(), list[BaseException]()
+    stop, request, failed = threading.Event(), threading.Event(), list[BaseException]()
 
     def serve() -> None:
         try:
@@ -63,15 +63,15 @@ def host(endpoint: str, certs: Path, name: str, file: Path, forge: Forge = lambd
                 while not stop.is_set():
                     worker.turn()
                     if forging.sent.is_set():
-                        asked.set()
+                        request.set()
         except BaseException as error:
             failed.append(error)
-            asked.set()
+            request.set()
 
     thread = threading.Thread(target=serve)
     thread.start()
     try:
-        assert asked.wait(30)
+        assert request.wait(30)
         assert not failed, failed
         yield
     finally:
@@ -103,12 +103,14 @@ def file_of(config: RunConfig) -> Path:
 
 def refused(caplog: pytest.LogCaptureFixture) -> set[str]:
     """Hosts that the learner refused."""
-    found = (re.match(r"worker (\w+)/\S+ is refused", line) for line in caplog.messages)
-    return {each[1] for each in found if each}
+    matches = (re.match(r"worker (\w+)/\S+ is refused", line) for line in caplog.messages)
+    return {each[1] for each in matches if each}
 
 
 def shifted(change: Callable[[np.ndarray], np.ndarray]) -> Forge:
-    return lambda said: said if isinstance(said, WorkRequest) else replace(said, returns=change(said.returns))
+    return lambda message: (
+        message if isinstance(message, WorkRequest) else replace(message, returns=change(message.returns))
+    )
 
 
 LIES = {
@@ -120,12 +122,12 @@ LIES = {
 class Late:
     """Results that are changed from the `begin`th on, if `which` says so."""
 
-    def __init__(self, lie: Forge, begin: int, which: Callable[[int], bool] = lambda _: True) -> None:
-        self.lie, self.begin, self.which, self.sent = lie, begin, which, 0
+    def __init__(self, lie: Forge, start: int, which: Callable[[int], bool] = lambda _: True) -> None:
+        self.lie, self.start, self.which, self.sent = lie, start, which, 0
 
-    def __call__(self, said: Any) -> Any:
-        if isinstance(said, Results):
+    def __call__(self, message: Any) -> Any:
+        if isinstance(message, Results):
             self.sent += 1
-            if self.sent >= self.begin and self.which(self.sent):
-                return self.lie(said)
-        return said
+            if self.sent >= self.start and self.which(self.sent):
+                return self.lie(message)
+        return message

@@ -19,7 +19,7 @@ from workers.worker import Worker
 @contextmanager
 def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
     """Workers on threads of this process, some lying by the last bit; all have asked for work when this returns."""
-    stop, asked = threading.Event(), threading.Semaphore(0)
+    stop, requests = threading.Event(), threading.Semaphore(0)
     configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
 
     def serve(config: WorkerConfig, lies: bool) -> None:
@@ -28,7 +28,7 @@ def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator
             worker.join()
             while not worker.inbox.runs and not stop.is_set():
                 worker.turn()
-            asked.release()
+            requests.release()
             while not stop.is_set():
                 worker.turn()
             worker.close()
@@ -38,7 +38,7 @@ def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator
         for thread in threads:
             thread.start()
         for _ in threads:
-            assert asked.acquire(timeout=30), "a worker has found no learner"
+            assert requests.acquire(timeout=30), "a worker has found no learner"
         yield
     finally:
         stop.set()

@@ -45,9 +45,9 @@ def spec(**changed: Any) -> Spec:
 
 def spec_of(file: Path, policy: str = "kernel", **changed: Any) -> Spec:
     """What a learner says of a run with the task in that file."""
-    found, acts = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", policy)
-    code = {"task": found.digest(), "policy": acts.digest(), "simulation": plugins.code_digest(SIMULATION)}
-    values = {"task": found.wire, "policy": policy, "code": code, "files": {"model.xml": found.target.xml}}
+    task, acts = plugins.find("tasks", f"{file}:Pole"), plugins.find("policies", policy)
+    code = {"task": task.digest(), "policy": acts.digest(), "simulation": plugins.code_digest(SIMULATION)}
+    values = {"task": task.wire, "policy": policy, "code": code, "files": {"model.xml": task.target.xml}}
     return spec(**(values | changed))
 
 

@@ -10,18 +10,18 @@ CHOICES = {"shape": ("round", "flat"), "size": (1, 2, 3), "colour": ("red", "gre
 
 @pytest.mark.parametrize(("strength", "most"), [(1, 3), (2, 10), (3, 22)])
 def test_all_values_of_so_many_settings_occur_together(strength, most):
-    found = covering(product(CHOICES), strength)
+    selection = covering(product(CHOICES), strength)
     for names in itertools.combinations(CHOICES, strength):
-        wanted = set(itertools.product(*(CHOICES[name] for name in names)))
-        assert {tuple(case[name] for name in names) for case in found} == wanted
-    assert len(found) <= most, "of the 36 of the product"
+        expected = set(itertools.product(*(CHOICES[name] for name in names)))
+        assert {tuple(case[name] for name in names) for case in selection} == expected
+    assert len(selection) <= most, "of the 36 of the product"
 
 
 def test_what_no_case_has_is_not_missed():
     cases = [case for case in product(CHOICES) if case["lid"] or case["shape"] == "flat"]
-    found = covering(cases, 2)
-    assert all(case in cases for case in found)
-    assert {(case["lid"], case["shape"]) for case in found} == {(True, "round"), (True, "flat"), (False, "flat")}
+    selection = covering(cases, 2)
+    assert all(case in cases for case in selection)
+    assert {(case["lid"], case["shape"]) for case in selection} == {(True, "round"), (True, "flat"), (False, "flat")}
 
 
 def test_the_choice_is_the_same_each_time():

@@ -20,5 +20,5 @@ def way(of: str) -> Way:
     """The table under the heading "The way of ..."."""
     _, _, rest = PAGE.read_text("utf-8").partition(f"# The way of {of}\n")
     rows = [line for line in rest.partition("\n#")[0].splitlines() if re.match(r"\| \d+ \|", line)]
-    named = [re.findall(r"`([\w/]+\.py):([\w.]+)`", row) for row in rows]
-    return Way(tuple(each[0] for each in named), frozenset(file for each in named for file, _ in each))
+    pairs = [re.findall(r"`([\w/]+\.py):([\w.]+)`", row) for row in rows]
+    return Way(tuple(each[0] for each in pairs), frozenset(file for each in pairs for file, _ in each))

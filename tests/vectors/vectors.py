@@ -112,13 +112,13 @@ def plain(value: Any) -> Any:
 def described() -> str:
     """What messages.json says."""
     table = []
-    for name, (key, said) in MESSAGES.items():
-        message = {"schema": codec.SCHEMA, "type": type(said).__name__, **plain(said)}
-        table.append({"file": f"{name}.bin", "key": key, "message": message})
+    for name, (key, message) in MESSAGES.items():
+        entry = {"schema": codec.SCHEMA, "type": type(message).__name__, **plain(message)}
+        table.append({"file": f"{name}.bin", "key": key, "message": entry})
     return json.dumps(table, indent=1) + "\n"
 
 
 if __name__ == "__main__":
-    for name, (_, said) in MESSAGES.items():
-        (FOLDER / f"{name}.bin").write_bytes(codec.encode(said))
+    for name, (_, message) in MESSAGES.items():
+        (FOLDER / f"{name}.bin").write_bytes(codec.encode(message))
     (FOLDER / "messages.json").write_text(described())

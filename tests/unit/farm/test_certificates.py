@@ -29,10 +29,10 @@ def folder(tmp_path: Path) -> Path:
 def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     capsys.readouterr()
     assert main(["certificates", *words]) == 2
-    out, said = capsys.readouterr()
+    out, line = capsys.readouterr()
     assert out == ""
-    assert len(said.splitlines()) == 1
-    return said
+    assert len(line.splitlines()) == 1
+    return line
 
 
 def roster(path: Path) -> dict[str, Any]:
@@ -59,14 +59,14 @@ def files(folder: Path) -> dict[str, bytes]:
      "." * 500 + "é"],
 )  # fmt: skip
 def test_what_is_no_host(host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(["new", str(tmp_path / "certs"), f"--learner={host}"], capsys)
-    assert "is not a host; expected a name like learner.lab, or an address like 10.0.0.7, without port" in said
+    line = refused(["new", str(tmp_path / "certs"), f"--learner={host}"], capsys)
+    assert "is not a host; expected a name like learner.lab, or an address like 10.0.0.7, without port" in line
     assert not list(tmp_path.iterdir())
 
 
 def test_a_host_of_other_letters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(["new", str(tmp_path / "certs"), "--learner", "größe.lab"], capsys)
-    assert "without port; names of other letters have a form in ASCII, xn--..." in said
+    line = refused(["new", str(tmp_path / "certs"), "--learner", "größe.lab"], capsys)
+    assert "without port; names of other letters have a form in ASCII, xn--..." in line
 
 
 @pytest.mark.parametrize(
@@ -122,9 +122,9 @@ def test_a_bundle_that_was_moved_stays_on_the_roster(folder: Path, tmp_path: Pat
 
 def test_a_roster_that_is_lost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "ca" / "roster.json").unlink()
-    said = refused(["add", str(folder), "--worker", "w2"], capsys)
-    assert "roster.json is missing or damaged" in said
-    assert "the learner's bundle has a copy" in said
+    line = refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "roster.json is missing or damaged" in line
+    assert "the learner's bundle has a copy" in line
     shutil.copy(folder / "learner" / "roster.json", folder / "ca")
     assert main(["certificates", "add", str(folder), "--worker", "w2"]) == 0
     assert roster(folder / "ca")["workers"] == ["w1", "w2"]
@@ -175,9 +175,9 @@ def test_a_key_that_others_can_read(folder: Path, capsys: pytest.CaptureFixture[
 
 def test_another_name_than_the_certificates_is_refused(folder: Path) -> None:
     [bundle] = folder.glob("worker-*")
-    own = bundle.name.removeprefix("worker-")
-    assert tls.find(bundle, "worker", own).name == own
-    with pytest.raises(ConfigError, match=f"--name other: the certificate in {bundle} is for {own}; leave --name out"):
+    name = bundle.name.removeprefix("worker-")
+    assert tls.find(bundle, "worker", name).name == name
+    with pytest.raises(ConfigError, match=f"--name other: the certificate in {bundle} is for {name}; leave --name out"):
         tls.find(bundle, "worker", "other")
 
 

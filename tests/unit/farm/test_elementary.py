@@ -34,11 +34,11 @@ def exact(name, x):
 
 def error(name, x):
     """In units in the last place of the true value, (n,)."""
-    found = FUNCTIONS[name](x)
+    results = FUNCTIONS[name](x)
     out = []
-    for value, y in zip(x.tolist(), found.tolist(), strict=True):
-        wanted = exact(name, value)
-        out.append(abs(float((Decimal(y) - wanted) / Decimal(math.ulp(float(wanted))))))
+    for value, y in zip(x.tolist(), results.tolist(), strict=True):
+        truth = exact(name, value)
+        out.append(abs(float((Decimal(y) - truth) / Decimal(math.ulp(float(truth))))))
     return np.array(out)
 
 
@@ -71,13 +71,13 @@ def test_near_those_of_the_c_library(name):
     x = many(3, 30_000)
     if name == "exp":
         x = x[np.abs(x) < 700]
-    wanted = np.array([getattr(math, name)(value) for value in x.tolist()])
+    expected = np.array([getattr(math, name)(value) for value in x.tolist()])
     # It errs itself, by a unit at most: twice that where the next power of two begins.
-    assert (np.abs(FUNCTIONS[name](x) - wanted) <= (WITHIN[name] + 2.0) * np.spacing(np.abs(wanted))).all()
+    assert (np.abs(FUNCTIONS[name](x) - expected) <= (WITHIN[name] + 2.0) * np.spacing(np.abs(expected))).all()
 
 
 @pytest.mark.parametrize(
-    ("name", "x", "wanted"),
+    ("name", "x", "expected"),
     [
         ("exp", [0.0, -0.0, np.inf, -np.inf, 1e300, -1e300, 5e-324], [1.0, 1.0, np.inf, 0.0, np.inf, 0.0, 1.0]),
         ("exp", [710.0, -745.0, -746.0, 709.782712893384], [np.inf, 5e-324, 0.0, math.exp(709.782712893384)]),
@@ -88,16 +88,16 @@ def test_near_those_of_the_c_library(name):
         ("sin", [1e7, -1e22, 1.7e308], [math.sin(1e7), -math.sin(1e22), math.sin(1.7e308)]),
     ],
 )
-def test_at_the_edges(name, x, wanted):
-    np.testing.assert_allclose(FUNCTIONS[name](np.array(x)), wanted, rtol=1e-15, atol=0.0)
+def test_at_the_edges(name, x, expected):
+    np.testing.assert_allclose(FUNCTIONS[name](np.array(x)), expected, rtol=1e-15, atol=0.0)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_what_is_no_number_stays_none_and_spoils_no_neighbour(name):
     x = np.array([0.3, np.nan, 1.7, *([np.inf, -np.inf] if name in ("cos", "sin") else []), -0.2])
-    found = FUNCTIONS[name](x)
-    assert np.isfinite(found).tolist() == np.isfinite(x).tolist()
-    np.testing.assert_array_equal(found[np.isfinite(x)], FUNCTIONS[name](x[np.isfinite(x)]))
+    results = FUNCTIONS[name](x)
+    assert np.isfinite(results).tolist() == np.isfinite(x).tolist()
+    np.testing.assert_array_equal(results[np.isfinite(x)], FUNCTIONS[name](x[np.isfinite(x)]))
 
 
 def test_they_stay_within_their_bounds():
@@ -155,9 +155,9 @@ def test_the_argument_is_left_alone(name):
 def test_a_result_belongs_to_the_caller(name, count):
     x = np.linspace(-2.0, 2.0, count)
     first = FUNCTIONS[name](x)
-    wanted = first.copy()
+    expected = first.copy()
     first[:] = 9.0  # the same numbers again, which may be remembered
-    np.testing.assert_array_equal(FUNCTIONS[name](x), wanted)
+    np.testing.assert_array_equal(FUNCTIONS[name](x), expected)
 
 
 # ---------------------------------------------------------------- turns, single precision
@@ -177,10 +177,10 @@ def test_cosine_of_turns_is_near_the_true_values():
 
 def test_cosine_of_turns_at_the_edges():
     x = np.array([0, 0.25, 0.5, 2**23 + 1, 2**24 + 2, 3e38, np.inf, -np.inf, np.nan], dtype=np.float32)
-    found = elementary.cos_turns(x)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found[:6], [1, 0, -1, 1, 1, 1], atol=1e-7)
-    assert np.isnan(found[6:]).all()
+    cosines = elementary.cos_turns(x)
+    assert cosines.dtype == np.float32
+    np.testing.assert_allclose(cosines[:6], [1, 0, -1, 1, 1, 1], atol=1e-7)
+    assert np.isnan(cosines[6:]).all()
 
 
 def test_cosine_of_turns_has_the_same_bits_in_any_array():

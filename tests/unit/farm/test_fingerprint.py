@@ -52,9 +52,9 @@ def test_every_built_in_policy_counts(monkeypatch: pytest.MonkeyPatch, name: str
     before, kind = fresh(), plugins.find("policies", name).target
     whole = kind.act
 
-    def changed(self, *given):
-        said = whole(self, *given)
-        action, *memory = said if isinstance(said, tuple) else (said,)
+    def changed(self, *arguments):
+        answer = whole(self, *arguments)
+        action, *memory = answer if isinstance(answer, tuple) else (answer,)
         shifted = np.nextafter(action, 2.0)
         return (shifted, *memory) if memory else shifted
 

@@ -75,7 +75,7 @@ def test_a_policy_of_ones_own_that_cannot_be_is_named(tmp_path, members, size, l
 
 
 @pytest.mark.parametrize(
-    ("given", "got"),
+    ("value", "kind"),
     [
         ("np.zeros(3)", r"array of float64 \(3,\)"),
         ("np.zeros((2, 1))", r"array of float64 \(2, 1\)"),
@@ -84,14 +84,14 @@ def test_a_policy_of_ones_own_that_cannot_be_is_named(tmp_path, members, size, l
         ("[0.0, 0.0]", "list"),
     ],
 )
-def test_a_start_that_cannot_be_is_named(tmp_path, given, got):
-    line = f"start of mine.py:Mine gave an? {got}; expected 2 finite numbers of float64, or None$"
+def test_a_start_that_cannot_be_is_named(tmp_path, value, kind):
+    line = f"start of mine.py:Mine gave an? {kind}; expected 2 finite numbers of float64, or None$"
     with pytest.raises(ConfigError, match=line):
-        problem(mine(tmp_path, f"def start(self, rng): return {given}")).begin()
+        problem(mine(tmp_path, f"def start(self, rng): return {value}")).begin()
 
 
 @pytest.mark.parametrize(
-    ("given", "got"),
+    ("value", "kind"),
     [
         ("np.zeros((2, 1))", r"array of float64 \(2, 1\)"),
         ("np.array([np.inf])", r"array of float64 \(1,\)"),
@@ -99,32 +99,32 @@ def test_a_start_that_cannot_be_is_named(tmp_path, given, got):
         ("0.0", "float"),
     ],
 )
-def test_a_memory_that_cannot_be_is_named(tmp_path, given, got):
-    line = f"memory of mine.py:Mine gave an? {got}; expected a vector of finite numbers of float64, or None$"
+def test_a_memory_that_cannot_be_is_named(tmp_path, value, kind):
+    line = f"memory of mine.py:Mine gave an? {kind}; expected a vector of finite numbers of float64, or None$"
     with pytest.raises(ConfigError, match=line):
-        problem(mine(tmp_path, f"memory = {given}"))
+        problem(mine(tmp_path, f"memory = {value}"))
 
 
 def test_a_start_of_ones_own_is_added_to_the_algorithms_mean(tmp_path):
     start = "def start(self, rng): return np.array([2.0, -3.0])"
     for algorithm in ("pgpe", "es", "sep-cma"):
-        found = problem(mine(tmp_path, start, algorithm=algorithm, initial_mu=0.5))
-        assert found.begin().mu.tolist() == [2.5, -2.5]
+        setup = problem(mine(tmp_path, start, algorithm=algorithm, initial_mu=0.5))
+        assert setup.begin().mu.tolist() == [2.5, -2.5]
 
 
 def test_prepared_values_are_one_array(tmp_path):
-    found = problem(configure(f"{pole(tmp_path)}:Pole", policy="direct", features=3))
-    found.policy.prepare = lambda theta: (theta, theta[:, :1])
+    setup = problem(configure(f"{pole(tmp_path)}:Pole", policy="direct", features=3))
+    setup.policy.prepare = lambda theta: (theta, theta[:, :1])
     with pytest.raises(TaskError, match="prepare of the policy gave a tuple; expected one array, with a row"):
-        found.runner().rollouts(np.zeros((2, 3)), [None, None])
+        setup.runner().rollouts(np.zeros((2, 3)), [None, None])
 
 
 def test_prepared_values_need_a_row_for_each_rollout(tmp_path):
-    found = problem(configure(f"{pole(tmp_path)}:Pole", policy="direct", features=3))
-    found.policy.prepare = lambda theta: theta[:1]
+    setup = problem(configure(f"{pole(tmp_path)}:Pole", policy="direct", features=3))
+    setup.policy.prepare = lambda theta: theta[:1]
     line = r"prepare of the policy gave an array of shape \(1, 3\); expected an array of shape \(2, 3\)"
     with pytest.raises(TaskError, match=line):
-        found.runner().rollouts(np.zeros((2, 3)), [None, None])
+        setup.runner().rollouts(np.zeros((2, 3)), [None, None])
 
 
 RETURN = "return np.cos(sim.qpos[:, 0])"
@@ -134,10 +134,10 @@ LEAVES = "import sys\n" + POLE.replace(RETURN, f"{RETURN} if sim.t < 2 else sys.
 def test_a_task_that_exits_is_an_error_with_its_line(tmp_path: Path) -> None:
     path = pole(tmp_path, LEAVES, "leaves.py")
     line = LEAVES.partition("sys.exit")[0].count("\n") + 1
-    found = problem(configure(f"{path}:Pole", policy="constant"))
+    setup = problem(configure(f"{path}:Pole", policy="constant"))
     words = rf"^sys\.exit\(5\) in leaves\.py, line {line}: raise an error instead$"
     with pytest.raises(TaskError, match=words) as raised:
-        found.runner().rollouts(np.zeros((1, found.policy.size)), [None])
+        setup.runner().rollouts(np.zeros((1, setup.policy.size)), [None])
     assert plugins.author_traceback(raised.value)[0].startswith(f'  File "{path}", line {line}, in reward')
     assert plugins.author_traceback(raised.value)[-1] == "SystemExit: 5"
 

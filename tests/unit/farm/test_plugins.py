@@ -19,11 +19,11 @@ from farm.tasks.finger_gait.task import FingerGait
 
 
 def test_built_in() -> None:
-    found = find("tasks", "finger-gait")
-    assert (found.target, found.wire, found.origin, found.release, found.file) == (
+    plugin = find("tasks", "finger-gait")
+    assert (plugin.target, plugin.wire, plugin.origin, plugin.release, plugin.file) == (
         FingerGait, "finger-gait", "built in", "", None,
     )  # fmt: skip
-    assert len(found.digest()) == 64
+    assert len(plugin.digest()) == 64
     assert names("policies") == dict.fromkeys(
         (
             "direct",
@@ -46,10 +46,10 @@ def test_built_in() -> None:
     ("kind", "name"), [(kind, name) for kind in plugins.BUILT_IN for name in plugins.BUILT_IN[kind]]
 )
 def test_every_built_in_one_is_there(kind: str, name: str) -> None:
-    chosen = f"{name}:Swimmer-v5" if name == "gym" else name
+    choice = f"{name}:Swimmer-v5" if name == "gym" else name
     if name == "warp":
         pytest.importorskip("mujoco_warp")
-    assert callable(find(kind, chosen).target)
+    assert callable(find(kind, choice).target)
 
 
 @pytest.mark.parametrize(
@@ -91,8 +91,8 @@ def test_a_file_with_the_unknown_name_is_suggested_and_not_run(tmp_path: Path, m
 
 
 def test_a_variant_is_what_stands_behind_the_colon() -> None:
-    found = find("tasks", "gym:Some-v5")
-    assert (found.variant, found.wire, found.name) == ("Some-v5", "gym:Some-v5", "gym:Some-v5")
+    plugin = find("tasks", "gym:Some-v5")
+    assert (plugin.variant, plugin.wire, plugin.name) == ("Some-v5", "gym:Some-v5", "gym:Some-v5")
 
 
 # ---------------------------------------------------------------- files
@@ -112,12 +112,12 @@ def write(tmp_path: Path) -> Write:
 
 def test_a_class_in_a_file(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write("class Mine:\n    number = 7\nclass Other: pass\n")
-    found = find("tasks", f"{path}:Mine")
-    assert (found.target.number, found.wire, found.origin, found.file) == (7, "mine.py:Mine", str(path), path)
-    assert found.digest() == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert find("policies", f"{path}:Other").target.__module__ == found.target.__module__, "it is imported once"
+    plugin = find("tasks", f"{path}:Mine")
+    assert (plugin.target.number, plugin.wire, plugin.origin, plugin.file) == (7, "mine.py:Mine", str(path), path)
+    assert plugin.digest() == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert find("policies", f"{path}:Other").target.__module__ == plugin.target.__module__, "it is imported once"
     monkeypatch.chdir(path.parent)
-    assert find("tasks", "mine.py:Mine").target is found.target
+    assert find("tasks", "mine.py:Mine").target is plugin.target
     assert str(path.parent) not in sys.path
     assert not (path.parent / "__pycache__").exists()
 
@@ -188,16 +188,16 @@ def test_a_name_that_workers_refuse_is_refused_at_the_start(tmp_path: Path) -> N
 def test_a_file_of_somebody_elses(write: Write, tmp_path: Path) -> None:
     path = write("class Mine: pass\n")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    found = allowed("tasks", "mine.py:Mine", digest, (tmp_path / "other.py", path))
-    assert found.file == path
-    for wire, told, files, words in (
+    plugin = allowed("tasks", "mine.py:Mine", digest, (tmp_path / "other.py", path))
+    assert plugin.file == path
+    for wire, claim, files, words in (
         ("mine.py:Mine", digest, (), r"copy it here, and allow it by --allow-file mine\.py"),
         ("../mine.py:Mine", digest, (path,), "allow it by --allow-file"),
         ("mine.py:Mine", "", (path,), r"differs from the learner's mine\.py"),
         ("mine.py:Mine", digest, (tmp_path / "gone" / "mine.py",), "there is no such file"),
     ):
         with pytest.raises(UnservedError, match=words):
-            allowed("tasks", wire, told, files)
+            allowed("tasks", wire, claim, files)
 
 
 def test_the_author_is_told_where_it_happened(write: Write) -> None:
@@ -252,8 +252,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.usefixtures("package")
 def test_a_class_of_an_installed_package() -> None:
-    found = find("tasks", "walk")
-    assert (found.target.steps, found.wire, found.release, found.origin) == (5, "walk", "theirs 1.2", "theirs 1.2")
+    plugin = find("tasks", "walk")
+    assert (plugin.target.steps, plugin.wire, plugin.release, plugin.origin) == (5, "walk", "theirs 1.2", "theirs 1.2")
     assert names("tasks") == {
         **dict.fromkeys(("finger-gait", "fragile-bar", "turning", "gym"), "built in"),
         **dict.fromkeys(("walk", "broken", "lost"), "theirs 1.2"),
@@ -325,8 +325,8 @@ def test_no_other_name_is_there() -> None:
 
 def test_farm_alone_imports_nothing_heavy() -> None:
     code = "import sys, farm; farm.Task; print(*sorted({'mujoco', 'zenoh', 'rerun', 'tyro'} & set(sys.modules)))"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.strip() == "", "a task is declared without simulator or network"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "", "a task is declared without simulator or network"
 
 
 def test_a_backend_whose_simulator_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,7 +57,7 @@ def test_cores_are_not_more_than_a_container_s_share(
 
 
 def test_a_killed_fork_is_replaced_by_another_one() -> None:
-    said = ran("""
+    output = ran("""
 with forks(2) as waiting, LocalWorkers(2, NOBODY, waiting) as pool:
     before = pool.pids
     assert before == [each.pid for each in waiting]
@@ -69,7 +69,7 @@ with forks(2) as waiting, LocalWorkers(2, NOBODY, waiting) as pool:
     print(open(f"/proc/{after[0]}/cmdline").read() == open("/proc/self/cmdline").read())
 print([os.path.exists(f"/proc/{pid}") for pid in {*before, *after}])
 """)
-    assert said == "True\n[False, False, False]\n"
+    assert output == "True\n[False, False, False]\n"
 
 
 def test_forks_that_never_work_end() -> None:

@@ -99,13 +99,13 @@ def test_jobs_do_not_know_of_each_other_and_their_rate_changes_no_figure(runner)
     for row in (4, 6):
         same(together, [row], together, [8])
     starts = np.cumsum(jobs.rollouts) - jobs.rollouts
-    shown = iter(together.trajectories)
+    trajectories = iter(together.trajectories)
     for at in range(len(jobs)):
         alone = runner.run(MU, jobs.take([at]), "all")
         same(alone, slice(None), together, slice(starts[at], starts[at] + jobs.rollouts[at]))
         if jobs.seen[at]:
-            [own] = alone.trajectories
-            assert codec.encode(next(shown)) == codec.encode(own)
+            [single] = alone.trajectories
+            assert codec.encode(next(trajectories)) == codec.encode(single)
     frames = [len(trajectory.times) for trajectory in together.trajectories]
     assert frames == [6, 6, 11, 11]
     assert [t.value for t in together.trajectories] == together.returns[4:8].tolist()
@@ -115,8 +115,8 @@ def test_what_is_sent_is_what_the_receiver_expects(runner):
     jobs = Jobs.joined([Jobs.mean("control", [None]), Jobs.exploring(EPS, (1, -1), SEEDS)])
     head = {"run": "r", "incarnation": "i", "round": 0, "worker": "w/0"}
     for traces, count in (("none", 0), ("extremes", 2), ("all", 8)):
-        sent = Results.carrying(runner.run(MU, jobs, traces), jobs, 0.0, **head)
-        back = codec.decode(codec.encode(sent), Results)
+        results = Results.carrying(runner.run(MU, jobs, traces), jobs, 0.0, **head)
+        back = codec.decode(codec.encode(results), Results)
         assert back.traces.shape[1:] == (5, 1)
         assert len(back.traces) == count
         assert back.trajectories[0].fits(runner.spec.shapes(len(runner.scene.bodies)))
@@ -127,24 +127,24 @@ def test_what_is_sent_is_what_the_receiver_expects(runner):
 
 def test_an_end_and_its_trace(runner):
     fallen = Runner(Pole(Pole.Config(width=0.5)), runner.policy)
-    given = fallen.run(MU, Jobs.exploring(EPS, (1,), SEEDS), "all")
-    assert 0 < given.flags[:, 1].sum() < 4
+    outcome = fallen.run(MU, Jobs.exploring(EPS, (1,), SEEDS), "all")
+    assert 0 < outcome.flags[:, 1].sum() < 4
     for row in range(4):
-        last = np.flatnonzero(given.traces[row, :, 0])[-1]
-        assert (last < 4 or abs(given.traces[row, last, 0]) > 0.5) == given.flags[row, 1]
-        assert given.flags[row, 0] == (given.traces[row, last, 0] > 0)
+        last = np.flatnonzero(outcome.traces[row, :, 0])[-1]
+        assert (last < 4 or abs(outcome.traces[row, last, 0]) > 0.5) == outcome.flags[row, 1]
+        assert outcome.flags[row, 0] == (outcome.traces[row, last, 0] > 0)
     fallen.close()
 
 
 @pytest.mark.parametrize("size", [1e200, 1e308])
 def test_absurd_parameters_are_answered(runner, size):
     theta = np.where(np.arange(P) % 2, 1.0, -1.0) * size
-    given = runner.run(MU, Jobs.single(theta, "control", None))
-    assert np.isfinite(given.returns).all()
-    codec.decode(codec.encode(given.trajectories[0]), type(given.trajectories[0]))
+    outcome = runner.run(MU, Jobs.single(theta, "control", None))
+    assert np.isfinite(outcome.returns).all()
+    codec.decode(codec.encode(outcome.trajectories[0]), type(outcome.trajectories[0]))
 
 
 def test_the_seed_is_all_there_is_to_a_start(runner):
-    given = runner.run(MU, Jobs.mean("none", [SEEDS[0], SEEDS[0], SEEDS[1], None]))
-    assert given.returns[0] == given.returns[1]
-    assert len(set(given.returns.tolist())) == 3
+    outcome = runner.run(MU, Jobs.mean("none", [SEEDS[0], SEEDS[0], SEEDS[1], None]))
+    assert outcome.returns[0] == outcome.returns[1]
+    assert len(set(outcome.returns.tolist())) == 3

@@ -17,7 +17,7 @@ def test_a_command_that_draws_does_not_import_mujoco_before_it_has_chosen(comman
 
 
 @pytest.mark.parametrize(
-    ("installed", "own", "chosen"),
+    ("installed", "setting", "choice"),
     [
         (["OSMesa", "EGL"], None, "osmesa"),
         (["EGL"], None, "egl"),
@@ -26,9 +26,9 @@ def test_a_command_that_draws_does_not_import_mujoco_before_it_has_chosen(comman
     ],
 )
 def test_what_mujoco_draws_with_when_there_is_no_screen(
-    installed: list[str], own: str | None, chosen: str | None, monkeypatch: pytest.MonkeyPatch
+    installed: list[str], setting: str | None, choice: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "environ", {} if own is None else {"MUJOCO_GL": own})
+    monkeypatch.setattr(os, "environ", {} if setting is None else {"MUJOCO_GL": setting})
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: name if name in installed else None)
     screen.draw_offscreen()
-    assert os.environ.get("MUJOCO_GL") == chosen
+    assert os.environ.get("MUJOCO_GL") == choice

@@ -45,16 +45,16 @@ class Everything(Settings):
     ids=str,
 )  # fmt: skip
 def test_values_that_are_taken(changed: dict[str, Any]) -> None:
-    (name, value), made = *changed.items(), Everything(**changed)
-    assert getattr(made, name) == value
+    (name, value), config = *changed.items(), Everything(**changed)
+    assert getattr(config, name) == value
     if name != "anything":
-        assert from_dict(Everything, to_dict(made), "here") == made
+        assert from_dict(Everything, to_dict(config), "here") == config
 
 
 @pytest.mark.parametrize("name", ["part", "speed", "far"])
 def test_whole_numbers_become_floats_where_floats_are_wanted(name: str) -> None:
-    for made in (Everything(**{name: 1}), from_dict(Everything, {name: 1}, "here")):
-        assert (getattr(made, name), type(getattr(made, name))) == (1.0, float)
+    for config in (Everything(**{name: 1}), from_dict(Everything, {name: 1}, "here")):
+        assert (getattr(config, name), type(getattr(config, name))) == (1.0, float)
     assert type(Everything(either=2).either) is int
     assert type(Everything(either=2.0).either) is float
 
@@ -173,14 +173,14 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("words", "said"), MISTAKES, ids=lambda value: " ".join(value))
-def test_mistakes(words: tuple[str, ...], said: tuple[str, ...]) -> None:
-    with pytest.raises(ConfigError) as caught:
+@pytest.mark.parametrize(("words", "parts"), MISTAKES, ids=lambda value: " ".join(value))
+def test_mistakes(words: tuple[str, ...], parts: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError) as error:
         parse(*words)
-    line = str(caught.value)
+    line = str(error.value)
     assert len(line.splitlines()) == 1
     assert not set(line) & set("│╭╮╰╯")
-    for part in said:
+    for part in parts:
         assert part in line
     assert "expected 0 or more" in line or line.endswith("(see try --help)")
 
@@ -189,10 +189,10 @@ def test_help_says_what_units_and_defaults(capsys: pytest.CaptureFixture[str]) -
     with pytest.raises(SystemExit) as end:
         parse("--help")
     assert end.value.code in (0, None)
-    said = capsys.readouterr()
-    assert said.err == ""
+    output = capsys.readouterr()
+    assert output.err == ""
     for part in ("usage: try", "A command.", "How fast [m/s]. (default: 0.5)", "How many. (default: 3)"):
-        assert part in said.out
+        assert part in output.out
 
 
 BUILT_IN = sorted(plugins.BUILT_IN["commands"])
@@ -221,23 +221,23 @@ def test_every_command_has_a_help(
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
     assert end.value.code in (0, None)
-    said = capsys.readouterr().out
-    assert f"usage: farm {command}" in said
-    assert max(len(line) for line in said.splitlines() if not line.startswith("usage")) <= 100
+    output = capsys.readouterr().out
+    assert f"usage: farm {command}" in output
+    assert max(len(line) for line in output.splitlines() if not line.startswith("usage")) <= 100
     if command in ("run", "learner"):
         for part in ("[rad]", "(default: 90)", "--traces {all,extremes,none}", "--task STR"):
-            assert part in said
+            assert part in output
     if command == "worker":
-        assert "[s]" in said
-        assert "--allow-file" in said
+        assert "[s]" in output
+        assert "--allow-file" in output
 
 
 def test_the_front_page(capsys: pytest.CaptureFixture[str]) -> None:
     for words in ([], ["--help"], ["help"]):
         assert main(words) == 0
-        said = capsys.readouterr().out
-        assert all(f"farm {name} " in said for name in COMMANDS)
-        assert max(map(len, said.splitlines())) <= 120
+        output = capsys.readouterr().out
+        assert all(f"farm {name} " in output for name in COMMANDS)
+        assert max(map(len, output.splitlines())) <= 120
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"rolloutfarm {farm.__version__}\n"
     assert main(["fly"]) == 2
@@ -264,10 +264,10 @@ def test_help_is_silent_on_what_need_not_be_given(
     monkeypatch.setenv("COLUMNS", str(width))
     with pytest.raises(SystemExit):
         arguments.parse(Everything, ["--help"], "farm try")
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for none in ("(default: None)", "(default: '')", "{None}|", "{None,"):
-        assert none not in said
-    assert "--limit INT" in said
-    assert "(default: 3)" in said
-    assert "{a,b}" in said
-    assert max(len(line) for line in said.splitlines()) <= width
+        assert none not in output
+    assert "--limit INT" in output
+    assert "(default: 3)" in output
+    assert "{a,b}" in output
+    assert max(len(line) for line in output.splitlines()) <= width

@@ -25,10 +25,10 @@ def file(tmp_path: Path) -> Path:
 @pytest.fixture
 def spec(file: Path) -> Spec:
     """What a learner says of a task in that file."""
-    drawn = specification(plugins.find("tasks", f"{file}:Pole").target())
-    constants = Direct.draw(FeaturesConfig(features=4), drawn, np.random.default_rng(0))
-    said = spec_of(file, "direct", task_config={"steps": 2}, policy_config={"features": 4}, constants=constants)
-    return codec.decode(codec.encode(said), Spec)
+    task_spec = specification(plugins.find("tasks", f"{file}:Pole").target())
+    constants = Direct.draw(FeaturesConfig(features=4), task_spec, np.random.default_rng(0))
+    message = spec_of(file, "direct", task_config={"steps": 2}, policy_config={"features": 4}, constants=constants)
+    return codec.decode(codec.encode(message), Spec)
 
 
 def test_it_is_built_as_it_is_specified(spec, file):
@@ -38,8 +38,8 @@ def test_it_is_built_as_it_is_specified(spec, file):
     heavier = task.sources["model.xml"].replace('mass="1"', 'mass="5"')
     other, _ = served(replace(spec, files={"model.xml": heavier}), (file,))
     assert (task.model.body_mass[1], other.model.body_mass[1]) == (1.0, 5.0), "the run's texts count"
-    made = [Runner(*served(spec, (file,))).run(np.ones(4), Jobs.mean("none", [None])) for _ in range(2)]
-    assert made[0].returns.tobytes() == made[1].returns.tobytes()
+    outcomes = [Runner(*served(spec, (file,))).run(np.ones(4), Jobs.mean("none", [None])) for _ in range(2)]
+    assert outcomes[0].returns.tobytes() == outcomes[1].returns.tobytes()
 
 
 def test_a_file_is_served_by_permission_only_and_only_if_it_is_the_same(spec, file, tmp_path):

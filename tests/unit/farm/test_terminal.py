@@ -54,10 +54,10 @@ def test_letters_stay() -> None:
 @pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
 def test_in_the_log(attack: str) -> None:
     record = logging.LogRecord("n", logging.INFO, "p", 1, "run %s", (f"{attack}{LETTERS}",), None)
-    said = logs.Formatter("%(message)s").format(record)
-    assert said.isprintable()
-    assert said.startswith("run ")
-    assert said.endswith(LETTERS)
+    text = logs.Formatter("%(message)s").format(record)
+    assert text.isprintable()
+    assert text.startswith("run ")
+    assert text.endswith(LETTERS)
 
 
 def test_in_a_traceback_of_the_log() -> None:
@@ -65,9 +65,9 @@ def test_in_a_traceback_of_the_log() -> None:
         raise ValueError("".join(ATTACKS.values()))
     except ValueError as error:
         record = logging.LogRecord("n", logging.ERROR, "p", 1, "failed", (), (ValueError, error, error.__traceback__))
-    said = logs.Formatter("%(message)s").format(record)
-    assert_harmless(said)
-    assert len(said.splitlines()) > 3
+    text = logs.Formatter("%(message)s").format(record)
+    assert_harmless(text)
+    assert len(text.splitlines()) > 3
 
 
 def test_every_handler_of_ours_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,18 +93,20 @@ def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
             )  # fmt: skip
             session.answer(keys.status("farm", f"r{i}"), lambda run=run: codec.encode(run))
         assert main(["status", "--connect", endpoint]) == 0
-    said = capsys.readouterr().out
-    assert_harmless(said)
-    assert all(f"{i}/1234" in said for i in range(len(attacks)))
-    assert all(f"r{name}" in said and f"w{name}/1" in said and f"{name} 3" in said for name in ("[bold]", "[/red]"))
+    output = capsys.readouterr().out
+    assert_harmless(output)
+    assert all(f"{i}/1234" in output for i in range(len(attacks)))
+    assert all(
+        f"r{name}" in output and f"w{name}/1" in output and f"{name} 3" in output for name in ("[bold]", "[/red]")
+    )
 
 
 @pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
 def test_in_lines_that_commands_say(attack: str, capsys: pytest.CaptureFixture[str]) -> None:
     logs.say(f"reward of {attack}{LETTERS}", "two\nlines")
-    said = capsys.readouterr().out
-    assert_harmless(said)
-    assert said.endswith(f"{LETTERS}\ntwo\nlines\n")
+    output = capsys.readouterr().out
+    assert_harmless(output)
+    assert output.endswith(f"{LETTERS}\ntwo\nlines\n")
 
 
 def test_in_rows_of_tables() -> None:
@@ -117,9 +119,9 @@ def test_at_the_front_door(capsys: pytest.CaptureFixture[str], monkeypatch: pyte
 
     monkeypatch.setattr(status, "main", fails)
     assert main(["status"]) == 1
-    said = capsys.readouterr().err
-    assert_harmless(said)
-    assert len(said.splitlines()) == 1
+    output = capsys.readouterr().err
+    assert_harmless(output)
+    assert len(output.splitlines()) == 1
 
 
 def shown(what: Group) -> str:

@@ -48,7 +48,7 @@ def test_the_same_rollouts_pass_and_make_the_same_file(tmp_path: Path, pole: str
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "line"),
     [
         ('damping="0.1"', 'damping="0.2"', r"rollout 0, control step 1: state/qpos\[0\] was .*; 3 of 3 rollouts"),
         ("0.2 if rng is None", "0.1 if rng is None", r"rollout 0, start: state/qpos\[0\] was 0\.2, is 0\.1; 1 of 3"),
@@ -59,10 +59,10 @@ def test_the_same_rollouts_pass_and_make_the_same_file(tmp_path: Path, pole: str
         ('return {"angle": sim.qpos}', 'return {"angle": sim.qpos, "b": sim.qvel}', "the arrays are .*state/b"),
     ],
 )
-def test_what_changed_is_named_with_its_first_step(tmp_path: Path, pole: str, old: str, new: str, said: str) -> None:
+def test_what_changed_is_named_with_its_first_step(tmp_path: Path, pole: str, old: str, new: str, line: str) -> None:
     same(pole, "linear", [None, 0, 1], tmp_path / "a.npz", update=True)
     changed(pole, old, new)
-    with pytest.raises(AssertionError, match=said):
+    with pytest.raises(AssertionError, match=line):
         same(pole, "linear", [None, 0, 1], tmp_path / "a.npz")
     same(pole, "linear", [None, 0, 1], tmp_path / "a.npz", update=True)
     same(pole, "linear", [None, 0, 1], tmp_path / "a.npz")
@@ -74,9 +74,9 @@ def test_a_learnt_policy_acts_as_it_did(tmp_path: Path, pole: str) -> None:
         pass
     policy = farm.load(tmp_path / "r")
     same(pole, policy, [0], tmp_path / "a.npz", update=True)
-    with np.load(tmp_path / "a.npz") as kept:
+    with np.load(tmp_path / "a.npz") as archive:
         [trial] = policy.runner.rollouts(policy.mu[None], [(4, 0, 0, 0)]).returns
-        assert kept["return"].tolist() == [trial]
+        assert archive["return"].tolist() == [trial]
     same(pole, policy, [0], tmp_path / "a.npz")
 
 
@@ -91,7 +91,7 @@ def test_another_release_is_named(tmp_path: Path, pole: str, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("starts", "policy", "said"),
+    ("starts", "policy", "line"),
     [
         ([], "linear", "there are no seeds"),
         ([-1], "linear", "seed '-1'; expected a whole number"),
@@ -100,9 +100,9 @@ def test_another_release_is_named(tmp_path: Path, pole: str, monkeypatch: pytest
         ([0], "linear", "no file .*none.npz: update=True"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path: Path, pole: str, starts: list[int], policy: object, said: str) -> None:
-    with pytest.raises(farm.ConfigError, match=said):
-        same(pole, policy, starts, tmp_path / "none.npz", update=not said.startswith("no file"))
+def test_bad_input_is_one_line(tmp_path: Path, pole: str, starts: list[int], policy: object, line: str) -> None:
+    with pytest.raises(farm.ConfigError, match=line):
+        same(pole, policy, starts, tmp_path / "none.npz", update=not line.startswith("no file"))
 
 
 def test_a_damaged_file_is_named(tmp_path: Path, pole: str) -> None:
@@ -118,23 +118,23 @@ def test_pytest_is_imported_by_the_plugin_alone() -> None:
 
 def plain_pytest(folder: Path, *words: str) -> tuple[int, str]:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
-    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
-    return ended.returncode, ended.stdout + ended.stderr
+    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    return process.returncode, process.stdout + process.stderr
 
 
 @pytest.mark.slow
 def test_a_plain_pytest_elsewhere_has_the_fixture(tmp_path: Path, pole: str) -> None:
     (tmp_path / "test_pole.py").write_text(TEST)
-    status, said = plain_pytest(tmp_path)
-    assert (status, "pytest --golden-update" in said) == (1, True)
+    status, output = plain_pytest(tmp_path)
+    assert (status, "pytest --golden-update" in output) == (1, True)
     assert plain_pytest(tmp_path, "--golden-update")[0] == 0
     assert (tmp_path / "kept/pole.npz").stat().st_size < 10_000
     assert plain_pytest(tmp_path)[0] == 0
     changed(pole, 'damping="0.1"', 'damping="0.2"')
-    status, said = plain_pytest(tmp_path)
+    status, output = plain_pytest(tmp_path)
     assert status == 1
-    assert re.search(r"rollout 0, control step 1: state/qpos\[0\] was", said)
-    assert "farm/testing.py" not in said, "the reader's own line is shown, not ours"
+    assert re.search(r"rollout 0, control step 1: state/qpos\[0\] was", output)
+    assert "farm/testing.py" not in output, "the reader's own line is shown, not ours"
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from workers import runners
 @pytest.fixture
 def real() -> Iterator[Stage]:
     """Whose workers simulate."""
-    Runner.go, Runner.made, Runner.ran = threading.Event(), [], []
+    Runner.go, Runner.builds, Runner.ran = threading.Event(), [], []
     Runner.go.set()
     endpoint = free_endpoint()
     with listen(endpoint, FARM) as session:

@@ -32,13 +32,13 @@ class Runner:
     """Simulates nothing; a rollout's return is the sum of its parameters."""
 
     go: ClassVar[threading.Event]
-    made: ClassVar[list[str]]
+    builds: ClassVar[list[str]]
     ran: ClassVar[list[str]]
 
     def __init__(self, name: str, policy: Any, make: Callable[..., Any], *, exact: bool) -> None:
         assert exact
         self.name, self.size = name, policy.size
-        self.made.append(name)
+        self.builds.append(name)
         assert callable(make)
 
     def run(
@@ -49,9 +49,9 @@ class Runner:
         if 13 in jobs.indices:
             raise ArithmeticError("thirteen")
         returns = jobs.theta(mu).sum(axis=1)
-        shown = np.zeros((len(returns) if traces == "all" else 0, 1, 2), "<f4")
+        trace = np.zeros((len(returns) if traces == "all" else 0, 1, 2), "<f4")
         flags, steps = np.zeros((len(returns), 4), bool), np.ones(len(returns), "<i8")
-        return Simulated(returns=returns, flags=flags, steps=steps, traces=shown, trajectories=())
+        return Simulated(returns=returns, flags=flags, steps=steps, traces=trace, trajectories=())
 
     def close(self) -> None:
         pass
@@ -69,8 +69,8 @@ def served(spec: Spec, files: tuple[Path, ...], contents: dict[str, bytes]) -> t
 class Learner:
     """One run as a learner shows it; says only what the test says."""
 
-    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING, there: Session | None = None) -> None:
-        """As long as the session `there` is open, workers see that it is there."""
+    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING, presence: Session | None = None) -> None:
+        """As long as the session `presence` is open, workers see that the learner is there."""
         self.session, self.run, self.asked = session, run, Counter[str]()
         self.spec = codec.encode(replace(spec, run=run))
         self.header = RoundHeader(
@@ -80,7 +80,7 @@ class Learner:
         session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
         session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))
         session.answer(keys.generation(FARM, run), lambda: self._say("generation", codec.encode(self.header)))
-        (there or session).token(keys.learner_token(FARM, run))
+        (presence or session).token(keys.learner_token(FARM, run))
 
     def _say(self, what: str, payload: bytes) -> bytes:
         self.asked[what] += 1
@@ -151,14 +151,14 @@ class Stage:
                 return want
 
     def results(self, *runs: str) -> Results:
-        _, said = self.next(*(f"result of {run}" for run in runs or ("r",)))
-        assert isinstance(said, Results)
-        return said
+        _, message = self.next(*(f"result of {run}" for run in runs or ("r",)))
+        assert isinstance(message, Results)
+        return message
 
     def failure(self) -> Failure:
-        _, said = self.next("result of r", kind=Failure)
-        assert isinstance(said, Failure)
-        return said
+        _, message = self.next("result of r", kind=Failure)
+        assert isinstance(message, Failure)
+        return message
 
     def let_go(self) -> None:
         """Ask the worker to leave, and wake it."""

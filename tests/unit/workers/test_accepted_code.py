@@ -51,7 +51,7 @@ class Author(Learner):
     """A learner of a run whose task is a class in a file; workers may ask it for the file."""
 
     def __init__(
-        self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None, there: Session | None = None
+        self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None, presence: Session | None = None
     ) -> None:
         self.source = file.read_bytes()
         spec = spec_of(file)
@@ -59,7 +59,7 @@ class Author(Learner):
             spec = replace(spec, code=spec.code | {"task": digest(file)})
         key = keys.code(FARM, run, digest(file))
         stage.session.answer(key, lambda: self._say("code", self.source if sends is None else sends))
-        super().__init__(stage.session, run, spec, there)
+        super().__init__(stage.session, run, spec, presence)
         self.header = replace(self.header, mu=np.ones(2), traces="none")
 
 
@@ -94,12 +94,12 @@ def test_it_is_fetched_once_and_run_elsewhere(
 ) -> None:
     caplog.set_level(logging.INFO)
     monkeypatch.setenv("A_SECRET", "s")
-    said = tmp_path / "said"
+    log = tmp_path / "said"
     spy = f"""
 import os, sys
 if sys.argv[0].endswith("runner_process.py"):
     bound, session = "NoNewPrivs:\\t1" in open("/proc/self/status").read(), "zenoh" in sys.modules
-    with open({str(said)!r}, "a") as file:
+    with open({str(log)!r}, "a") as file:
         print(os.getpid(), os.getcwd(), os.listdir(), bound, session, *os.environ, sep="|", file=file)
 print("noise")
 """
@@ -115,7 +115,7 @@ print("noise")
     [copy] = kept(file)
     assert copy.read_bytes() == file.read_bytes()
     assert copy.parents[1].stat().st_mode & 0o077 == 0
-    lines = [line.split("|") for line in said.read_text().splitlines()]
+    lines = [line.split("|") for line in log.read_text().splitlines()]
     assert len(lines) == 2, "one process for each run"
     for pid, folder, content, bound, session, *names in lines:
         assert int(pid) != os.getpid()
@@ -126,22 +126,22 @@ print("noise")
 
 
 def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, certs: Path, tmp_path: Path) -> None:
-    said = tmp_path / "said"
+    log = tmp_path / "said"
     spy = f"""
 import os, sys
 if sys.argv[0].endswith("runner_process.py"):
-    print(os.getpid(), file=open({str(said)!r}, "a"))
+    print(os.getpid(), file=open({str(log)!r}, "a"))
 """
-    with connect((safe.endpoint,), WAIT, lambda: False, find(certs, "learner")) as there:
-        author, worker = Author(safe, write(tmp_path, spy), there=there), hire(safe, certs)
+    with connect((safe.endpoint,), WAIT, lambda: False, find(certs, "learner")) as presence:
+        author, worker = Author(safe, write(tmp_path, spy), presence=presence), hire(safe, certs)
         author.send(worker.id, 0)
         safe.results()
-        first = int(said.read_text())
+        first = int(log.read_text())
         os.kill(first, signal.SIGKILL)
         until(lambda: not alive(first))
         author.send(worker.id, 1)
         assert indices(safe.results()) == [1], "its job is tried once more"
-        second = int(said.read_text().split()[-1])
+        second = int(log.read_text().split()[-1])
         assert second != first
     until(lambda: not Path(f"/proc/{second}").exists())
 
@@ -158,17 +158,17 @@ def test_what_does_not_fit_is_not_run(safe: Stage, certs: Path, tmp_path: Path, 
     file = write(tmp_path, f"# for {tmp_path} alone\n")
     author, worker = Author(safe, file, sends=sends), hire(safe, certs)
     author.send(worker.id, 0)
-    said = safe.failure()
-    assert (said.index, said.error) == (None, words)
+    failure = safe.failure()
+    assert (failure.index, failure.error) == (None, words)
     assert not kept(file)
 
 
 def test_a_worker_without_accept_code_fetches_none(safe: Stage, certs: Path, tmp_path: Path) -> None:
     author, worker = Author(safe, write(tmp_path)), safe.hire(tls=certs)
     author.send(worker.id, 0)
-    said = safe.failure()
-    assert said.index is None
-    assert "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls" in said.error
+    failure = safe.failure()
+    assert failure.index is None
+    assert "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls" in failure.error
     assert not author.asked["code"]
 
 
@@ -187,12 +187,12 @@ def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
     broken = write(tmp_path, guard + "def load():\n    import nowhere_to_be_found\nif here: load()\n", "broken.py")
     author, other, worker = Author(safe, broken), Author(safe, write(tmp_path), "other"), hire(safe, certs)
     author.send(worker.id, 0, 1)
-    said = safe.failure()
-    assert said.index is None
-    assert said.error == (
+    failure = safe.failure()
+    assert failure.index is None
+    assert failure.error == (
         "broken.py cannot be imported: line 4: ModuleNotFoundError: No module named 'nowhere_to_be_found'"
     )
-    assert said.traceback == (
+    assert failure.traceback == (
         '  File "broken.py", line 5, in <module>', "    if here: load()",
         '  File "broken.py", line 4, in load', "    import nowhere_to_be_found",
         "ModuleNotFoundError: No module named 'nowhere_to_be_found'",
@@ -208,13 +208,13 @@ def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Pa
     author, other = Author(safe, raises), Author(safe, write(tmp_path, guard), "other")
     worker = hire(safe, certs)
     author.send(worker.id, 3)
-    said = safe.failure()
-    assert (said.index, said.error) == (3, "ZeroDivisionError: division by zero")
-    assert said.traceback[0].startswith('  File "raises.py", line 11, in reward')
+    failure = safe.failure()
+    assert (failure.index, failure.error) == (3, "ZeroDivisionError: division by zero")
+    assert failure.traceback[0].startswith('  File "raises.py", line 11, in reward')
     other.send(worker.id, 0)
-    _, said = safe.next("result of other", kind=type(said))
-    assert said.index is None, "the task cannot be built here"  # type: ignore[attr-defined]
-    assert said.error.endswith("files beside a class do not travel, but those that its xml names do")  # type: ignore[attr-defined]
+    _, failure = safe.next("result of other", kind=type(failure))
+    assert failure.index is None, "the task cannot be built here"  # type: ignore[attr-defined]
+    assert failure.error.endswith("files beside a class do not travel, but those that its xml names do")  # type: ignore[attr-defined]
 
 
 def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,8 +223,8 @@ def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monk
     hangs.write_text(POLE.replace("return np", "while sim.t > 1: pass\n        return np"))
     author, worker = Author(safe, hangs), hire(safe, certs)
     author.send(worker.id, 0)
-    said = safe.failure()
-    assert (said.index, said.error) == (None, "its code did not answer within 0.2 s and was stopped")
+    failure = safe.failure()
+    assert (failure.index, failure.error) == (None, "its code did not answer within 0.2 s and was stopped")
 
 
 def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: Path) -> None:
@@ -239,8 +239,8 @@ if sys.argv[0].endswith("runner_process.py"):
     author, other = Author(safe, write(tmp_path, forged, "forged.py")), Author(safe, write(tmp_path), "other")
     worker = hire(safe, certs)
     author.send(worker.id, 0)
-    said = safe.failure()
-    assert said.error.startswith("the process that runs its code ended")
+    failure = safe.failure()
+    assert failure.error.startswith("the process that runs its code ended")
     other.send(worker.id, 0)
     assert indices(safe.results("other")) == [0]
 
@@ -274,16 +274,16 @@ def test_what_a_killed_worker_left_is_deleted_at_the_next_start(
         try:
             assert killed.stdout
             assert working.stdout
-            left, held = (Path(process.stdout.readline().strip()).parent for process in (killed, working))
+            orphan, folder = (Path(process.stdout.readline().strip()).parent for process in (killed, working))
             killed.kill()
             killed.wait()
-            assert left.is_dir()
+            assert orphan.is_dir()
             with closing(SourceCache()) as cache:
                 assert cache.empty.is_dir()
-                assert not left.exists()
-                assert held.is_dir(), "its worker is alive"
+                assert not orphan.exists()
+                assert folder.is_dir(), "its worker is alive"
                 assert other.is_symlink(), "no worker made it"
         finally:
             killed.kill()
             working.kill()
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["elsewhere", other.name, held.name])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["elsewhere", other.name, folder.name])

@@ -33,9 +33,9 @@ def test_processes_are_told_everything(changed: dict[str, object], tmp_path: Pat
     for path in files:
         path.touch()
     config = WorkerConfig(**(changed | ({"allow_file": files} if files else {})))  # type: ignore[arg-type]
-    told = passed_on(config)
-    assert told.worker == config
-    assert told.log_level == "WARNING"
+    arguments = passed_on(config)
+    assert arguments.worker == config
+    assert arguments.log_level == "WARNING"
 
 
 def test_no_setting_is_left_out(tmp_path: Path) -> None:

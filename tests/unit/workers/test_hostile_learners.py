@@ -48,8 +48,8 @@ def test_messages_it_cannot_read(
     learner.announce()
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]
-    said = f"schema version {codec.SCHEMA + 1}, this side has {codec.SCHEMA}"
-    until(lambda: sum(said in line for line in caplog.messages) == 2)
+    warning = f"schema version {codec.SCHEMA + 1}, this side has {codec.SCHEMA}"
+    until(lambda: sum(warning in line for line in caplog.messages) == 2)
 
 
 def test_a_header_that_comes_late_voids_nothing(stage: Stage) -> None:
@@ -81,8 +81,8 @@ def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) 
     stage.asked(lambda want: "another-19" in want.idle)
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1], "what was crowded out is asked for again"
-    kept = [worker.inbox.of(run).header for run in worker.inbox.runs]
-    assert sum(header.mu.nbytes for header in kept if header) <= 10_000
+    headers = [worker.inbox.of(run).header for run in worker.inbox.runs]
+    assert sum(header.mu.nbytes for header in headers if header) <= 10_000
     stage.asked(lambda want: want.ignored == {"large": 14})
 
 
@@ -106,7 +106,7 @@ def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog
     learner.spec = learner.spec[:-1]
     learner.send(worker.id, 1)
     assert indices(stage.results()) == [1]
-    assert Runner.made == ["r"]
+    assert Runner.builds == ["r"]
 
 
 def test_a_false_header_does_not_stall_other_runs(stage: Stage) -> None:
@@ -139,10 +139,10 @@ def test_jobs_of_a_round_that_no_learner_confirms_are_told_of(
 
 def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage) -> None:
     over = threading.Event()
-    asked: list[str] = []
+    questions: list[str] = []
 
     def deaf(run: str) -> bytes:
-        asked.append(run)
+        questions.append(run)
         over.wait(WAIT)
         return b""
 
@@ -155,12 +155,12 @@ def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage) -> N
         for i in range(30):
             learner.send(worker.id, 0, run=f"made-up-{i}")
         learner.send(worker.id, 1)
-        begun = time.monotonic()
+        start = time.monotonic()
         assert indices(stage.results()) == [1]
-        assert time.monotonic() - begun < 2.0, "thirty questions were waited for"
+        assert time.monotonic() - start < 2.0, "thirty questions were waited for"
         stage.asked(lambda want: want.ignored == {"stale": 30})
         over.set()
-    assert len(asked) < 5
+    assert len(questions) < 5
 
 
 def test_no_more_jobs_are_kept_than_were_asked_for(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,11 +51,11 @@ def test_idle_runs_are_told_of_again_after_the_same_time() -> None:
     box.begin(header("a"))
     box.begin(header("b"))
     box.put(chunk("b"))
-    begun = box.of("a").busy
-    assert box.idle(begun + 0.5, 1.0) == ()
-    assert box.idle(begun + 1.5, 1.0) == ("a",)
-    assert box.idle(begun + 2.0, 1.0) == ()
-    assert box.idle(begun + 2.5, 1.0) == ("a",)
+    start = box.of("a").busy
+    assert box.idle(start + 0.5, 1.0) == ()
+    assert box.idle(start + 1.5, 1.0) == ("a",)
+    assert box.idle(start + 2.0, 1.0) == ()
+    assert box.idle(start + 2.5, 1.0) == ("a",)
 
 
 def test_no_more_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,8 +74,8 @@ def test_no_more_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_run_that_left_and_names_that_are_none() -> None:
     box = Inbox(1)
     box.begin(header("a"))
-    gone = box.left("a")
-    assert gone is not None
-    assert (gone.run, box.left("a"), box.runs) == ("a", None, ())
+    entry = box.left("a")
+    assert entry is not None
+    assert (entry.run, box.left("a"), box.runs) == ("a", None, ())
     with pytest.raises(MessageError, match="is not a name"):
         box.of("*")

@@ -55,18 +55,18 @@ class Kicked(Task):
 @pytest.fixture(scope="module")
 def runners() -> tuple[Runner, Runner]:
     """Of one task, on the processor and in Warp."""
-    made = make_backend("warp")
-    assert not is_exact(made)
+    backend = make_backend("warp")
+    assert not is_exact(backend)
     task = Kicked(TaskConfig())
     policy = Linear(Linear.Config(), specification(task), {})
-    return Runner(task, policy), Runner(task, policy, made.engine, exact=False)
+    return Runner(task, policy), Runner(task, policy, backend.engine, exact=False)
 
 
 def jobs(policy: Linear) -> Jobs:
     """Three pairs, and the mean, shown."""
     eps = 0.3 * np.random.default_rng(0).standard_normal((3, policy.size))
-    drawn = [seeds.trial(0, i) for i in range(3)]
-    return Jobs.joined([Jobs.exploring(eps, (1, -1), drawn), Jobs.mean("control", [None])])
+    trials = [seeds.trial(0, i) for i in range(3)]
+    return Jobs.joined([Jobs.exploring(eps, (1, -1), trials), Jobs.mean("control", [None])])
 
 
 class Either(Kicked):
@@ -89,55 +89,55 @@ def test_several_models_in_one_batch_are_mujocos_to_single_precision() -> None:
     policy = Linear(Linear.Config(), specification(task), {})
     cpu, gpu = Runner(task, policy), Runner(task, policy, make_backend("warp").engine, exact=False)
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
-    drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
-    expected, found = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)
+    trials = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    expected, rollouts = cpu.rollouts(theta, trials), gpu.rollouts(theta, trials)
     assert set(expected.which) == {0, 1}
-    np.testing.assert_array_equal(found.which, expected.which)
-    np.testing.assert_allclose(found.returns, expected.returns, atol=2e-4)
+    np.testing.assert_array_equal(rollouts.which, expected.which)
+    np.testing.assert_allclose(rollouts.returns, expected.returns, atol=2e-4)
 
 
 def test_returns_are_mujocos_to_single_precision(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
-    drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
-    expected, got = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)
-    assert np.allclose(got.start["qpos"], expected.start["qpos"], atol=1e-6)
-    assert not np.array_equal(got.returns, expected.returns), "it was Warp that simulated"
-    np.testing.assert_allclose(got.returns, expected.returns, rtol=1e-3)
-    np.testing.assert_allclose(got.frames["qpos"], expected.frames["qpos"], atol=1e-4)
+    trials = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    expected, rollouts = cpu.rollouts(theta, trials), gpu.rollouts(theta, trials)
+    assert np.allclose(rollouts.start["qpos"], expected.start["qpos"], atol=1e-6)
+    assert not np.array_equal(rollouts.returns, expected.returns), "it was Warp that simulated"
+    np.testing.assert_allclose(rollouts.returns, expected.returns, rtol=1e-3)
+    np.testing.assert_allclose(rollouts.frames["qpos"], expected.frames["qpos"], atol=1e-4)
 
 
 def test_a_rollouts_numbers_do_not_depend_on_the_others(runners: tuple[Runner, Runner]) -> None:
     _, gpu = runners
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, gpu.size))
-    drawn = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
-    together, order = gpu.rollouts(theta, drawn), np.random.default_rng(1).permutation(ROWS)
-    permuted = gpu.rollouts(theta[order], [drawn[i] for i in order])
-    alone = gpu.rollouts(theta[2:3], [drawn[2]])
+    trials = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    together, order = gpu.rollouts(theta, trials), np.random.default_rng(1).permutation(ROWS)
+    permuted = gpu.rollouts(theta[order], [trials[i] for i in order])
+    alone = gpu.rollouts(theta[2:3], [trials[2]])
     assert np.array_equal(permuted.returns, together.returns[order])
     assert np.array_equal(alone.frames["qpos"][0], together.frames["qpos"][2])
 
 
 def test_a_policy_with_memory_acts_alike(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
-    drawn = [seeds.trial(0, i) for i in range(ROWS)]
+    trials = [seeds.trial(0, i) for i in range(ROWS)]
     for policy in (Rnn(Rnn.Config(units=3), cpu.spec, {}), Cpg(Cpg.Config(frequency=3.0), cpu.spec, {})):
         theta = 0.5 * np.random.default_rng(0).standard_normal((ROWS, policy.size))
         with pytest.MonkeyPatch.context() as patched:
             for each in runners:
                 patched.setattr(each, "policy", policy)
-            expected, got = cpu.rollouts(theta, drawn), gpu.rollouts(theta, drawn)
-        np.testing.assert_allclose(got.actions, expected.actions, atol=1e-3)
-        assert np.ptp(got.actions, axis=1).min() > 1e-3
+            expected, rollouts = cpu.rollouts(theta, trials), gpu.rollouts(theta, trials)
+        np.testing.assert_allclose(rollouts.actions, expected.actions, atol=1e-3)
+        assert np.ptp(rollouts.actions, axis=1).min() > 1e-3
 
 
 def test_the_mean_and_what_is_shown_are_the_processors(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
-    asked, mu = jobs(cpu.policy), np.full(cpu.size, 0.1)  # type: ignore[arg-type]
-    expected, got = cpu.run(mu, asked), gpu.run(mu, asked)
-    assert got.returns[-1] == expected.returns[-1]
-    assert np.array_equal(got.trajectories[0].bodies, expected.trajectories[0].bodies)
-    assert (got.returns[:-1] != expected.returns[:-1]).any()
+    work, mu = jobs(cpu.policy), np.full(cpu.size, 0.1)  # type: ignore[arg-type]
+    expected, outcome = cpu.run(mu, work), gpu.run(mu, work)
+    assert outcome.returns[-1] == expected.returns[-1]
+    assert np.array_equal(outcome.trajectories[0].bodies, expected.trajectories[0].bodies)
+    assert (outcome.returns[:-1] != expected.returns[:-1]).any()
 
 
 def test_too_little_room_is_noticed_and_doubled(

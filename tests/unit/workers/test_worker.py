@@ -49,7 +49,7 @@ def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
         assert indices(answer) == [first, first + 1]
         assert answer.returns.tolist() == [3.0 + 3 * first, 6.0 + 3 * first]
     assert learner.asked == {"generation": 1, "spec": 1}
-    assert Runner.made == ["r"]
+    assert Runner.builds == ["r"]
 
 
 def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
@@ -59,7 +59,7 @@ def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
     learner.send(worker.id, 3)
     until(lambda: stage.queued == 4)
     Runner.go.set()
-    assert [(indices(said), said.round) for said in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
+    assert [(indices(results), results.round) for results in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
 
 
 def test_two_runs_in_turn(stage: Stage) -> None:
@@ -70,21 +70,21 @@ def test_two_runs_in_turn(stage: Stage) -> None:
     Runner.go.clear()
     learners[0].send(worker.id, 0)
     until(lambda: Runner.ran)
-    for learner, sent in zip(learners, ((1, 2), (0, 1, 2)), strict=True):
-        for index in sent:
+    for learner, numbers in zip(learners, ((1, 2), (0, 1, 2)), strict=True):
+        for index in numbers:
             learner.send(worker.id, index)
     until(lambda: stage.queued == 5)
     Runner.go.set()
     answers = [stage.results("a", "b") for _ in range(6)]
     assert Runner.ran == ["a", "b", "a", "b", "a", "b"]
-    assert [indices(said) for said in answers if said.run == "b"] == [[0], [1], [2]]
-    assert Runner.made == ["a", "b"]
+    assert [indices(answer) for answer in answers if answer.run == "b"] == [[0], [1], [2]]
+    assert Runner.builds == ["a", "b"]
 
 
 def test_a_learner_that_leaves_takes_its_work_along(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "IDLE", 0.05)
-    with connect((stage.endpoint,), WAIT, lambda: False) as there:
-        learner = Learner(stage.session, "r", there=there)
+    with connect((stage.endpoint,), WAIT, lambda: False) as presence:
+        learner = Learner(stage.session, "r", presence=presence)
         worker = stage.hire()
         learner.send(worker.id, 0)
         stage.results()
@@ -96,8 +96,8 @@ def test_an_idle_worker_says_so(stage: Stage, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(workers, "IDLE", 0.05)
     Learner(stage.session, "r")
     stage.hire()
-    said = [stage.next("want")[1] for _ in range(3)]
-    assert [want.idle for want in said if isinstance(want, WorkRequest)] == [(), ("r",), ("r",)]
+    messages = [stage.next("want")[1] for _ in range(3)]
+    assert [want.idle for want in messages if isinstance(want, WorkRequest)] == [(), ("r",), ("r",)]
 
 
 def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
@@ -108,10 +108,10 @@ def test_what_got_lost_of_one_run_is_noticed_while_another_keeps_it_busy(
     worker = stage.hire()
     busy.send(worker.id, 0)
     while True:
-        _, said = stage.next("result of busy", "want")
-        if isinstance(said, Results):
+        _, message = stage.next("result of busy", "want")
+        if isinstance(message, Results):
             busy.send(worker.id, 0)
-        elif isinstance(said, WorkRequest) and "lost" in said.idle:
+        elif isinstance(message, WorkRequest) and "lost" in message.idle:
             break
 
 
@@ -120,13 +120,13 @@ def test_a_worker_that_leaves_hands_back(stage: Stage) -> None:
     until(lambda: stage.queued == 2)
     stage.let_go()
     Runner.go.set()
-    said: list[object] = []
-    while len(said) < 2:
+    messages: list[object] = []
+    while len(messages) < 2:
         _, message = stage.next("result of r", "want")
         if not isinstance(message, WorkRequest) or message.credits == 0:
-            said.append(message)
-    said.sort(key=lambda message: isinstance(message, WorkRequest))
-    done, want = said
+            messages.append(message)
+    messages.sort(key=lambda message: isinstance(message, WorkRequest))
+    done, want = messages
     assert isinstance(done, Results)
     assert isinstance(want, WorkRequest)
     assert indices(done) == [0], "what it has begun is done"
@@ -138,9 +138,9 @@ def test_a_task_it_does_not_know(stage: Stage, caplog: pytest.LogCaptureFixture)
     worker = stage.hire()
     for _ in range(2):
         learner.send(worker.id, 4, 5)
-        said = stage.failure()
-        assert said.index is None, "it is not the job"
-        assert said.error == "not here"
+        failure = stage.failure()
+        assert failure.index is None, "it is not the job"
+        assert failure.error == "not here"
     assert caplog.messages == ["cannot serve run r: not here"]
     assert caplog.records[0].exc_info in (None, False)
     assert learner.asked["spec"] == 1
@@ -151,9 +151,9 @@ def test_a_task_it_cannot_build(stage: Stage, caplog: pytest.LogCaptureFixture) 
     worker = stage.hire()
     for _ in range(2):
         learner.send(worker.id, 0, 1)
-        said = stage.failure()
-        assert said.index is None, "it is not the job"
-        assert said.error == "RuntimeError: no such machine"
+        failure = stage.failure()
+        assert failure.index is None, "it is not the job"
+        assert failure.error == "RuntimeError: no such machine"
     assert learner.asked["spec"] == 1
     assert caplog.messages[0].startswith("cannot serve run r: no such")
     assert caplog.records[0].exc_info is None, "its learner shows the traceback"
@@ -222,9 +222,9 @@ def test_a_class_in_another_file_is_refused(real: Stage, file: Path) -> None:
     learner = Learner(real.session, "r", spec_of(file))
     worker = real.hire()
     learner.send(worker.id, 0)
-    said = real.failure()
-    assert said.index is None
-    assert said.error.startswith("pole.py is a file on the learner's machine: copy it here")
+    failure = real.failure()
+    assert failure.index is None
+    assert failure.error.startswith("pole.py is a file on the learner's machine: copy it here")
 
 
 def test_settings_that_make_no_sense() -> None:

@@ -47,10 +47,10 @@ def test_a_waiting_thread_is_woken() -> None:
 
 def test_a_signal_near_the_end_does_not_make_it_wait_for_ever() -> None:
     """A handler that outlasts the time is what SimpleQueue.get does not survive."""
-    events, told = Events(), threading.Event()
+    events, delivery = Events(), threading.Event()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        told.set()
+        delivery.set()
         time.sleep(0.1)
 
     rescue = threading.Timer(10.0, events.put, [event(1)])
@@ -62,4 +62,4 @@ def test_a_signal_near_the_end_does_not_make_it_wait_for_ever() -> None:
     finally:
         signal.signal(signal.SIGALRM, before)
         rescue.cancel()
-    assert told.is_set()
+    assert delivery.is_set()

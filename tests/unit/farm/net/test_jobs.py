@@ -31,26 +31,26 @@ def test_jobs_without_eps_and_of_one_sign():
     assert means_first.theta(mu)[[0, 1, 4]].tobytes() == np.array([mu, mu + eps[0], mu - eps[1]]).tobytes()
 
 
-@pytest.mark.parametrize("chosen", [[0], [3], [5], [1, 2], [3, 4], [0, 1, 2, 3, 4, 5], [0, 2], [5, 1], [4, 1, 5, 0]])
-def test_some_jobs_are_the_same_jobs(chosen):
-    mu, some = RNG.normal(size=P), JOBS.take(chosen)
+@pytest.mark.parametrize("indices", [[0], [3], [5], [1, 2], [3, 4], [0, 1, 2, 3, 4, 5], [0, 2], [5, 1], [4, 1, 5, 0]])
+def test_some_jobs_are_the_same_jobs(indices):
+    mu, subset = RNG.normal(size=P), JOBS.take(indices)
     starts = np.cumsum(JOBS.rollouts) - JOBS.rollouts
-    rows = [row for job in chosen for row in range(starts[job], starts[job] + JOBS.rollouts[job])]
-    assert some.indices.tolist() == chosen
-    assert some.theta(mu).tobytes() == JOBS.theta(mu)[rows].tobytes()
-    assert some.seeds() == [JOBS.seeds()[row] for row in rows]
-    Chunk.carrying(some, **HEAD)
-    back = codec.decode(codec.encode(Chunk.carrying(some, **HEAD)), Chunk).take(range(len(chosen)))
-    assert back.theta(mu).tobytes() == some.theta(mu).tobytes()
+    rows = [row for job in indices for row in range(starts[job], starts[job] + JOBS.rollouts[job])]
+    assert subset.indices.tolist() == indices
+    assert subset.theta(mu).tobytes() == JOBS.theta(mu)[rows].tobytes()
+    assert subset.seeds() == [JOBS.seeds()[row] for row in rows]
+    Chunk.carrying(subset, **HEAD)
+    back = codec.decode(codec.encode(Chunk.carrying(subset, **HEAD)), Chunk).take(range(len(indices)))
+    assert back.theta(mu).tobytes() == subset.theta(mu).tobytes()
 
 
 def test_results_carry_the_jobs_indices():
-    given_ = Simulated(
+    outcome = Simulated(
         returns=np.arange(3.0), flags=np.zeros((3, 4), bool), steps=np.ones(3, "<i8"),
         traces=np.zeros((0, 0, 0), "<f4"), trajectories=(WIRE,),
     )  # fmt: skip
-    made = Results.carrying(given_, JOBS.take([1, 3]), 0.5, **HEAD, worker="w/1")
-    assert codec.decode(codec.encode(made), Results).jobs.tolist() == [1, 3]
+    results = Results.carrying(outcome, JOBS.take([1, 3]), 0.5, **HEAD, worker="w/1")
+    assert codec.decode(codec.encode(results), Results).jobs.tolist() == [1, 3]
 
 
 @pytest.mark.parametrize(

@@ -49,27 +49,27 @@ def test_a_good_certificate_gets_through(learner: str, certs: Path) -> None:
 def test_a_closed_port(certs: Path) -> None:
     endpoint = tls()
     for bundle in (None, find(certs / "own", "worker", "w1")):
-        said = probe.reason(endpoint, bundle)
-        assert said == (
+        reason = probe.reason(endpoint, bundle)
+        assert reason == (
             f"nothing listens on port {endpoint.rpartition(':')[2]} of 127.0.0.1; start a learner there, "
             "or check --connect"
         )
 
 
 def test_a_name_of_no_host() -> None:
-    said = probe.reason("tcp/no-such-host.invalid:7447")
-    assert said == "the host name no-such-host.invalid is unknown here; check --connect"
+    reason = probe.reason("tcp/no-such-host.invalid:7447")
+    assert reason == "the host name no-such-host.invalid is unknown here; check --connect"
 
 
 def test_an_authority_of_others(learner: str, certs: Path) -> None:
-    said = probe.reason(learner, find(certs / "foreign", "worker", "w1"))
-    assert said.startswith(f"its certificate is of another authority than {certs}/foreign/worker-w1/ca.pem")
+    reason = probe.reason(learner, find(certs / "foreign", "worker", "w1"))
+    assert reason.startswith(f"its certificate is of another authority than {certs}/foreign/worker-w1/ca.pem")
 
 
 def test_a_host_name_that_is_not_in_the_certificate(learner: str, certs: Path) -> None:
-    said = probe.reason(learner.replace("127.0.0.1", "localhost"), find(certs / "own", "worker", "w1"))
-    assert said.startswith("its certificate is not for the host name localhost")
-    assert "farm certificates renew CERTS --learner localhost" in said
+    reason = probe.reason(learner.replace("127.0.0.1", "localhost"), find(certs / "own", "worker", "w1"))
+    assert reason.startswith("its certificate is not for the host name localhost")
+    assert "farm certificates renew CERTS --learner localhost" in reason
 
 
 def test_our_certificate_is_refused(learner: str, certs: Path) -> None:
@@ -79,10 +79,10 @@ def test_our_certificate_is_refused(learner: str, certs: Path) -> None:
         mixed.mkdir()
         for source, name in (("own", "ca.pem"), ("foreign", "cert.pem"), ("foreign", "key.pem")):
             (mixed / name).write_bytes((certs / source / "worker-w1" / name).read_bytes())
-    said = probe.reason(learner, Bundle(mixed, "worker", "w1"))
-    assert said.startswith(f"it refuses the certificate of worker w1 in {mixed}")
-    said = probe.reason(learner, Bundle(certs / "own" / "worker-old", "worker", "old"))
-    assert said.startswith(f"it refuses the certificate of worker old in {certs}/own/worker-old: expired")
+    reason = probe.reason(learner, Bundle(mixed, "worker", "w1"))
+    assert reason.startswith(f"it refuses the certificate of worker w1 in {mixed}")
+    reason = probe.reason(learner, Bundle(certs / "own" / "worker-old", "worker", "old"))
+    assert reason.startswith(f"it refuses the certificate of worker old in {certs}/own/worker-old: expired")
 
 
 def test_a_listener_with_an_expired_certificate_or_a_workers(certs: Path) -> None:
@@ -96,8 +96,8 @@ def test_a_listener_with_an_expired_certificate_or_a_workers(certs: Path) -> Non
 def test_something_that_speaks_no_tls(certs: Path) -> None:
     endpoint = free_endpoint()
     with listen(endpoint, "farm"):
-        said = probe.reason(endpoint.replace("tcp/", "tls/"), find(certs / "own", "worker", "w1"))
-    assert said == "what listens there does not speak TLS; check --connect, and start the learner with --tls"
+        reason = probe.reason(endpoint.replace("tcp/", "tls/"), find(certs / "own", "worker", "w1"))
+    assert reason == "what listens there does not speak TLS; check --connect, and start the learner with --tls"
 
 
 def test_the_reason_is_in_the_message(learner: str, certs: Path) -> None:
@@ -127,10 +127,12 @@ def test_an_expired_bundle_is_named_at_once(certs: Path) -> None:
 
 
 def test_a_bundle_of_another_role_says_how_to_get_one(certs: Path) -> None:
-    own = certs / "own"
+    folder = certs / "own"
     remedy = "farm certificates add CERTS --viewer NAME makes one, in CERTS/viewer-NAME"
     for role in ("learner", "worker-w1"):
         with pytest.raises(ConfigError, match=f"a viewer's is needed here: {remedy}"):
-            find(own / role, "viewer")
-    with pytest.raises(ConfigError, match=f"{own} holds no viewer's certificate: farm certificates add {own} --viewer"):
-        find(own, "viewer")
+            find(folder / role, "viewer")
+    with pytest.raises(
+        ConfigError, match=f"{folder} holds no viewer's certificate: farm certificates add {folder} --viewer"
+    ):
+        find(folder, "viewer")

@@ -120,9 +120,9 @@ def test_values_that_make_no_sense_are_refused(name, change):
 
 @pytest.mark.parametrize(("name", "field"), [("refusal", "reason"), ("results", "worker"), ("spec", "task")])
 def test_texts_have_an_end(name, field):
-    said = dataclasses.replace(MESSAGES[name], **{field: "x" * 1001})
+    message = dataclasses.replace(MESSAGES[name], **{field: "x" * 1001})
     with pytest.raises(MessageError, match=r"a text of 1001 characters, at most 1000 are taken"):
-        codec.decode(codec.encode(said), type(said))
+        codec.decode(codec.encode(message), type(message))
 
 
 @pytest.mark.parametrize(

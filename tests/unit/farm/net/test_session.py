@@ -23,15 +23,15 @@ def test_many_tokens_are_all_found() -> None:
     with listen(endpoint, "f") as router, connect((endpoint,), 10, lambda: False) as worker:
         for i in range(MANY):
             worker.token(keys.worker_token("f", f"w/{i}"))
-        seen: dict[Session, list[str]] = {}
+        tokens: dict[Session, list[str]] = {}
 
         def look() -> None:
             for side in (router, worker):
-                while len(seen.get(side, ())) < MANY:
-                    seen[side] = side.tokens(keys.worker_token("f", "**"), 1.0)
+                while len(tokens.get(side, ())) < MANY:
+                    tokens[side] = side.tokens(keys.worker_token("f", "**"), 1.0)
 
-        assert within(30, look), f"it waits for ever, or finds {[len(found) for found in seen.values()]}"
-        assert all(len(set(found)) == MANY for found in seen.values())
+        assert within(30, look), f"it waits for ever, or finds {[len(names) for names in tokens.values()]}"
+        assert all(len(set(names)) == MANY for names in tokens.values())
 
 
 def test_connections_that_say_nothing_keep_nobody_out() -> None:

@@ -25,19 +25,19 @@ def test_a_silenced_connection_receives_nothing_and_stays_open(family: int, host
             near.append(stack.enter_context(socket.create_connection((host, listener.getsockname()[1]))))
             far.append(stack.enter_context(listener.accept()[0]))
         silence({f"{name}:{near[0].getsockname()[1]}"})
-        for own in near:
-            own.sendall(b"hello")
+        for client in near:
+            client.sendall(b"hello")
         assert far[1].recv(5) == b"hello"
         far[0].settimeout(0.2)
         with pytest.raises(TimeoutError):
             far[0].recv(5)
-        sent = secrets.token_bytes(10_000_000)  # more than any buffer, so that near has to acknowledge it
-        sending = threading.Thread(target=far[0].sendall, args=(sent,), daemon=True)
+        payload = secrets.token_bytes(10_000_000)  # more than any buffer, so that near has to acknowledge it
+        sending = threading.Thread(target=far[0].sendall, args=(payload,), daemon=True)
         far[0].settimeout(10.0)
         sending.start()
         near[0].settimeout(10.0)
         got = bytearray()
-        while len(got) < len(sent):
+        while len(got) < len(payload):
             got += near[0].recv(1_000_000)
         sending.join(10.0)
-        assert got == sent
+        assert got == payload

@@ -16,16 +16,16 @@ STORED = (
 
 
 def test_a_stored_line_is_read_back() -> None:
-    read = GenerationStats.from_dict(json.loads(STORED))
-    assert json.dumps(read.to_dict()) == STORED
-    assert (read.generation, read.best, read.mean_policy_success, read.seconds) == (2, -4.25, False, 6.5)
+    stats = GenerationStats.from_dict(json.loads(STORED))
+    assert json.dumps(stats.to_dict()) == STORED
+    assert (stats.generation, stats.best, stats.mean_policy_success, stats.seconds) == (2, -4.25, False, 6.5)
 
 
 def test_what_a_task_or_an_algorithm_does_not_know_is_none() -> None:
     unknown = dict.fromkeys(("baseline", "mean_policy_success", "success_rate"))
-    read = GenerationStats.from_dict({**json.loads(STORED), **unknown})
-    assert (read.baseline, read.mean_policy_success, read.success_rate) == (None, None, None)
-    assert GenerationStats.from_dict(read.to_dict()) == read
+    stats = GenerationStats.from_dict({**json.loads(STORED), **unknown})
+    assert (stats.baseline, stats.mean_policy_success, stats.success_rate) == (None, None, None)
+    assert GenerationStats.from_dict(stats.to_dict()) == stats
 
 
 def test_further_fields_do_no_harm() -> None:

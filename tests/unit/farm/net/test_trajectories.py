@@ -11,13 +11,13 @@ from farm.sim.trajectory import Trajectory
 
 
 def test_a_trajectory_comes_back_to_single_precision():
-    sent = trajectory()
-    back = codec.decode(codec.encode(sent), Trajectory)
-    assert (back.value, back.success, back.times.tolist()) == (sent.value, sent.success, sent.times.tolist())
-    assert list(back.arrays()) == list(sent.arrays())
+    source = trajectory()
+    back = codec.decode(codec.encode(source), Trajectory)
+    assert (back.value, back.success, back.times.tolist()) == (source.value, source.success, source.times.tolist())
+    assert list(back.arrays()) == list(source.arrays())
     for name, values in back.arrays().items():
         assert values.dtype == np.float32
-        np.testing.assert_array_equal(sent.arrays()[name], values)
+        np.testing.assert_array_equal(source.arrays()[name], values)
 
 
 @pytest.mark.parametrize("bad", [np.inf, -np.inf, 1e300, -1e300, np.nan])
@@ -26,9 +26,9 @@ def test_a_trajectory_of_overflowing_numbers_can_be_sent(bad):
     values[2, 1] = bad
     payload = codec.encode(trajectory(terms=values, channels={"force": values}))
     back = codec.decode(payload, Trajectory)
-    for shown in (back.terms, back.channels["force"]):
-        assert shown[2, 1] == np.float32(1e30 if bad > 0 else -1e30)
-        assert not shown[:2].any()
+    for array in (back.terms, back.channels["force"]):
+        assert array[2, 1] == np.float32(1e30 if bad > 0 else -1e30)
+        assert not array[:2].any()
 
 
 @pytest.mark.parametrize(

@@ -23,10 +23,10 @@ def test_the_table_says_what_is_there() -> None:
 
 @pytest.mark.parametrize("name", MESSAGES)
 def test_our_codec_writes_and_reads_them(name: str) -> None:
-    _, said = MESSAGES[name]
+    _, message = MESSAGES[name]
     payload = (FOLDER / f"{name}.bin").read_bytes()
-    assert codec.encode(said) == payload
-    assert codec.encode(codec.decode(payload, type(said))) == payload
+    assert codec.encode(message) == payload
+    assert codec.encode(codec.decode(payload, type(message))) == payload
 
 
 def packed(value: Any) -> Any:

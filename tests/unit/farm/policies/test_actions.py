@@ -30,10 +30,10 @@ def test_actions_are_as_written(name, bandwidth):
     assert actions.shape == (3, ACTIONS)
     for i in range(3):
         z = features(x[i])
-        for joint, own in enumerate(theta[i].reshape(ACTIONS, -1)):
-            parts = {"projected": features, "cosine": np.cos}.get(name, np.asarray)(own)
+        for joint, joint_theta in enumerate(theta[i].reshape(ACTIONS, -1)):
+            parts = {"projected": features, "cosine": np.cos}.get(name, np.asarray)(joint_theta)
             if name == "kernel":
-                expected = math.exp(-(math.dist(own, x[i]) ** 2) / (2 * bandwidth**2))
+                expected = math.exp(-(math.dist(joint_theta, x[i]) ** 2) / (2 * bandwidth**2))
             else:
                 expected = sum(a * b for a, b in zip(parts, z, strict=True))
             assert actions[i, joint] == pytest.approx(expected, rel=1e-9, abs=1e-12)
@@ -43,17 +43,17 @@ def test_actions_are_as_written(name, bandwidth):
 def test_single_precision_changes_actions_by_rounding_alone(name):
     single, double = make(name, features=8000), make(name.partition(",")[0], features=8000)
     theta, x = parameters(single, 20), states(20)
-    found, wanted = act(single, theta, x), act(double, theta, x)
-    assert found.dtype == np.float64
-    assert 0.0 < np.abs(found - wanted).max() < 2e-6
+    actions, expected = act(single, theta, x), act(double, theta, x)
+    assert actions.dtype == np.float64
+    assert 0.0 < np.abs(actions - expected).max() < 2e-6
 
 
 def test_single_precision_overflows_like_double():
     policy = make("direct, single")
     theta, x = parameters(policy, 3), states(3)
     theta[1], x[2, 0] = 1e300, 1e300
-    found = act(policy, theta, x)
-    assert np.isfinite(found).all(axis=1).tolist() == [True, False, False]
+    actions = act(policy, theta, x)
+    assert np.isfinite(actions).all(axis=1).tolist() == [True, False, False]
 
 
 def plain(policy, theta, x):
@@ -92,8 +92,8 @@ def test_actions_are_those_of_plain_numpy(name, size):
     sizes |= {"rnn": 7 * (size + 7 + 1) + 3 * 8, "cpg": 12}
     assert policy.size == sizes.get(name, 3 * (size + 1))
     theta, x = parameters(policy, 5), states(5, size)
-    wanted = [plain(policy, *row) for row in zip(theta, x, strict=True)]
-    np.testing.assert_allclose(act(policy, theta, x), wanted, rtol=1e-11, atol=1e-13)
+    expected = [plain(policy, *row) for row in zip(theta, x, strict=True)]
+    np.testing.assert_allclose(act(policy, theta, x), expected, rtol=1e-11, atol=1e-13)
 
 
 def test_the_hidden_layer_of_an_rnn_is_its_next_memory():
@@ -102,8 +102,8 @@ def test_the_hidden_layer_of_an_rnn_is_its_next_memory():
     [memory] = memories(policy, x)
     _, after = policy.act(policy.prepare(theta), x, memory)
     rows = theta[:, : 4 * 13].reshape(3, 4, 13)  # 8 observations, 4 memories, a bias
-    for row, seen, known, found in zip(rows, x, memory, after, strict=True):
-        np.testing.assert_allclose(found, np.tanh(row @ np.concatenate([seen, known, [1.0]])), rtol=1e-12)
+    for row, observation, state, layer in zip(rows, x, memory, after, strict=True):
+        np.testing.assert_allclose(layer, np.tanh(row @ np.concatenate([observation, state, [1.0]])), rtol=1e-12)
     assert policy.memory.tolist() == [0.0] * 4
 
 

@@ -45,8 +45,8 @@ def test_features_are_as_written():
 
 
 def test_constants_are_drawn_from_their_distributions_and_the_kernel_has_none():
-    drawn = make("direct", 20_000).constants
-    frequencies, phases = drawn["frequencies"], drawn["phases"]
+    constants = make("direct", 20_000).constants
+    frequencies, phases = constants["frequencies"], constants["phases"]
     assert (frequencies.shape, phases.shape) == ((20_000, 8), (20_000,))
     np.testing.assert_allclose(frequencies.mean(axis=0), 0.0, atol=0.04)
     np.testing.assert_allclose(frequencies.std(axis=0), 1.0, atol=0.03)

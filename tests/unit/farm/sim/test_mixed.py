@@ -105,28 +105,28 @@ def only(which: int) -> type[Rods]:
     return Only
 
 
-def runner(kind: type[Task] = Rods, size: int = 64) -> Runner:
+def new_runner(kind: type[Task] = Rods, size: int = 64) -> Runner:
     task = kind()
     spec, config = specification(task), FeaturesConfig(features=5)
     constants = Direct.draw(config, spec, np.random.default_rng(0))
     return Runner(task, Direct(config, spec, constants), lambda model: BatchEngine(model, size))
 
 
-def run(made: Runner, rows: Any = slice(None)) -> Rollouts:
-    theta = np.random.default_rng(1).normal(0.0, 0.5, (len(SEEDS), made.policy.size))
-    chosen = np.arange(len(SEEDS))[rows]
-    return made.rollouts(theta[chosen], [SEEDS[i] for i in chosen])
+def run(runner: Runner, rows: Any = slice(None)) -> Rollouts:
+    theta = np.random.default_rng(1).normal(0.0, 0.5, (len(SEEDS), runner.policy.size))
+    indices = np.arange(len(SEEDS))[rows]
+    return runner.rollouts(theta[indices], [SEEDS[i] for i in indices])
 
 
-def bits(found: Rollouts, row: int) -> dict[str, bytes]:
-    arrays = {**{f"start {name}": values for name, values in found.start.items()}, **found.frames}
-    arrays |= {name: getattr(found, name) for name in ("returns", "steps", "ended", "failed", "terms", "actions")}
+def bits(rollouts: Rollouts, row: int) -> dict[str, bytes]:
+    arrays = {**{f"start {name}": values for name, values in rollouts.start.items()}, **rollouts.frames}
+    arrays |= {name: getattr(rollouts, name) for name in ("returns", "steps", "ended", "failed", "terms", "actions")}
     return {name: np.ascontiguousarray(values[row]).tobytes() for name, values in arrays.items()}
 
 
 @pytest.fixture(scope="module")
 def mixed() -> Rollouts:
-    return run(runner())
+    return run(new_runner())
 
 
 def test_each_row_has_the_bits_of_its_model_alone(mixed: Rollouts) -> None:
@@ -135,22 +135,22 @@ def test_each_row_has_the_bits_of_its_model_alone(mixed: Rollouts) -> None:
     assert set(mixed.which.tolist()) == {0, 1, 2}
     assert 0 < mixed.ended.sum() < len(SEEDS)
     for which in range(3):
-        alone = run(runner(only(which)))
+        alone = run(new_runner(only(which)))
         for row in np.flatnonzero(mixed.which == which).tolist():
             assert bits(mixed, row) == bits(alone, row)
 
 
 @pytest.mark.parametrize("rows", [slice(None, None, -1), slice(3, 7), [2], [8], [0, 4]])
 def test_no_row_depends_on_its_neighbours(mixed: Rollouts, rows: Any) -> None:
-    found = run(runner(), rows)
+    rollouts = run(new_runner(), rows)
     for at, row in enumerate(np.arange(len(SEEDS))[rows].tolist()):
-        assert bits(found, at) == bits(mixed, row)
+        assert bits(rollouts, at) == bits(mixed, row)
 
 
 def test_nor_on_the_engines_size_nor_on_what_it_simulated_before(mixed: Rollouts) -> None:
-    made = runner(size=3)
-    for found in (run(made), run(made)):
-        assert all(bits(found, row) == bits(mixed, row) for row in range(len(SEEDS)))
+    runner = new_runner(size=3)
+    for rollouts in (run(runner), run(runner)):
+        assert all(bits(rollouts, row) == bits(mixed, row) for row in range(len(SEEDS)))
 
 
 def test_models_of_one_layout_share_a_batch() -> None:
@@ -160,18 +160,18 @@ def test_models_of_one_layout_share_a_batch() -> None:
 
 
 def test_a_rollout_shows_its_own_model(mixed: Rollouts) -> None:
-    made = runner()
-    [channel] = [each for each in made.spec.channels if each.name == MODEL]
+    runner = new_runner()
+    [channel] = [each for each in runner.spec.channels if each.name == MODEL]
     assert channel.labels == ("long", "short", "knobbed")
     for row, which in enumerate(mixed.which.tolist()):
-        shown = made.trajectory(mixed, row)
-        assert shown.fits(made.spec.shapes(len(made.scene.bodies)))
-        assert (shown.channels[MODEL].argmax(axis=1) == which).all()
-        places = Scene(made.task.simulated[which]).poses(whole(mixed, row)["qpos"])
-        assert shown.bodies.tobytes() == places.astype("<f4").tobytes()
-    drawn = {geometry.name: geometry.models for geometry in made.scene.geometries()}
-    own = {"rod-0": (0,), "rod-1": (1,), "rod-2": (2,), "tip-0": (0,), "tip-1": (1,), "tip-2": (2,), "knob-2": (2,)}
-    assert drawn == {"floor": (), **own}
+        trajectory = runner.trajectory(mixed, row)
+        assert trajectory.fits(runner.spec.shapes(len(runner.scene.bodies)))
+        assert (trajectory.channels[MODEL].argmax(axis=1) == which).all()
+        places = Scene(runner.task.simulated[which]).poses(whole(mixed, row)["qpos"])
+        assert trajectory.bodies.tobytes() == places.astype("<f4").tobytes()
+    models = {geometry.name: geometry.models for geometry in runner.scene.geometries()}
+    parts = {"rod-0": (0,), "rod-1": (1,), "rod-2": (2,), "tip-0": (0,), "tip-1": (1,), "tip-2": (2,), "knob-2": (2,)}
+    assert models == {"floor": (), **parts}
 
 
 def with_models(*models: Any, **methods: Any) -> type[Rods]:
@@ -201,4 +201,4 @@ def test_what_has_other_shapes_or_places_is_one_line() -> None:
     with pytest.raises(TaskError, match="geom 'tip' has other places in the arrays of other models"):
         specification(Swapped())
     with pytest.raises(TaskError, match="which gave 3; expected the index of a model, 0 to 2"):
-        run(runner(with_models(*TEXTS, observe=lambda self, sim: sim.qpos, which=lambda self, rng: 3)))
+        run(new_runner(with_models(*TEXTS, observe=lambda self, sim: sim.qpos, which=lambda self, rng: 3)))

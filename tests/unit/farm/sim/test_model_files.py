@@ -34,23 +34,23 @@ def same(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
 
 
 def test_a_model_in_files_is_the_one_that_mujoco_reads_there(folder: Path) -> None:
-    found = read(Path("robot/scene.xml"), folder)
-    assert next(iter(found)) == "robot/scene.xml", "the model comes first"
-    assert sorted(found) == sorted(f"robot/{name}" for name in NAMES)
-    model = compiled(SCENE, "Reach", found, "robot/scene.xml")
+    files = read(Path("robot/scene.xml"), folder)
+    assert next(iter(files)) == "robot/scene.xml", "the model comes first"
+    assert sorted(files) == sorted(f"robot/{name}" for name in NAMES)
+    model = compiled(SCENE, "Reach", files, "robot/scene.xml")
     assert (model.nmesh, model.ntex, model.nhfield) == (1, 1, 1)
     assert same(model, mujoco.MjModel.from_xml_path(str(folder / "robot/scene.xml")))
 
 
 def test_it_is_compiled_without_the_folder(folder: Path) -> None:
-    found = read(Path("robot/scene.xml"), folder)
-    before = compiled(SCENE, "Reach", found, "robot/scene.xml")
+    files = read(Path("robot/scene.xml"), folder)
+    before = compiled(SCENE, "Reach", files, "robot/scene.xml")
     for path in sorted(folder.rglob("*.*")):
         path.unlink()
-    texts, assets = split(found)
+    texts, assets = split(files)
     assert sorted(texts) == ["robot/parts/arm.xml", "robot/scene.xml"]
-    again = joined(texts, assets, by_digest(found))
-    assert again == found
+    again = joined(texts, assets, by_digest(files))
+    assert again == files
     assert same(before, compiled(SCENE, "Reach", again, "robot/scene.xml"))
 
 
@@ -78,9 +78,9 @@ def test_a_file_included_from_an_included_one_and_an_attached_model(folder: Path
         '<body name="ball"', '<body name="on"><attach model="gripper" body="claw" prefix="g-"/></body><body name="ball"'
     )
     (folder / "robot/scene.xml").write_text(scene)
-    found = read(Path("robot/scene.xml"), folder)
-    assert {"robot/parts/deep/more.xml", "robot/gripper.xml", "robot/assets/claw.stl"} <= set(found)
-    model = compiled(scene, "Reach", found, "robot/scene.xml")
+    files = read(Path("robot/scene.xml"), folder)
+    assert {"robot/parts/deep/more.xml", "robot/gripper.xml", "robot/assets/claw.stl"} <= set(files)
+    model = compiled(scene, "Reach", files, "robot/scene.xml")
     assert same(model, mujoco.MjModel.from_xml_path(str(folder / "robot/scene.xml")))
     assert model.body("g-claw").id > 0
 
@@ -157,9 +157,9 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_what_cannot_be_read_is_one_line(folder: Path, case: str) -> None:
     spoil, expected = BAD[case]
     spoil(folder)
-    with pytest.raises(ConfigError) as said:
+    with pytest.raises(ConfigError) as error:
         read(Path("robot/scene.xml"), folder)
-    assert str(said.value) == expected.format(folder)
+    assert str(error.value) == expected.format(folder)
 
 
 def test_a_file_above_the_limits_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,10 +185,10 @@ def test_what_was_not_sent_is_not_read_from_this_machine(
 
 def test_mujocos_own_refusal_names_no_folder_of_ours(folder: Path) -> None:
     (folder / "robot/assets/link.stl").write_bytes(b"no mesh")
-    found = read(Path("robot/scene.xml"), folder)
-    with pytest.raises(ConfigError, match=r"^Reach: MuJoCo refuses the model: ") as said:
-        compiled(SCENE, "Reach", found, "robot/scene.xml")
-    assert "rolloutfarm-model" not in str(said.value)
+    files = read(Path("robot/scene.xml"), folder)
+    with pytest.raises(ConfigError, match=r"^Reach: MuJoCo refuses the model: ") as error:
+        compiled(SCENE, "Reach", files, "robot/scene.xml")
+    assert "rolloutfarm-model" not in str(error.value)
 
 
 def test_a_task_with_files_is_checked(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -197,9 +197,9 @@ def test_a_task_with_files_is_checked(folder: Path, capsys: pytest.CaptureFixtur
     assert task.model.nmesh == 1
     (folder / "robot/assets/link.stl").unlink()
     assert command(["check", f"{folder}/reach.py:Reach"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("farm: robot/parts/arm.xml: mesh 'link.stl': there is no file")
-    assert said.count("\n") == 1
+    errors = capsys.readouterr().err
+    assert errors.startswith("farm: robot/parts/arm.xml: mesh 'link.stl': there is no file")
+    assert errors.count("\n") == 1
 
 
 def test_no_class_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,11 +80,11 @@ def test_objects_by_name_are_those_of_mujoco(engine: Any) -> None:
         sim.step(70)
         for (kind, name), attributes in FIELDS.items():
             for attribute in attributes:
-                found, own = getattr(sim, kind)(name), getattr(data, kind)(name)
-                values, expected = getattr(found, attribute), getattr(own, attribute)
+                view, reference = getattr(sim, kind)(name), getattr(data, kind)(name)
+                values, expected = getattr(view, attribute), getattr(reference, attribute)
                 assert values.shape == (1, *expected.shape)
                 assert values[0].tobytes() == expected.tobytes(), (kind, name, attribute)
-                assert (found.id, found.name) == (own.id, name)
+                assert (view.id, view.name) == (reference.id, name)
 
     data.joint("hinge").qpos[:] = 0.4
     mujoco.mj_forward(MODEL, data)

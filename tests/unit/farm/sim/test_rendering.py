@@ -50,10 +50,10 @@ def drawn_by(code, tmp_path):
 
 
 def test_geometries_are_painted_by_a_channels_values(tmp_path):
-    drawn = drawn_by(DRAW, tmp_path)
-    assert drawn.shape == (3, 30, 40, 3)
-    np.testing.assert_allclose(drawn[:, 0, 0], np.tile([240, 242, 245], (3, 1)), atol=2)
-    untouched, lightest, full = drawn[:, 15, 20]
+    pictures = drawn_by(DRAW, tmp_path)
+    assert pictures.shape == (3, 30, 40, 3)
+    np.testing.assert_allclose(pictures[:, 0, 0], np.tile([240, 242, 245], (3, 1)), atol=2)
+    untouched, lightest, full = pictures[:, 15, 20]
     assert np.ptp(untouched) < 10, "white"
     assert lightest[2] - lightest[0] > 50, "the lightest touch shows"
     assert full[2] > 150
@@ -80,9 +80,9 @@ def test_a_picture_frames_the_first_state_and_follows_what_moves_away(tmp_path):
     places = "[[9, 9, 9], [9, 9.1, 9], [2, 9, 9]]"
     away = f"qpos, values = np.repeat(model.qpos0[None], 3, axis=0), None; qpos[:, :3] = {places}"
     code = DRAW.replace(next(line for line in DRAW.splitlines() if line.startswith("qpos")), away)
-    drawn = drawn_by(code.replace("[touch]", "[]"), tmp_path)
-    assert (drawn[:, 15, 20].max(axis=-1) < 120).all(), "the black ball is in the middle of each"
-    assert (drawn[0] != drawn[1]).any(), "a ball that hardly moves does not move the camera"
+    pictures = drawn_by(code.replace("[touch]", "[]"), tmp_path)
+    assert (pictures[:, 15, 20].max(axis=-1) < 120).all(), "the black ball is in the middle of each"
+    assert (pictures[0] != pictures[1]).any(), "a ball that hardly moves does not move the camera"
 
 
 def test_the_view_follows_a_body_that_leaves_the_middle_but_no_swinging():
@@ -133,11 +133,11 @@ except RunError as error:
 
 
 def test_arrows_points_and_touched_places_are_drawn_where_they_are_and_goals_move(tmp_path):
-    drawn = drawn_by(MARKS, tmp_path)
+    pictures = drawn_by(MARKS, tmp_path)
 
     def pixel(frame, x, z, near=0.0):
         scale = 240 / ((3.0 - near) * np.tan(np.deg2rad(22.5)))  # pixels per metre, so much nearer than the target
-        return drawn[frame, round(239.5 - z * scale), round(239.5 + x * scale)]
+        return pictures[frame, round(239.5 - z * scale), round(239.5 + x * scale)]
 
     def is_red(colour):
         return colour[0] > colour[2] + 60

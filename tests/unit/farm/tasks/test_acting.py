@@ -55,16 +55,16 @@ def task() -> Task:
     return Slides()
 
 
-def runner(task: Task, kind: type[Policy] = Counts, size: int = 64, **settings: object) -> Runner:
+def new_runner(task: Task, kind: type[Policy] = Counts, size: int = 64, **settings: object) -> Runner:
     config = kind.Config(**settings)  # type: ignore[arg-type]
     return Runner(task, kind(config, specification(task), {}), lambda model: BatchEngine(model, size))
 
 
 def test_each_rollout_counts_its_own_steps_until_it_ends(task: Task) -> None:
     seeds = [(seed,) for seed in range(12)]
-    found = runner(task).rollouts(np.ones((12, 1)), seeds)
-    assert len(set(found.steps.tolist())) > 3, "they end at different times"
-    for steps, actions in zip(found.steps.tolist(), found.actions, strict=True):
+    rollouts = new_runner(task).rollouts(np.ones((12, 1)), seeds)
+    assert len(set(rollouts.steps.tolist())) > 3, "they end at different times"
+    for steps, actions in zip(rollouts.steps.tolist(), rollouts.actions, strict=True):
         assert actions[:steps].tolist() == [[t, 5.0] for t in range(steps)]
     assert Counts.memory.tolist() == [0.0, 5.0]
 
@@ -72,22 +72,22 @@ def test_each_rollout_counts_its_own_steps_until_it_ends(task: Task) -> None:
 @pytest.mark.parametrize(("kind", "settings"), [(Rnn, {"units": 3}), (Cpg, {"frequency": 2.0})])
 @pytest.mark.parametrize("normalise", [False, True])
 def test_no_batch_changes_a_bit(task: Task, kind: type[Policy], settings: dict[str, float], normalise: bool) -> None:
-    some, few = (runner(task, kind, size, **settings) for size in (64, 5))
+    large, small = (new_runner(task, kind, size, **settings) for size in (64, 5))
     if normalise:
-        seen = np.random.default_rng(1).uniform(0.5, 1.0, (2, 4))
-        some.policy, few.policy = (Normalised(each.policy, seen) for each in (some, few))
-    theta = np.random.default_rng(0).normal(size=(12, some.size))
+        normaliser = np.random.default_rng(1).uniform(0.5, 1.0, (2, 4))
+        large.policy, small.policy = (Normalised(each.policy, normaliser) for each in (large, small))
+    theta = np.random.default_rng(0).normal(size=(12, large.size))
     seeds = [(seed % 5,) for seed in range(12)]
-    together = some.rollouts(theta, seeds)
+    together = large.rollouts(theta, seeds)
     assert len(set(together.steps.tolist())) > 1
     order = np.random.default_rng(2).permutation(12)
     for others, rows in (
-        (few.rollouts(theta, seeds), np.arange(12)),
-        (some.rollouts(theta[order], [seeds[i] for i in order]), order),
+        (small.rollouts(theta, seeds), np.arange(12)),
+        (large.rollouts(theta[order], [seeds[i] for i in order]), order),
     ):
         assert others.returns.tobytes() == together.returns[rows].tobytes()
         assert others.actions.tobytes() == together.actions[rows].tobytes()
-    alone = [some.rollouts(theta[i : i + 1], seeds[i : i + 1]).actions[0].tobytes() for i in range(12)]
+    alone = [large.rollouts(theta[i : i + 1], seeds[i : i + 1]).actions[0].tobytes() for i in range(12)]
     assert alone == [actions.tobytes() for actions in together.actions]
 
 
@@ -101,7 +101,7 @@ def test_what_a_rollout_forgets_is_its_own_alone(task: Task) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "line"),
+    ("act", "line"),
     [
         (lambda x, memory: x[:, :2], r"act of the policy gave a ndarray; expected \(action, memory\), as the policy"),
         (lambda x, memory: (x[:, :2], memory[:1]), r"memory from act .* \(1, 2\); expected an array of shape \(3, 2\)"),
@@ -109,8 +109,8 @@ def test_what_a_rollout_forgets_is_its_own_alone(task: Task) -> None:
         (lambda x, memory: (x[:1, :2], memory), r"act of the policy .* \(1, 2\); expected an array of shape \(3, 2\)"),
     ],
 )
-def test_a_memory_that_cannot_be_is_one_line(task: Task, given, line: str) -> None:
-    wrong = runner(task)
-    wrong.policy.act = lambda _, x, memory: given(x, memory)  # type: ignore[method-assign,assignment]
+def test_a_memory_that_cannot_be_is_one_line(task: Task, act, line: str) -> None:
+    runner = new_runner(task)
+    runner.policy.act = lambda _, x, memory: act(x, memory)  # type: ignore[method-assign,assignment]
     with pytest.raises(TaskError, match=line):
-        wrong.rollouts(np.ones((3, 1)), [None] * 3)
+        runner.rollouts(np.ones((3, 1)), [None] * 3)

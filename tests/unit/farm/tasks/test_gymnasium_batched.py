@@ -30,32 +30,34 @@ ARGUMENTS = {
     "Reacher-v5": ("reward_dist_weight=2", "reward_control_weight=0.3"),
     "Pusher-v5": ("reward_near_weight=2", "reward_control_weight=0.3", "reward_dist_weight=0.7"),
 }
-CASES = [(name, own) for name, given in ARGUMENTS.items() for own in ((), given)]
+CASES = [(name, arguments) for name, options in ARGUMENTS.items() for arguments in ((), options)]
 STARTS = (None, (3, 0, 1, 0), (3, 0, 2, 0))
 
 
 @cache
-def task(name: str, own: tuple[str, ...] = ()) -> Environment:
-    return Environment(EnvironmentConfig(env_arg=own, steps=100 if name in ("Pusher-v5",) else 0), name)
+def new_task(name: str, arguments: tuple[str, ...] = ()) -> Environment:
+    return Environment(EnvironmentConfig(env_arg=arguments, steps=100 if name in ("Pusher-v5",) else 0), name)
 
 
-@pytest.mark.parametrize(("name", "own"), CASES, ids=lambda value: value if isinstance(value, str) else len(value))
-def test_every_step_is_the_environments(name: str, own: tuple[str, ...]) -> None:
-    made = task(name, own)
-    assert made.batched is not None
-    sim, steps = Sim(made.engine(lambda model: BatchEngine(model, 5))), min(100, made.steps)
+@pytest.mark.parametrize(
+    ("name", "arguments"), CASES, ids=lambda value: value if isinstance(value, str) else len(value)
+)
+def test_every_step_is_the_environments(name: str, arguments: tuple[str, ...]) -> None:
+    task = new_task(name, arguments)
+    assert task.batched is not None
+    sim, steps = Sim(task.engine(lambda model: BatchEngine(model, 5))), min(100, task.steps)
 
     def begin() -> Batch:
-        begun = Batch(made, sim, [*STARTS, STARTS[1]])  # two begin alike
-        begun.observe()
-        begun.step(np.zeros((4, len(made.limits[0]))))
-        begun.observe()
-        return Batch(made, sim, [*STARTS, STARTS[1]])
+        rehearsal = Batch(task, sim, [*STARTS, STARTS[1]])  # two begin alike
+        rehearsal.observe()
+        rehearsal.step(np.zeros((4, len(task.limits[0]))))
+        rehearsal.observe()
+        return Batch(task, sim, [*STARTS, STARTS[1]])
 
     batch = again(begin)
-    raw = np.random.default_rng(0).uniform(-1.2, 1.2, (steps, 4, len(made.limits[0])))
-    envs = [make(name, **made.config.arguments) for _ in range(4)]
-    seen = [
+    raw = np.random.default_rng(0).uniform(-1.2, 1.2, (steps, 4, len(task.limits[0])))
+    envs = [make(name, **task.config.arguments) for _ in range(4)]
+    observations = [
         env.reset(seed=reset_seed(None if start is None else np.random.default_rng(start)))[0]
         for env, start in zip(envs, [*STARTS, STARTS[1]], strict=True)
     ]
@@ -63,12 +65,12 @@ def test_every_step_is_the_environments(name: str, own: tuple[str, ...]) -> None
     for t in range(steps):
         if not going:
             break
-        np.testing.assert_allclose(batch.observe(), [seen[row] for row in going], rtol=0, atol=1e-9)
-        actions = made.act(sim, raw[t, going])
+        np.testing.assert_allclose(batch.observe(), [observations[row] for row in going], rtol=0, atol=1e-9)
+        actions = task.act(sim, raw[t, going])
         batch.step(raw[t, going])
         for at, row in enumerate(list(going)):
             action = actions[at].astype(np.float32)
-            seen[row], reward, terminated, *_ = envs[row].step(action)
+            observations[row], reward, terminated, *_ = envs[row].step(action)
             assert batch.terms is not None
             assert batch.terms[row, t, 0] == pytest.approx(reward, rel=0, abs=1e-9)
             assert batch.frames["qpos"][row, t].tolist() == envs[row].unwrapped.data.qpos.tolist()
@@ -78,17 +80,17 @@ def test_every_step_is_the_environments(name: str, own: tuple[str, ...]) -> None
 
 
 def test_physics_that_blows_up_is_never_good() -> None:
-    made = Environment(EnvironmentConfig(env_arg=("reset_noise_scale=1e7",), steps=20), "HalfCheetah-v5")
-    linear = Linear(Linear.Config(), made.spec(), {})
-    found = Runner(made, linear).rollouts(np.zeros((1, linear.size)), [None])
-    assert (found.failed[0], found.clamped[0], found.returns[0]) == (True, True, RETURN_FLOOR)
+    task = Environment(EnvironmentConfig(env_arg=("reset_noise_scale=1e7",), steps=20), "HalfCheetah-v5")
+    linear = Linear(Linear.Config(), task.spec(), {})
+    rollouts = Runner(task, linear).rollouts(np.zeros((1, linear.size)), [None])
+    assert (rollouts.failed[0], rollouts.clamped[0], rollouts.returns[0]) == (True, True, RETURN_FLOOR)
 
 
 def test_others_step_themselves() -> None:
-    for name, own in (("HumanoidStandup-v5", ()), ("Ant-v4", ()), ("Swimmer-v4", ())):
-        made = Environment(EnvironmentConfig(env_arg=own), name)
-        assert (made.batched, made.substeps) == (None, 1)
-        assert isinstance(made.engine(lambda model: BatchEngine(model, 1)), EnvironmentEngine)
+    for name, arguments in (("HumanoidStandup-v5", ()), ("Ant-v4", ()), ("Swimmer-v4", ())):
+        task = Environment(EnvironmentConfig(env_arg=arguments), name)
+        assert (task.batched, task.substeps) == (None, 1)
+        assert isinstance(task.engine(lambda model: BatchEngine(model, 1)), EnvironmentEngine)
 
 
 def test_an_environment_derived_from_one_is_not_it() -> None:

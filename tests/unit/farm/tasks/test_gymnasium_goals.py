@@ -64,8 +64,8 @@ class Goal(gymnasium.Env[Any, Any]):
         return self._seen(), -gap, gap < 0.01, False, {}
 
     def _seen(self) -> dict[str, Any]:
-        own = np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
-        return {"observation": own, "goals": (self.data.qpos.astype(np.float32), self.goal[None].copy())}
+        state = np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
+        return {"observation": state, "goals": (self.data.qpos.astype(np.float32), self.goal[None].copy())}
 
 
 @pytest.fixture(autouse=True)
@@ -76,34 +76,34 @@ def registered() -> Iterator[None]:
     del gymnasium.registry["Goal-v0"]
 
 
-def runner() -> Runner:
+def new_runner() -> Runner:
     task = Environment(EnvironmentConfig(), "Goal-v0")
     return Runner(task, Linear(LinearConfig(), task.spec(), standard(task, 0.5)))
 
 
 def test_a_goal_environment_is_a_plain_loop_with_gymnasiums_own_flatten() -> None:
-    made = runner()
-    theta = np.random.default_rng(0).normal(size=(1, made.size))
+    runner = new_runner()
+    theta = np.random.default_rng(0).normal(size=(1, runner.size))
     env: Any = gymnasium.make("Goal-v0")
-    assert made.spec.observation == flatdim(env.observation_space) == 4
-    found = made.rollouts(theta, [(3,)])
+    assert runner.spec.observation == flatdim(env.observation_space) == 4
+    rollouts = runner.rollouts(theta, [(3,)])
     x, _ = env.reset(seed=reset_seed(np.random.default_rng((3,))))
-    prepared, rewards, over = made.policy.prepare(theta), [], False
+    prepared, rewards, over = runner.policy.prepare(theta), [], False
     while not over:
         flat = flatten(env.observation_space, x)
         assert isinstance(flat, np.ndarray)
-        action = np.clip(made.policy.act(prepared, flat[None])[0], -1.0, 1.0).astype(np.float32)
+        action = np.clip(runner.policy.act(prepared, flat[None])[0], -1.0, 1.0).astype(np.float32)
         x, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)
         over = terminated or truncated
-    assert found.terms[0, : len(rewards), 0].tolist() == rewards
-    assert found.frames["qpos"][0, len(rewards) - 1].tolist() == env.unwrapped.data.qpos.tolist()
+    assert rollouts.terms[0, : len(rewards), 0].tolist() == rewards
+    assert rollouts.frames["qpos"][0, len(rewards) - 1].tolist() == env.unwrapped.data.qpos.tolist()
 
 
 def test_what_a_reset_leaves_does_not_reach_later_rollouts() -> None:
-    made, seeds = runner(), [(1,), None, (2,), (3,)]
-    theta = np.random.default_rng(0).normal(size=(4, made.size))
-    first, again = made.rollouts(theta, seeds), made.rollouts(theta[::-1], seeds[::-1])
+    runner, seeds = new_runner(), [(1,), None, (2,), (3,)]
+    theta = np.random.default_rng(0).normal(size=(4, runner.size))
+    first, again = runner.rollouts(theta, seeds), runner.rollouts(theta[::-1], seeds[::-1])
     assert first.frames["qpos"].tobytes() == again.frames["qpos"][::-1].tobytes()
     assert first.returns.tobytes() == again.returns[::-1].tobytes()
 
@@ -114,7 +114,7 @@ def test_an_environments_state_is_its_own() -> None:
             sim.qpos[:] = 0.0
             return super().act(sim, action)
 
-    batch = Batch(Moves(EnvironmentConfig(), "Goal-v0"), runner().sim, [None])
+    batch = Batch(Moves(EnvironmentConfig(), "Goal-v0"), new_runner().sim, [None])
     with pytest.raises(TaskError, match=r"sim.qpos can be written in .*, and in no environment of Gymnasium"):
         batch.step(np.zeros((1, 2)))
 
@@ -198,12 +198,12 @@ def test_dm_controls_physics_seeds_and_limit(steps: int) -> None:
     gymnasium.register("suite/push-v0", Suite)
     try:
         task = Environment(EnvironmentConfig(steps=steps), "suite/push-v0")
-        made = Runner(task, Linear(LinearConfig(), task.spec(), {}))
-        found = made.rollouts(np.zeros((20, made.size)), [(each,) for each in range(20)])
+        runner = Runner(task, Linear(LinearConfig(), task.spec(), {}))
+        rollouts = runner.rollouts(np.zeros((20, runner.size)), [(each,) for each in range(20)])
     finally:
         del gymnasium.registry["suite/push-v0"]
-    assert 0 < found.failed.sum() < 20
-    fine = ~found.failed
-    assert set(found.steps[fine].tolist()) == {min(steps, 7)}
-    assert found.returns[fine].tolist() == [min(steps, 7)] * fine.sum()
-    assert found.ended[fine].all() == found.ended[fine].any() == (steps > 7)
+    assert 0 < rollouts.failed.sum() < 20
+    fine = ~rollouts.failed
+    assert set(rollouts.steps[fine].tolist()) == {min(steps, 7)}
+    assert rollouts.returns[fine].tolist() == [min(steps, 7)] * fine.sum()
+    assert rollouts.ended[fine].all() == rollouts.ended[fine].any() == (steps > 7)

@@ -28,10 +28,10 @@ def scene(request):
 
 @pytest.fixture(scope="module")
 def data(scene):
-    made = mujoco.MjData(scene.model)
-    made.qpos[:8] = BENT
-    mujoco.mj_forward(scene.model, made)
-    return made
+    state = mujoco.MjData(scene.model)
+    state.qpos[:8] = BENT
+    mujoco.mj_forward(scene.model, state)
+    return state
 
 
 # ---------------------------------------------------------------- the hand as the rest of the program sees it
@@ -127,8 +127,8 @@ def test_what_is_shown_of_a_link_touches_nothing_and_is_a_little_larger(scene):
 def test_masses_are_those_of_the_hand(scene):
     assert scene.model.body("palm").mass[0] == pytest.approx(0.4154)
     for finger, (base, proximal, medial, distal) in LINKS.items():
-        own = {part: scene.model.body(f"{finger}_{part}").mass[0] for part in ("proximal", "medial", "distal")}
-        assert own == pytest.approx({"proximal": proximal, "medial": medial, "distal": distal})
+        masses = {part: scene.model.body(f"{finger}_{part}").mass[0] for part in ("proximal", "medial", "distal")}
+        assert masses == pytest.approx({"proximal": proximal, "medial": medial, "distal": distal})
         bases = ("thumb_mount", "thumb_base") if finger == "thumb" else (f"{finger}_base",)
         assert sum(scene.model.body(name).mass[0] for name in bases) == pytest.approx(base)
     hand = scene.model.body_subtreemass[scene.model.body("palm").id]
@@ -190,16 +190,16 @@ def test_each_fingertip_feels_the_object_only(scene):
 
 
 def test_the_freeze_holds_the_object_where_it_is(scene):
-    made = mujoco.MjData(scene.model)
-    made.mocap_pos[0], made.mocap_quat[0] = made.qpos[8:11], made.qpos[11:]
-    before = made.qpos[8:].copy()
+    state = mujoco.MjData(scene.model)
+    state.mocap_pos[0], state.mocap_quat[0] = state.qpos[8:11], state.qpos[11:]
+    before = state.qpos[8:].copy()
     for _ in range(100):
-        mujoco.mj_step(scene.model, made)
-    np.testing.assert_allclose(made.qpos[8:], before, atol=2e-3)
-    made.eq_active[0] = 0
+        mujoco.mj_step(scene.model, state)
+    np.testing.assert_allclose(state.qpos[8:], before, atol=2e-3)
+    state.eq_active[0] = 0
     for _ in range(50):
-        mujoco.mj_step(scene.model, made)
-    assert made.qpos[10] < before[2] - 0.05
+        mujoco.mj_step(scene.model, state)
+    assert state.qpos[10] < before[2] - 0.05
     assert scene.model.equality(0).name == "freeze"
     assert scene.model.neq == 1
 

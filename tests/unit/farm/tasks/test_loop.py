@@ -68,14 +68,14 @@ class Pole(Task):
         return {"angle": sim.sensordata}
 
 
-def runner(kind: type[Task] = Pole, **settings) -> Runner:
+def new_runner(kind: type[Task] = Pole, **settings) -> Runner:
     task = kind(kind.Config(**settings))
     spec, config = specification(task), FeaturesConfig(features=10)
     return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
 
 
-def thetas(made: Runner, count: int, scale: float = 1.0) -> np.ndarray:
-    return np.random.default_rng(1).normal(0.0, scale, (count, made.policy.size))
+def thetas(runner: Runner, count: int, scale: float = 1.0) -> np.ndarray:
+    return np.random.default_rng(1).normal(0.0, scale, (count, runner.policy.size))
 
 
 SEEDS = [None, (1, 2, 3, 4), (1, 2, 3, 4), (5, 0, 0, 0), None, (9, 9, 9, 9), (5, 0, 0, 0)]
@@ -95,16 +95,16 @@ def same(one: Rollouts, row: int, other: Rollouts, at: int) -> None:
 
 
 def test_a_rollout_does_not_depend_on_its_batch():
-    made = runner()
-    theta = thetas(made, 7, 4.0)
-    together = made.rollouts(theta, SEEDS)
+    runner = new_runner()
+    theta = thetas(runner, 7, 4.0)
+    together = runner.rollouts(theta, SEEDS)
     assert len(set(together.steps.tolist())) > 2, "some end early"
     order = [3, 6, 0, 5, 1, 4, 2]
-    permuted = made.rollouts(theta[order], [SEEDS[i] for i in order])
+    permuted = runner.rollouts(theta[order], [SEEDS[i] for i in order])
     for at, row in enumerate(order):
         same(together, row, permuted, at)
-        same(together, row, made.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
-    fresh = runner().rollouts(theta[::-1], SEEDS[::-1])
+        same(together, row, runner.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+    fresh = new_runner().rollouts(theta[::-1], SEEDS[::-1])
     for row in range(7):
         same(together, row, fresh, 6 - row)
 
@@ -128,55 +128,55 @@ class Changed(Pole):
 
 
 def test_models_of_rollouts_do_not_leak_into_later_ones():
-    made = runner(Changed, width=0.2)
-    theta = thetas(made, len(SEEDS), 3.0)
-    first = made.rollouts(theta, SEEDS)
+    runner = new_runner(Changed, width=0.2)
+    theta = thetas(runner, len(SEEDS), 3.0)
+    first = runner.rollouts(theta, SEEDS)
     assert 0 < first.ended.sum() < len(SEEDS)
-    again = made.rollouts(theta, SEEDS)
+    again = runner.rollouts(theta, SEEDS)
     for row in reversed(range(len(SEEDS))):
         same(first, row, again, row)
-        for other in (made, runner(Changed, width=0.2)):
+        for other in (runner, new_runner(Changed, width=0.2)):
             same(first, row, other.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
 
 
 def test_more_rollouts_than_the_engine_has_rows_are_done_in_turns():
-    made = runner()
-    count = made.sim.engine.size + 9
-    theta, seeds = thetas(made, count), [(0, 0, 0, i // 2) for i in range(count)]
-    together = made.rollouts(theta, seeds)
+    runner = new_runner()
+    count = runner.sim.engine.size + 9
+    theta, seeds = thetas(runner, count), [(0, 0, 0, i // 2) for i in range(count)]
+    together = runner.rollouts(theta, seeds)
     for row in (0, 40, count - 10, count - 1):
-        same(together, row, made.rollouts(theta[row : row + 1], [seeds[row]]), 0)
+        same(together, row, runner.rollouts(theta[row : row + 1], [seeds[row]]), 0)
 
 
 def test_physics_rate_shows_more_of_the_same():
-    made = runner()
-    theta = thetas(made, 3, 4.0)
-    coarse, fine = made.rollouts(theta, SEEDS[:3]), made.rollouts(theta, SEEDS[:3], physics=True)
+    runner = new_runner()
+    theta = thetas(runner, 3, 4.0)
+    coarse, fine = runner.rollouts(theta, SEEDS[:3]), runner.rollouts(theta, SEEDS[:3], physics=True)
     assert fine.frames["angle"].shape == (3, 48, 1)
     assert fine.frames["angle"][:, 3::4].tobytes() == coarse.frames["angle"].tobytes()
     assert fine.returns.tobytes() == coarse.returns.tobytes()
 
 
 def test_it_is_a_plain_loop():
-    made = runner(steps=5)
+    runner = new_runner(steps=5)
     model = mujoco.MjModel.from_xml_string(XML)
     data = mujoco.MjData(model)
     data.qpos[1] = 0.05
     mujoco.mj_forward(model, data)
-    theta, value = thetas(made, 1), 0.0
-    prepared = made.policy.prepare(theta)
+    theta, value = thetas(runner, 1), 0.0
+    prepared = runner.policy.prepare(theta)
     for _ in range(5):
         x = np.concatenate([data.sensordata, data.qvel, data.qpos[:1]])[None]
-        data.ctrl[:] = -3 + 8 * 0.5 * (1 + np.clip(made.policy.act(prepared, x)[0], -1, 1))
+        data.ctrl[:] = -3 + 8 * 0.5 * (1 + np.clip(runner.policy.act(prepared, x)[0], -1, 1))
         for _ in range(4):
             mujoco.mj_step(model, data)
         value += float(np.cos(data.qpos[1]) - abs(data.qpos[0]))
-    assert made.rollouts(theta, [None]).returns[0] == pytest.approx(value, rel=1e-14)
+    assert runner.rollouts(theta, [None]).returns[0] == pytest.approx(value, rel=1e-14)
 
 
 def test_ends_and_success():
-    made = runner()
-    rollouts = made.rollouts(thetas(made, 7, 4.0), SEEDS)
+    runner = new_runner()
+    rollouts = runner.rollouts(thetas(runner, 7, 4.0), SEEDS)
     for row in range(7):
         angle, steps = rollouts.frames["qpos"][row, :, 1], rollouts.steps[row]
         assert rollouts.ended[row] == bool(np.abs(angle).max() > 0.6)
@@ -184,18 +184,18 @@ def test_ends_and_success():
         assert not rollouts.terms[row, steps:].any()
         assert rollouts.success[row] == (abs(angle[steps - 1]) < 0.3)
         assert rollouts.returns[row] == pytest.approx(rollouts.terms[row].sum())
-    never = made.task.Config(width=100.0)
-    assert not runner(width=never.width).rollouts(thetas(made, 7), SEEDS).ended.any()
+    never = runner.task.Config(width=100.0)
+    assert not new_runner(width=never.width).rollouts(thetas(runner, 7), SEEDS).ended.any()
 
 
 def test_a_trajectory_has_the_channels():
-    made = runner()
-    rollouts = made.rollouts(thetas(made, 1), [None])
-    shown = trajectory(made.task, made.spec, made.scene, rollouts, 0)
-    assert {name: v.shape[1:] for name, v in shown.arrays().items()} == made.spec.shapes(len(made.scene.bodies))
-    assert shown.channels["angle"][0, 0] == pytest.approx(0.05)
-    assert shown.times[-1] == pytest.approx(rollouts.steps[0] * 0.04)
-    assert shown.success in (True, False)
+    runner = new_runner()
+    rollouts = runner.rollouts(thetas(runner, 1), [None])
+    motion = trajectory(runner.task, runner.spec, runner.scene, rollouts, 0)
+    assert {name: v.shape[1:] for name, v in motion.arrays().items()} == runner.spec.shapes(len(runner.scene.bodies))
+    assert motion.channels["angle"][0, 0] == pytest.approx(0.05)
+    assert motion.times[-1] == pytest.approx(rollouts.steps[0] * 0.04)
+    assert motion.success in (True, False)
 
 
 class Fragile(Pole):
@@ -220,18 +220,18 @@ class Compiled(Fragile):
 
 @pytest.mark.parametrize("kind", [Fragile, Compiled])
 def test_a_rollout_that_blows_up_fails_alone(kind):
-    made = runner(kind)
-    theta = thetas(made, 3)
-    rollouts = made.rollouts(theta, [None, (1, 1, 1, 1), None])
+    runner = new_runner(kind)
+    theta = thetas(runner, 3)
+    rollouts = runner.rollouts(theta, [None, (1, 1, 1, 1), None])
     assert rollouts.failed.tolist() == [False, True, False]
     assert rollouts.returns[1] == RETURN_FLOOR
     assert rollouts.clamped.tolist() == [False, True, False]
     assert all(np.isfinite(values).all() for values in arrays(rollouts).values())
-    same(rollouts, 2, made.rollouts(theta[2:], [None]), 0)
+    same(rollouts, 2, runner.rollouts(theta[2:], [None]), 0)
 
 
 def broken(**methods) -> Runner:
-    return runner(type("Broken", (Pole,), methods))
+    return new_runner(type("Broken", (Pole,), methods))
 
 
 @pytest.mark.parametrize(
@@ -266,9 +266,9 @@ def test_arrays_that_make_no_sense_are_named(methods, line):
 
 
 def test_an_observation_that_is_not_finite_later_is_an_error():
-    made = broken(observe=lambda _, sim: sim.qpos / (1.0 if sim.t < 2 else np.zeros(1)))
+    runner = broken(observe=lambda _, sim: sim.qpos / (1.0 if sim.t < 2 else np.zeros(1)))
     with np.errstate(all="ignore"), pytest.raises(TaskError, match="observe is not finite before control step 3"):
-        made.rollouts(np.zeros((2, made.size)), [None, None])
+        runner.rollouts(np.zeros((2, runner.size)), [None, None])
 
 
 @pytest.mark.parametrize(
@@ -294,9 +294,9 @@ def test_classes_that_make_no_sense_are_named(attributes, line):
 
 
 def test_an_observation_keeps_its_length():
-    made = broken(observe=lambda _, sim: np.zeros((len(sim), 2 + sim.t // 3)))
+    runner = broken(observe=lambda _, sim: np.zeros((len(sim), 2 + sim.t // 3)))
     with pytest.raises(TaskError, match=r"shape \(1, 3\); expected an array of shape \(1, 2\)"):
-        made.rollouts(thetas(made, 1), [None])
+        runner.rollouts(thetas(runner, 1), [None])
 
 
 def test_names_that_sim_does_not_have_are_named():
@@ -324,12 +324,12 @@ class Whole(Pole):
 
 
 def test_whole_rollouts_can_be_scored_at_once():
-    made, step = runner(Whole), runner()
-    theta = thetas(made, 7, 4.0)
-    once, each = made.rollouts(theta, SEEDS), step.rollouts(theta, SEEDS)
+    whole, step = new_runner(Whole), new_runner()
+    theta = thetas(whole, 7, 4.0)
+    once, each = whole.rollouts(theta, SEEDS), step.rollouts(theta, SEEDS)
     np.testing.assert_allclose(once.terms[..., 0], each.terms[..., 0], rtol=1e-15)
-    assert not made.spec.success
-    assert made.spec.terms == ("reward",)
+    assert not whole.spec.success
+    assert whole.spec.terms == ("reward",)
 
 
 def test_the_return_is_discounted_and_never_looks_good_when_it_overflows():
@@ -344,8 +344,8 @@ def test_the_return_is_discounted_and_never_looks_good_when_it_overflows():
 
 
 def test_sim_shows_what_is_going_and_follows_it():
-    made = runner()
-    sim = made.sim
+    runner = new_runner()
+    sim = runner.sim
     sim.begin(3)
     sim.qpos[:, 0] = (1.0, 2.0, 3.0)
     sim.own["name"] = np.array([10, 20, 30])
@@ -358,7 +358,7 @@ def test_sim_shows_what_is_going_and_follows_it():
 
 
 def test_a_policy_of_another_shape_is_named():
-    made = runner()
-    made.policy.act = lambda prepared, x: np.zeros(len(x))
+    runner = new_runner()
+    runner.policy.act = lambda prepared, x: np.zeros(len(x))
     with pytest.raises(TaskError, match=r"act of the policy gave an array of shape \(2,\)"):
-        made.rollouts(thetas(made, 2), [None, None])
+        runner.rollouts(thetas(runner, 2), [None, None])

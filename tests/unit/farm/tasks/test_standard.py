@@ -32,21 +32,22 @@ class Cart(Task):
 def test_origin_and_spread() -> None:
     task = Cart()
     np.testing.assert_array_equal(nominal(task), [0.5, 7.0, 0.5, 0.0])
-    found = standard(task, 0.25)
-    np.testing.assert_array_equal(found["origin"], nominal(task))
-    own = found["spread"][0]
-    assert 0.001 < own < 0.5
-    np.testing.assert_allclose(found["spread"], [own, own * 2 / 12, own, own * 2 / 12])  # a third of the mean
+    constants = standard(task, 0.25)
+    np.testing.assert_array_equal(constants["origin"], nominal(task))
+    spread = constants["spread"][0]
+    assert 0.001 < spread < 0.5
+    # A third of the mean.
+    np.testing.assert_allclose(constants["spread"], [spread, spread * 2 / 12, spread, spread * 2 / 12])
     again = standard(Cart(), 0.25)
-    assert again["spread"].tobytes() == found["spread"].tobytes()
+    assert again["spread"].tobytes() == constants["spread"].tobytes()
 
 
 def test_parts_are_measured_by_themselves() -> None:
     task = Cart()
     task.unit, task.parts = 1000.0, (2, 1, 1)
-    own, still, large, nothing = standard(task, 0.25)["spread"]
-    assert still == pytest.approx(own / 6)
-    assert large == pytest.approx(1000 * own)
+    base, still, large, nothing = standard(task, 0.25)["spread"]
+    assert still == pytest.approx(base / 6)
+    assert large == pytest.approx(1000 * base)
     assert nothing == 1.0
     task.parts = (2, 1)
     with pytest.raises(TaskError, match=r"parts are \(2, 1\); expected sizes that add up to the observation's 4"):

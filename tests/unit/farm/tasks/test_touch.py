@@ -130,12 +130,12 @@ def test_noise_is_each_rollouts_own_and_part_of_the_reading() -> None:
     task = Press(farm.TouchConfig(touch_noise=0.5, touch_interval=2))
     seeds: list[tuple[int, ...] | None] = [(1, 2, 3, i) for i in range(30)]
     felt, true = played(task, [*seeds, None])
-    held = true[np.arange(40) // 2 * 2]
-    noise = (felt - held)[:, :-1]
+    samples = true[np.arange(40) // 2 * 2]
+    noise = (felt - samples)[:, :-1]
     assert np.std(noise) == pytest.approx(0.5, rel=0.05)
     assert abs(noise.mean()) < 0.03
     np.testing.assert_array_equal(felt[0::2], felt[1::2], err_msg="a reading that holds has one noise")
-    np.testing.assert_array_equal(felt[:, -1], held[:, -1], err_msg="none under nominal conditions")
+    np.testing.assert_array_equal(felt[:, -1], samples[:, -1], err_msg="none under nominal conditions")
     alone, _ = played(task, [seeds[7]])
     np.testing.assert_array_equal(alone[:, 0], felt[:, 7], err_msg="whatever the batch")
 
@@ -153,7 +153,7 @@ def test_channel() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pads", "shape", "said"),
+    ("pads", "shape", "line"),
     [
         ({"p": ("nobody",)}, None, "touch: there is no sensor 'nobody' in the model"),
         ({"p": ("height",)}, None, "touch: sensor 'height' is of kind jointpos; expected touch, contact or tactile"),
@@ -164,10 +164,10 @@ def test_channel() -> None:
         ({"p": ("a",) * 162, "q": ("skin",)}, None, "touch: the sensors' units are N and m; expected one"),
     ],
 )
-def test_what_cannot_be_felt_is_one_line(pads: Any, shape: Any, said: str) -> None:
+def test_what_cannot_be_felt_is_one_line(pads: Any, shape: Any, line: str) -> None:
     with pytest.raises(ConfigError) as error:
         farm.Touch(Press().model, pads, farm.TouchConfig(), 10, shape=shape)
-    assert str(error.value) == said
+    assert str(error.value) == line
 
 
 GRIPPER = Path(__file__).parents[4] / "examples/tasks/gripper.py"
@@ -178,10 +178,10 @@ def test_a_gripper_learns_to_lift_and_is_recorded_with_its_pads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    own = ["--touch-noise", "0.05", "--touch-delay", "1", "--touch-interval", "2"]
+    sensing = ["--touch-noise", "0.05", "--touch-delay", "1", "--touch-interval", "2"]
     flags = ["--policy", "linear", "--normalise", "--algorithm", "ars", "--initial-sigma", "0.1"]
     flags += ["--learning-rate-mu", "0.1", "--pairs", "10", "--generations", "15"]
-    assert main(["run", "--task", f"{GRIPPER}:Gripper", *own, *flags, "--workers", "1", "--name", "r"]) == 0
+    assert main(["run", "--task", f"{GRIPPER}:Gripper", *sensing, *flags, "--workers", "1", "--name", "r"]) == 0
     policy = farm.load("runs/r")
     first, last = (farm.load("runs/r", generation=g).rollout().trajectory for g in (0, 15))
     assert last.value > first.value + 15.0

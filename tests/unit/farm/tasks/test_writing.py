@@ -117,7 +117,7 @@ WRITERS = [Pushes, Twists, Moves, Jumps, Couples, Feels]
 SEEDS: list[Any] = [None, (1,), (1,), (2,), (3,), (4,), (5,), (6,)]
 
 
-def runner(kind: type[Task]) -> Runner:
+def new_runner(kind: type[Task]) -> Runner:
     task = kind()
     spec, config = specification(task), FeaturesConfig(features=10)
     return Runner(task, Direct(config, spec, Direct.draw(config, spec, np.random.default_rng(0))))
@@ -133,17 +133,20 @@ def same(one: Rollouts, row: int, other: Rollouts, at: int) -> None:
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_what_a_task_writes_does_not_depend_on_the_batch(kind: type[Writer]) -> None:
-    made = runner(kind)
-    theta = np.random.default_rng(1).normal(0.0, 2.0, (len(SEEDS), made.size))
-    together = made.rollouts(theta, SEEDS)
+    runner = new_runner(kind)
+    theta = np.random.default_rng(1).normal(0.0, 2.0, (len(SEEDS), runner.size))
+    together = runner.rollouts(theta, SEEDS)
     assert len(set(together.steps.tolist())) > 3, "rows are removed while others go on"
     order = [3, 6, 0, 7, 5, 1, 4, 2]
-    permuted, fine = made.rollouts(theta[order], [SEEDS[i] for i in order]), made.rollouts(theta, SEEDS, physics=True)
+    permuted, fine = (
+        runner.rollouts(theta[order], [SEEDS[i] for i in order]),
+        runner.rollouts(theta, SEEDS, physics=True),
+    )
     assert fine.returns.tobytes() == together.returns.tobytes()
     for at, row in enumerate(order):
         same(together, row, permuted, at)
-        same(together, row, runner(kind).rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
-    plain = runner(Writer).rollouts(theta, SEEDS)
+        same(together, row, new_runner(kind).rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+    plain = new_runner(Writer).rollouts(theta, SEEDS)
     assert (plain.returns != together.returns).any(), "it counts"
 
 
@@ -192,7 +195,7 @@ def test_what_mujoco_computes_cannot_be_written(name: str) -> None:
         getattr(sim, name)[...] = 0.0
 
     with pytest.raises(TaskError, match=r"test_writing.py, line \d+, cannot write getattr\(sim, name\)\[...\] = 0.0: "):
-        runner(wrong("act", write))
+        new_runner(wrong("act", write))
 
 
 def put_site(sim):
@@ -231,7 +234,7 @@ def put_state(sim):
 )  # fmt: skip
 def test_what_cannot_be_written_is_one_line(method: str, write: Any, line: str) -> None:
     with pytest.raises(TaskError, match=line):
-        runner(wrong(method, write))
+        new_runner(wrong(method, write))
 
 
 def test_an_array_that_was_kept_cannot_be_written_later() -> None:
@@ -246,7 +249,7 @@ def test_an_array_that_was_kept_cannot_be_written_later() -> None:
             return super().reward(sim, action)
 
     with pytest.raises(TaskError, match=r"cannot write kept\[.qpos.\]\[:\] = 0.0: the array is read-only"):
-        runner(Keeps)
+        new_runner(Keeps)
 
 
 def test_a_state_that_makes_no_sense_fails_alone() -> None:
@@ -254,9 +257,9 @@ def test_a_state_that_makes_no_sense_fails_alone() -> None:
         def write(self, sim, now, size):
             sim.qpos[size > 1.0, 0] = np.inf
 
-    made = runner(Breaks)
-    found = made.rollouts(np.zeros((2, made.size)), [(1,), None])
-    assert found.failed.tolist() == [True, False]
+    runner = new_runner(Breaks)
+    rollouts = runner.rollouts(np.zeros((2, runner.size)), [(1,), None])
+    assert rollouts.failed.tolist() == [True, False]
 
 
 def test_all_that_can_be_written_is_a_state() -> None:

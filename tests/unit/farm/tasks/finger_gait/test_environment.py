@@ -49,11 +49,11 @@ def episode(env, policy, theta, seed):
 def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, motion, seed, kind, config):
     task = FingerGait(FingerGaitConfig(state=state, perturb=seed is not None, action=action, motion=motion))
     policy = kind(config, task.spec(), {})
-    drawn = None
+    farm_seed = None
     if seed is not None:
-        drawn = tuple(np.random.default_rng(seed).integers(0, 2**32, 4).tolist())
+        farm_seed = tuple(np.random.default_rng(seed).integers(0, 2**32, 4).tolist())
     thetas = np.random.default_rng(1).normal(1.0 if kind is Kernel else 0.0, 0.8, (4, policy.size))
-    rollouts = Runner(task, policy).rollouts(thetas, [drawn] * len(thetas))
+    rollouts = Runner(task, policy).rollouts(thetas, [farm_seed] * len(thetas))
     env = FingerGaitEnv(action=action, state=state, perturb=task.config.perturb, motion=motion)
     for i, theta in enumerate(thetas):
         rewards, terms, terminated, success = episode(env, policy, theta, seed)
@@ -72,9 +72,9 @@ def test_success_is_the_farms():
     start = env._task.start_commands[0]
     for command, expected in ((goal, True), (start, False)):
         env.reset()
-        said = [env.step(command) for _ in range(steps)]
-        assert [bool(truncated) for _, _, _, truncated, _ in said] == [False] * (steps - 1) + [True]
-        assert [info["is_success"] for *_, info in said] == [False] * (steps - 1) + [expected]
+        transitions = [env.step(command) for _ in range(steps)]
+        assert [bool(truncated) for _, _, _, truncated, _ in transitions] == [False] * (steps - 1) + [True]
+        assert [info["is_success"] for *_, info in transitions] == [False] * (steps - 1) + [expected]
 
 
 def test_dropping_ends_an_episode_with_the_penalty():
@@ -115,10 +115,10 @@ def test_seeds_perturb_and_repeat():
 @pytest.mark.parametrize(("state", "perturb"), [*((state, True) for state in STATES), ("joints", False)])
 def test_gymnasium_finds_it_and_has_nothing_to_say(state, perturb):
     env = gymnasium.make(ID, state=state, perturb=perturb)
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as records:
         warnings.simplefilter("always")
         check_env(env.unwrapped, skip_render_check=True)
-    assert [str(warning.message) for warning in said] == []
+    assert [str(warning.message) for warning in records] == []
     assert env.observation_space.shape == (STATES[state].size,)
 
 
@@ -159,5 +159,5 @@ def _run(code: str) -> "subprocess.CompletedProcess[str]":
 def test_a_program_that_imports_gymnasium_alone_makes_checks_and_renders_it():
     if _run("from mujoco.egl import GLContext; GLContext(8, 8)").returncode:
         pytest.skip("no EGL: nothing renders without a screen here")
-    ended = _run(_CHECK)
-    assert (ended.returncode, ended.stderr) == (0, "")
+    process = _run(_CHECK)
+    assert (process.returncode, process.stderr) == (0, "")

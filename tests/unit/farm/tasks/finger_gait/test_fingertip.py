@@ -43,11 +43,11 @@ def pressed(task: FingerGait) -> Trajectory:
     for finger, row, column in PLACES:
         joints = LOWER + rng.uniform(0.1, 0.5, 8) * (UPPER - LOWER)
         frames.append(press(task, joints, finger, towards(PITCH[row], ACROSS[column])))
-    shown = {name: np.concatenate([frame[name] for frame in frames]) for name in frames[0]}
+    arrays = {name: np.concatenate([frame[name] for frame in frames]) for name in frames[0]}
     count, scene = len(frames), Scene(task.model)
     return Trajectory.of(
-        times=0.1 * np.arange(count), bodies=scene.poses(shown["qpos"]), actions=np.zeros((count, 8)),
-        terms=np.zeros((count, 5)), channels=task.show(shown), value=0.0, success=False,
+        times=0.1 * np.arange(count), bodies=scene.poses(arrays["qpos"]), actions=np.zeros((count, 8)),
+        terms=np.zeros((count, 5)), channels=task.show(arrays), value=0.0, success=False,
     )  # fmt: skip
 
 

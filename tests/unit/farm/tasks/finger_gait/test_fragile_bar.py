@@ -25,9 +25,9 @@ SEEDS: list[Seed] = [(5, 0, 0, i) for i in range(24)]
 
 @pytest.fixture(scope="module")
 def runner() -> Iterator[Runner]:
-    made = Runner(FragileBar(EXACT), SimpleNamespace(spec=None))  # type: ignore[arg-type]
-    yield made
-    made.close()
+    simulator = Runner(FragileBar(EXACT), SimpleNamespace(spec=None))  # type: ignore[arg-type]
+    yield simulator
+    simulator.close()
 
 
 def played(runner: Runner, act: Any, seeds: list[Seed] = SEEDS) -> Rollouts:
@@ -39,8 +39,8 @@ def played(runner: Runner, act: Any, seeds: list[Seed] = SEEDS) -> Rollouts:
             batch.step(act(batch.observe()[:, -3:], runner.sim.t))
         return batch.rollouts()
 
-    found: Rollouts = again(play)
-    return found
+    rollouts: Rollouts = again(play)
+    return rollouts
 
 
 def closing(rate: Any, force: np.ndarray) -> np.ndarray:
@@ -111,8 +111,8 @@ def test_a_drop_costs_every_step_that_is_left() -> None:
 
 
 def test_a_higher_surface_is_touched_sooner(runner: Runner) -> None:
-    found = played(runner, lambda force, _: closing(0.02, force))
-    first = (found.frames["force"].sum(axis=-1)[..., MIDDLE] > 0).argmax(axis=1)
+    rollouts = played(runner, lambda force, _: closing(0.02, force))
+    first = (rollouts.frames["force"].sum(axis=-1)[..., MIDDLE] > 0).argmax(axis=1)
     heights = [np.random.default_rng(seed).uniform(-HEIGHT, HEIGHT) for seed in SEEDS]
     assert len(set(first.tolist())) > 3
     assert np.corrcoef(heights, first)[0, 1] < -0.8

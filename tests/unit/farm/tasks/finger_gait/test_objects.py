@@ -29,7 +29,7 @@ class Undrawn(FingerGait):
         return int(rng.bit_generator.state["state"]["state"] % len(self.simulated))
 
 
-def runner(kind, names):
+def new_runner(kind, names):
     task = kind(FingerGaitConfig(object=names, state="joints+tactile", motion=0.3, steps=5))
     config = FeaturesConfig(features=10)
     return Runner(task, Direct(config, task.spec(), Direct.draw(config, task.spec(), np.random.default_rng(0))))
@@ -37,18 +37,18 @@ def runner(kind, names):
 
 def test_each_rollout_has_the_bits_of_its_object_alone():
     seeds = [None, (0,), (1,), (2,)]
-    made = runner(Undrawn, OBJECTS)
-    theta = np.random.default_rng(1).normal(0.0, 0.1, (len(seeds), made.policy.size))
-    found = made.rollouts(theta, seeds)
-    assert found.which[0] == 0
-    assert set(found.which.tolist()) == {0, 1}
+    runner = new_runner(Undrawn, OBJECTS)
+    theta = np.random.default_rng(1).normal(0.0, 0.1, (len(seeds), runner.policy.size))
+    rollouts = runner.rollouts(theta, seeds)
+    assert rollouts.which[0] == 0
+    assert set(rollouts.which.tolist()) == {0, 1}
     for which, name in enumerate(OBJECTS):
-        rows = np.flatnonzero(found.which == which)
-        alone = runner(FingerGait, name).rollouts(theta[rows], [seeds[row] for row in rows.tolist()])
+        rows = np.flatnonzero(rollouts.which == which)
+        alone = new_runner(FingerGait, name).rollouts(theta[rows], [seeds[row] for row in rows.tolist()])
         for array in ("returns", "success", "terms", "actions"):
-            assert getattr(found, array)[rows].tobytes() == getattr(alone, array).tobytes()
+            assert getattr(rollouts, array)[rows].tobytes() == getattr(alone, array).tobytes()
         for array, values in alone.frames.items():
-            assert found.frames[array][rows].tobytes() == values.tobytes()
+            assert rollouts.frames[array][rows].tobytes() == values.tobytes()
 
 
 def test_one_name_is_a_text_and_several_are_flags():
@@ -60,8 +60,8 @@ def test_one_name_is_a_text_and_several_are_flags():
     ):
         parsed = settings.parse(FingerGaitConfig, words, "farm run", FingerGaitConfig())
         assert parsed.object == expected
-        told = settings.to_dict(parsed)
-        assert settings.from_dict(FingerGaitConfig, told, "task") == parsed
+        values = settings.to_dict(parsed)
+        assert settings.from_dict(FingerGaitConfig, values, "task") == parsed
     two = FingerGaitConfig(object=("bolt", "bar"))
     assert settings.parse(FingerGaitConfig, ("--object", "thin-bar"), "farm replay", two).object == "thin-bar"
 
@@ -94,17 +94,17 @@ LEVER = """<mujoco>{compiler}<worldbody><body name="object" pos="0.08 0.04 0.02"
 def test_angles_of_an_object_are_degrees_unless_its_file_says_radians(tmp_path):
     degrees = {"turn": 60, "low": -90, "high": 30}
     radians = {name: np.radians(angle) for name, angle in degrees.items()}
-    found = []
+    poses = []
     for compiler, angles in (
         ("", degrees), ('<compiler angle="degree"/>', degrees), ('<compiler angle="radian"/>', radians),
     ):  # fmt: skip
-        path = tmp_path / f"{len(found)}.xml"
+        path = tmp_path / f"{len(poses)}.xml"
         path.write_text(LEVER.format(compiler=compiler, **angles))
-        made = mujoco.MjModel.from_xml_string(model.mjcf(model.files([str(path)], "opposed")))
-        found.append([made.geom("handle").quat, made.geom("lid").quat, made.joint("lid").range])
-        hand = made.joint("index_1")
+        mj_model = mujoco.MjModel.from_xml_string(model.mjcf(model.files([str(path)], "opposed")))
+        poses.append([mj_model.geom("handle").quat, mj_model.geom("lid").quat, mj_model.joint("lid").range])
+        hand = mj_model.joint("index_1")
         assert hand.range == pytest.approx([-0.196, 1.61])
-    for values in found:
+    for values in poses:
         assert values[0] == pytest.approx([np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6), 0.0])
         assert values[1] == pytest.approx([np.cos(np.pi / 6), 0.0, 0.0, np.sin(np.pi / 6)])
         assert values[2] == pytest.approx([-np.pi / 2, np.pi / 6])
@@ -112,9 +112,9 @@ def test_angles_of_an_object_are_degrees_unless_its_file_says_radians(tmp_path):
 
 def test_the_axes_of_cylinder_and_bolt_lie_across_the_fingers():
     for name, geom in (("cylinder", "cylinder"), ("bolt", "head")):
-        made = mujoco.MjModel.from_xml_string(model.mjcf(model.files([name], "opposed")))
+        mj_model = mujoco.MjModel.from_xml_string(model.mjcf(model.files([name], "opposed")))
         axis = np.zeros(9)
-        mujoco.mju_quat2Mat(axis, made.geom(geom).quat)
+        mujoco.mju_quat2Mat(axis, mj_model.geom(geom).quat)
         assert np.abs(axis.reshape(3, 3)[:, 2]) == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
 
 
@@ -130,6 +130,6 @@ def test_one_policy_holds_five_objects_two_of_which_it_never_met(tmp_path):
     learnt(configure("finger-gait", object=trained), tmp_path / "r", 2)
     for thing in (*trained, "thin-bar", "bolt"):
         policy = load(tmp_path / "r", object=thing)
-        found = policy.runner.run(policy.mu, evaluation_jobs(100, 1))
+        outcome = policy.runner.run(policy.mu, evaluation_jobs(100, 1))
         least = 0.8 if thing == "cylinder" else 0.95  # of 200 it is 0.91, and 1: docs/results/several-objects.md
-        assert found.flags[:100, 0].mean() > least, thing
+        assert outcome.flags[:100, 0].mean() > least, thing

@@ -18,11 +18,11 @@ ORACLE = {
 
 
 def test_the_numbers_drawn_for_a_seed_never_change():
-    drawn = Perturbation.draw(np.random.default_rng(2016), STEPS, SensingConfig())
-    assert drawn.friction == ORACLE["friction"]
-    assert drawn.mass == ORACLE["mass"]
-    assert drawn.displacement.tolist() == ORACLE["displacement"]
-    assert drawn.noise[0, :3].tolist() == ORACLE["noise"]
+    perturbation = Perturbation.draw(np.random.default_rng(2016), STEPS, SensingConfig())
+    assert perturbation.friction == ORACLE["friction"]
+    assert perturbation.mass == ORACLE["mass"]
+    assert perturbation.displacement.tolist() == ORACLE["displacement"]
+    assert perturbation.noise[0, :3].tolist() == ORACLE["noise"]
 
 
 def test_the_same_seed_draws_the_same():
@@ -42,22 +42,22 @@ def test_the_order_of_draws_is_friction_mass_displacement_noise(steps):
         rng.uniform(-0.002, 0.002, 3),
         rng.normal(0, 0.01, (steps, 8)),
     )
-    drawn = Perturbation.draw(np.random.default_rng(4), steps, SensingConfig())
-    for name, wanted in zip(("friction", "mass", "displacement", "noise"), expected, strict=True):
-        np.testing.assert_array_equal(getattr(drawn, name), wanted)
+    perturbation = Perturbation.draw(np.random.default_rng(4), steps, SensingConfig())
+    for name, value in zip(("friction", "mass", "displacement", "noise"), expected, strict=True):
+        np.testing.assert_array_equal(getattr(perturbation, name), value)
 
 
 def test_draws_fill_their_ranges():
     rng = np.random.default_rng(0)
-    drawn = [Perturbation.draw(rng, STEPS, SensingConfig()) for _ in range(500)]
-    for values in ([p.friction for p in drawn], [p.mass for p in drawn]):
+    perturbations = [Perturbation.draw(rng, STEPS, SensingConfig()) for _ in range(500)]
+    for values in ([p.friction for p in perturbations], [p.mass for p in perturbations]):
         assert 0.8 <= min(values) < 0.81
         assert 1.19 < max(values) <= 1.2
-    places = np.stack([p.displacement for p in drawn])
+    places = np.stack([p.displacement for p in perturbations])
     assert np.abs(places).max() <= DISPLACEMENT == 0.002
     assert (places.max(axis=0) > 0.0019).all()
     assert (places.min(axis=0) < -0.0019).all()
-    noise = np.stack([p.noise for p in drawn])
+    noise = np.stack([p.noise for p in perturbations])
     assert noise.shape == (500, STEPS, 8)
     assert noise.std() == pytest.approx(0.01, rel=0.02)
     assert abs(noise.mean()) < 1e-4

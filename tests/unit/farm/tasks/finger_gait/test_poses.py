@@ -20,7 +20,7 @@ from farm.tasks.rollouts import Rollouts, whole
 def held(config: FingerGaitConfig) -> tuple[FingerGait, Rollouts]:
     """A rollout whose targets stay those of the start grip."""
     task = FingerGait(config)
-    sim = Sim(task.engine(lambda own: BatchEngine(own, 1)))
+    sim = Sim(task.engine(lambda mj_model: BatchEngine(mj_model, 1)))
 
     def hold() -> Rollouts:
         task.setup(sim)

@@ -29,7 +29,7 @@ SPREAD = {"direct": 0.2, "cosine": 0.2, "projected": 2.0, "kernel": 0.3}
 
 
 @functools.cache
-def runner(policy="projected", **settings) -> Runner:
+def new_runner(policy="projected", **settings) -> Runner:
     """A runner that tests share: no run leaves anything behind (a test of the loop says so)."""
     task = FingerGait(FingerGaitConfig(**settings))
     kind, spec = plugins.find("policies", policy).target, task.spec()
@@ -37,8 +37,8 @@ def runner(policy="projected", **settings) -> Runner:
     return Runner(task, kind(config, spec, kind.draw(config, spec, np.random.default_rng(0))))
 
 
-def parameters(policy, made, count, seed=1):
-    return np.random.default_rng(seed).normal(CENTRE[policy], SPREAD[policy], (count, made.policy.size))
+def parameters(policy, runner, count, seed=1):
+    return np.random.default_rng(seed).normal(CENTRE[policy], SPREAD[policy], (count, runner.policy.size))
 
 
 class Fixed(Policy):
@@ -57,9 +57,9 @@ def loaded(name):
 
 
 def fixed(value, seeds=(None,), physics=False, **settings) -> Rollouts:
-    made = runner(**settings)
-    other = copy.copy(made)
-    other.policy = Fixed(Fixed.Config(), made.spec, {})
+    runner = new_runner(**settings)
+    other = copy.copy(runner)
+    other.policy = Fixed(Fixed.Config(), runner.spec, {})
     return other.rollouts(np.tile(value, (len(seeds), 1)).astype(float), list(seeds), physics=physics)
 
 
@@ -91,21 +91,21 @@ def plain_images(force, contact, tips, axes):
     """Spread the forces where they act in the fingertips' frames, (3, 18)."""
     place = np.zeros((3, 4, 3))
     for f, c in np.ndindex(3, 4):
-        away, own = contact[f, c] - tips[f], axes[f].reshape(3, 3)
+        away, basis = contact[f, c] - tips[f], axes[f].reshape(3, 3)
         for k in range(3):
-            place[f, c, k] = own[0, k] * away[0] + own[1, k] * away[1] + own[2, k] * away[2]
+            place[f, c, k] = basis[0, k] * away[0] + basis[1, k] * away[1] + basis[2, k] * away[2]
     return touch.image(force, place)
 
 
-def plain_close(own, commands, displacement):
+def plain_close(model, commands, displacement):
     """Close a grip round the frozen object and let it go."""
-    data, waiting = mujoco.MjData(own), grasp()[()]
+    data, waiting = mujoco.MjData(model), grasp()[()]
     data.qpos[:8] = waiting
     data.qpos[8:11] += displacement
     data.mocap_pos[0], data.mocap_quat[0] = data.qpos[8:11], data.qpos[11:]
     for t in range(CLOSING):
         data.ctrl[:] = waiting + (commands - waiting) * min(1.0, (t + 1) / RAMP)
-        mujoco.mj_step(own, data)
+        mujoco.mj_step(model, data)
     data.eq_active[0] = 0
     return data
 
@@ -113,10 +113,10 @@ def plain_close(own, commands, displacement):
 @functools.cache
 def plain_goal(grip):
     """The demonstration of a grip."""
-    own = loaded("bar").model
-    data = plain_close(own, grasp()[GRIPS[grip]], np.zeros(3))
+    model = loaded("bar").model
+    data = plain_close(model, grasp()[GRIPS[grip]], np.zeros(3))
     for _ in range(SETTLE):
-        mujoco.mj_step(own, data)
+        mujoco.mj_step(model, data)
     qpos, *felt = plain_measure(data)
     image = plain_images(*felt)
     return Felt(joints=qpos[:8], images=image, points=touch.contact_points(image))
@@ -129,53 +129,53 @@ def plain_observation(task, joints, *felt):
     return np.concatenate([parts[part] for part in task.config.state.split("+")], axis=1)
 
 
-def plain_rollout(made, theta, seed):
+def plain_rollout(runner, theta, seed):
     """Returns, steps, actions and frames of one rollout, stepped on its own."""
-    task, steps = made.task, made.task.steps
-    drawn = Perturbation.draw(np.random.default_rng(seed), steps, SensingConfig())
-    own = Perturbation.none(steps) if seed is None else drawn
-    changed = copy.copy(loaded("bar").model)
-    body = changed.body("object").id
-    changed.geom_friction[:] *= own.friction
-    changed.body_mass[body] *= own.mass
-    changed.body_inertia[body] *= own.mass
-    mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    task, steps = runner.task, runner.task.steps
+    draw = Perturbation.draw(np.random.default_rng(seed), steps, SensingConfig())
+    perturbation = Perturbation.none(steps) if seed is None else draw
+    model = copy.copy(loaded("bar").model)
+    body = model.body("object").id
+    model.geom_friction[:] *= perturbation.friction
+    model.body_mass[body] *= perturbation.mass
+    model.body_inertia[body] *= perturbation.mass
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     start = last = grasp()[GRIPS[task.config.start_grip]]
-    data = plain_close(changed, start, own.displacement)
+    data = plain_close(model, start, perturbation.displacement)
     first = now = plain_measure(data)
     frames = [np.zeros((1, steps, *part.shape)) for part in now]
-    actions, prepared, count = np.zeros((1, steps, 8)), made.policy.prepare(theta[None]), steps
+    actions, prepared, count = np.zeros((1, steps, 8)), runner.policy.prepare(theta[None]), steps
     for t in range(steps):
-        x = plain_observation(task, now[0][:8] + own.noise[t], *now[1:])
-        actions[:, t] = made.policy.act(prepared, x)
+        x = plain_observation(task, now[0][:8] + perturbation.noise[t], *now[1:])
+        actions[:, t] = runner.policy.act(prepared, x)
         base = {"offset": start, "absolute": 0.0, "increment": last}[task.config.action]
         target = np.nan_to_num(base + actions[0, t], nan=0.0)
         limits = (LOWER, UPPER) if task.config.clip else (-1e6, 1e6)
         last = data.ctrl[:] = np.clip(target, *limits)
         last = last.copy()
         for _ in range(SUBSTEPS):
-            mujoco.mj_step(changed, data)
+            mujoco.mj_step(model, data)
         now = plain_measure(data)
         for rows, part in zip(frames, now, strict=True):
             rows[0, t] = part
         if not touching(now[1]):
             count = t + 1
             break
-    task.goals, kept = [plain_goal(task.config.goal_grip)], task.goals
+    task.goals, goals = [plain_goal(task.config.goal_grip)], task.goals
     names = dict(zip(("qpos", "force", "contact", "tip", "axes"), frames, strict=True))
     record = Record(names, {"qpos": first[0][None]}, actions, np.array([count]), np.array([False]), np.zeros(1, int))
     score = task.score(record)
-    task.goals = kept
+    task.goals = goals
     returns, _ = discounted(score.terms, task.config.gamma, task.return_scale)
     return {"returns": returns, "terms": score.terms, "actions": actions, "success": score.success, **names}
 
 
-def assert_plain(made, theta, seeds):
-    rollouts = made.rollouts(theta, seeds)
+def assert_plain(runner, theta, seeds):
+    rollouts = runner.rollouts(theta, seeds)
     for i, seed in enumerate(seeds):
-        plain = plain_rollout(made, theta[i], seed)
-        found = {name: getattr(rollouts, name) for name in ("returns", "terms", "actions", "success")}
-        for name, values in (found | rollouts.frames).items():
+        plain = plain_rollout(runner, theta[i], seed)
+        results = {name: getattr(rollouts, name) for name in ("returns", "terms", "actions", "success")}
+        for name, values in (results | rollouts.frames).items():
             if name in plain:
                 assert values[i].tobytes() == plain[name][0].tobytes(), f"{name} of rollout {i}"
     return rollouts
@@ -183,14 +183,14 @@ def assert_plain(made, theta, seeds):
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_a_batch_equals_plain_rollouts_bit_for_bit(policy):
-    made = runner(policy, state="joints+tactile")
-    assert_plain(made, parameters(policy, made, 4), [None, *trials(2), None])
+    runner = new_runner(policy, state="joints+tactile")
+    assert_plain(runner, parameters(policy, runner, 4), [None, *trials(2), None])
 
 
 def test_the_rollouts_compared_drop_and_hold():
     for policy in POLICIES:
-        made = runner(policy)
-        steps = made.rollouts(parameters(policy, made, 32), [None] * 32).steps
+        runner = new_runner(policy)
+        steps = runner.rollouts(parameters(policy, runner, 32), [None] * 32).steps
         assert 0 < (steps == 15).sum() < 32, policy
 
 
@@ -205,14 +205,14 @@ def test_the_rollouts_compared_drop_and_hold():
     ids=lambda settings: "-".join(settings),
 )
 def test_other_settings_equal_plain_rollouts(settings):
-    made = runner("direct", **settings)
-    assert_plain(made, parameters("direct", made, 3), [None, *trials(2)])
+    runner = new_runner("direct", **settings)
+    assert_plain(runner, parameters("direct", runner, 3), [None, *trials(2)])
 
 
 def test_huge_unclipped_actions_equal_plain_rollouts():
-    made = runner("direct", clip=False)
-    theta = parameters("direct", made, 4) * np.array([1e3, 1e9, 1e160, 1e307])[:, None]
-    rollouts = assert_plain(made, theta, [None] * 4)
+    runner = new_runner("direct", clip=False)
+    theta = parameters("direct", runner, 4) * np.array([1e3, 1e9, 1e160, 1e307])[:, None]
+    rollouts = assert_plain(runner, theta, [None] * 4)
     assert rollouts.clamped.tolist() == [False, True, True, True]
     assert (rollouts.returns[1:] == -1e12).all()
 
@@ -258,8 +258,8 @@ def test_the_demonstrated_grip_succeeds_when_perturbed_and_the_start_grip_does_n
 
 def test_friction_of_all_rollouts_is_a_setting():
     slippery = fixed(goal_offset(), [None, (1, 2, 3, 4)], friction=0.5)
-    own = fixed(goal_offset(), [None, (1, 2, 3, 4)])
-    assert (slippery.frames["qpos"] != own.frames["qpos"]).any(axis=(1, 2)).all()
+    default = fixed(goal_offset(), [None, (1, 2, 3, 4)])
+    assert (slippery.frames["qpos"] != default.frames["qpos"]).any(axis=(1, 2)).all()
 
 
 # ---------------------------------------------------------------- grips are found, not typed in
@@ -321,17 +321,17 @@ def test_waiting_fingers_keep_their_distance():
 )
 def test_an_object_that_cannot_be_gripped_is_a_clear_error(thing, kind, mass, line):
     with pytest.raises(ConfigError, match=line):
-        runner(object=thing(kind, mass=mass))
+        new_runner(object=thing(kind, mass=mass))
 
 
 def test_settings_that_name_nothing_are_clear_errors(tmp_path):
     words = r"'middle\+thumb' does not hold object 'bar' in pose 'opposed', pressing with 3 N \(middle\) and 6.5 N"
     with pytest.raises(ConfigError, match=words):
-        runner(start_grip="middle+thumb")
+        new_runner(start_grip="middle+thumb")
     with pytest.raises(ConfigError, match="unknown object 'spoon'; known are .*bar"):
-        runner(object="spoon")
+        new_runner(object="spoon")
     with pytest.raises(ConfigError, match="cannot read the object .*none.xml"):
-        runner(object=str(tmp_path / "none.xml"))
+        new_runner(object=str(tmp_path / "none.xml"))
 
 
 def test_a_command_does_not_depend_on_what_was_asked_before():

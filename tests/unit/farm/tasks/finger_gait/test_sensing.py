@@ -25,15 +25,15 @@ def observed(task: str = "fragile-bar", action: np.ndarray = CLOSING, **settings
     """Observations (T, B, d) of rollouts that repeat an action, and the fingers' true forces (T, B, 3)."""
     runner: Runner = problem(configure(task, **(EXACT | settings))).runner()
     try:
-        batch, seen, force = Batch(runner.task, runner.sim, SEEDS), [], []
+        batch, observations, force = Batch(runner.task, runner.sim, SEEDS), [], []
         while not batch.over:
             x = np.full((len(SEEDS), runner.task.spec().observation), np.nan)
             f = np.full((len(SEEDS), 3), np.nan)
             x[batch.active], f[batch.active] = batch.observe(), runner.task.measure(runner.sim)["force"].sum(axis=-1)
-            seen.append(x)
+            observations.append(x)
             force.append(f)
             batch.step(np.tile(action, (len(runner.sim), 1)))
-        return np.stack(seen), np.stack(force)
+        return np.stack(observations), np.stack(force)
     finally:
         runner.close()
 
@@ -47,9 +47,9 @@ def test_readings_have_no_errors_but_noise_and_bias_unless_asked():
 
 
 def test_the_fragile_bars_forces_are_read_with_errors():
-    own = FragileBarConfig()
-    assert (own.force_noise, own.force_hysteresis, own.force_dropout, own.force_delay) == (0.05, 0.1, 0.01, 0)
-    assert own.numb
+    bar = FragileBarConfig()
+    assert (bar.force_noise, bar.force_hysteresis, bar.force_dropout, bar.force_delay) == (0.05, 0.1, 0.01, 0)
+    assert bar.numb
     assert not SensingConfig().numb
 
 
@@ -77,11 +77,11 @@ def test_hysteresis_keeps_a_reading_within_its_share_of_the_force():
     lazy, _ = observed(state="tactile", force_hysteresis=0.2)
     before = lazy[:-1]
     low, high = 0.8 * now[1:], 1.2 * now[1:]
-    kept = (before >= low) & (before <= high)
-    assert 0.05 < kept[now[1:] > 0].mean() < 0.95, "of those with a force some stay and some move"
-    np.testing.assert_array_equal(lazy[1:][kept], before[kept])
+    in_band = (before >= low) & (before <= high)
+    assert 0.05 < in_band[now[1:] > 0].mean() < 0.95, "of those with a force some stay and some move"
+    np.testing.assert_array_equal(lazy[1:][in_band], before[in_band])
     np.testing.assert_allclose(
-        lazy[1:][~kept & ~np.isnan(now[1:])], np.clip(before, low, high)[~kept & ~np.isnan(now[1:])]
+        lazy[1:][~in_band & ~np.isnan(now[1:])], np.clip(before, low, high)[~in_band & ~np.isnan(now[1:])]
     )
 
 
@@ -90,9 +90,9 @@ def test_lost_readings_repeat_the_last_one():
     gaps, _ = observed(force_dropout=0.4)
     new = gaps[1:] == now[1:]
     repeated = gaps[1:] == gaps[:-1]
-    there = ~np.isnan(now[1:])
-    assert (new | repeated)[there].all()
-    assert (~new)[there & (now[1:] != now[:-1])].mean() == pytest.approx(0.4, abs=0.1)
+    active = ~np.isnan(now[1:])
+    assert (new | repeated)[active].all()
+    assert (~new)[active & (now[1:] != now[:-1])].mean() == pytest.approx(0.4, abs=0.1)
 
 
 def test_noise_is_that_of_a_fingers_total_and_nothing_touched_reads_nothing():
@@ -133,9 +133,9 @@ def test_stiffer_servos_are_pushed_back_less():
 def test_every_hand_has_these_errors(task: str, settings: dict[str, Any]):
     clean, _ = observed(task, np.zeros(8), **settings)
     late, _ = observed(task, np.zeros(8), force_delay=1, **settings)
-    there = ~np.isnan(late[1:, :, -3:])
-    np.testing.assert_allclose(late[1:, :, -3:][there], clean[:-1, :, -3:][there], atol=1e-12)
-    assert (late[1:, :, -3:] != clean[1:, :, -3:])[there].any()
+    active = ~np.isnan(late[1:, :, -3:])
+    np.testing.assert_allclose(late[1:, :, -3:][active], clean[:-1, :, -3:][active], atol=1e-12)
+    assert (late[1:, :, -3:] != clean[1:, :, -3:])[active].any()
 
 
 @pytest.mark.parametrize(

@@ -67,45 +67,47 @@ def some_frames(count=4, seed=5):
     return Frames(rng.uniform(0, 1, (count, 15)), force, place)
 
 
-def observed(made, some, noise):
-    sim = SimpleNamespace(qpos=some.qpos, force=some.force, place=some.place, t=0, own={"noise": noise[:, None]})
-    return made.observe(sim)
+def observed(gait, frames, noise):
+    sim = SimpleNamespace(qpos=frames.qpos, force=frames.force, place=frames.place, t=0, own={"noise": noise[:, None]})
+    return gait.observe(sim)
 
 
 @pytest.mark.parametrize("state", SIZES)
 def test_observations_are_scaled_part_by_part(state):
-    some = some_frames()
+    frames = some_frames()
     noise = np.random.default_rng(1).normal(size=(4, 8))
-    scaled = observed(task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0), some, noise)
-    images = tactile.image(some.force, some.place)
-    wanted = {
-        "joints": 2.0 * (some.qpos[:, :8] + noise),
+    scaled = observed(task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0), frames, noise)
+    images = tactile.image(frames.force, frames.place)
+    expected = {
+        "joints": 2.0 * (frames.qpos[:, :8] + noise),
         "contacts": 3.0 * tactile.contact_points(images).reshape(4, 9),
         "tactile": 5.0 * images.reshape(4, 54),
     }
-    np.testing.assert_allclose(scaled, np.concatenate([wanted[part] for part in state.split("+")], axis=1), rtol=1e-12)
+    np.testing.assert_allclose(
+        scaled, np.concatenate([expected[part] for part in state.split("+")], axis=1), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("state", SIZES)
 def test_noise_is_in_the_joint_readings_only(state):
-    some = some_frames()
-    before = some.qpos.copy()
+    frames = some_frames()
+    before = frames.qpos.copy()
     noise = np.random.default_rng(1).normal(size=(4, 8))
-    made = task(state=state)
-    quiet, noisy = observed(made, some, np.zeros((4, 8))), observed(made, some, noise)
+    gait = task(state=state)
+    quiet, noisy = observed(gait, frames, np.zeros((4, 8))), observed(gait, frames, noise)
     count = 8 if state.startswith("joints") else 0
     np.testing.assert_array_equal(noisy[:, count:], quiet[:, count:])
     np.testing.assert_allclose(noisy[:, :count] - quiet[:, :count], noise[:, :count], atol=1e-15)
-    np.testing.assert_array_equal(some.qpos, before)
+    np.testing.assert_array_equal(frames.qpos, before)
 
 
 @pytest.mark.parametrize("state", SIZES)
 def test_observations_of_a_batch_equal_one_by_one_bit_for_bit(state):
-    some = some_frames(32)
+    frames = some_frames(32)
     noise = np.random.default_rng(1).normal(size=(32, 8))
-    made = task(state=state, tactile_scale=0.3)
-    x = observed(made, some, noise)
+    gait = task(state=state, tactile_scale=0.3)
+    x = observed(gait, frames, noise)
     for i in range(32):
-        own = Frames(some.qpos[i : i + 1], some.force[i : i + 1], some.place[i : i + 1])
-        alone = observed(made, own, noise[i : i + 1])
+        single = Frames(frames.qpos[i : i + 1], frames.force[i : i + 1], frames.place[i : i + 1])
+        alone = observed(gait, single, noise[i : i + 1])
         assert alone[0].tobytes() == x[i].tobytes()

@@ -26,9 +26,9 @@ def frames(count=1, force=1.0, steps=STEPS):
     return Frames(qpos, forces, place)
 
 
-def score(made, frames, actions, start, steps, failed):
+def score(gait, frames, actions, start, steps, failed):
     start = np.concatenate([np.zeros((len(start), 8)), start], axis=1)
-    return made.score(Record(frames.dict(), {"qpos": start}, actions, steps, failed, np.zeros(len(steps), int)))
+    return gait.score(Record(frames.dict(), {"qpos": start}, actions, steps, failed, np.zeros(len(steps), int)))
 
 
 def judged(frames, steps=STEPS, failed=False, **options):
@@ -52,11 +52,11 @@ def test_the_figures_of_the_criterion():
 
 @pytest.mark.parametrize(*any_two(grip=GRIPS, finger=(0, 1, 2), step=(11, 12, 13, 14)))
 def test_the_fingers_of_the_goal_and_no_others_press_at_each_of_the_last_three_steps(grip, finger, step):
-    held, pressing = frames(), [name in GRIPS[grip] for name in ("index", "middle", "thumb")]
-    held.force[:, :, np.logical_not(pressing)] = 0.0
-    assert judged(held, goal_grip=grip).success[0]
-    held.force[0, step, finger, 0] = 0.1 - 1e-9 if pressing[finger] else 0.1
-    assert judged(held, goal_grip=grip).success[0] == (step < 12)
+    rollout, pressing = frames(), [name in GRIPS[grip] for name in ("index", "middle", "thumb")]
+    rollout.force[:, :, np.logical_not(pressing)] = 0.0
+    assert judged(rollout, goal_grip=grip).success[0]
+    rollout.force[0, step, finger, 0] = 0.1 - 1e-9 if pressing[finger] else 0.1
+    assert judged(rollout, goal_grip=grip).success[0] == (step < 12)
 
 
 def test_a_tenth_of_a_newton_is_enough():
@@ -65,22 +65,22 @@ def test_a_tenth_of_a_newton_is_enough():
 
 
 def test_contacts_of_a_finger_press_together():
-    held = frames(force=0.0)
-    held.force[..., :2] = 0.06
-    assert judged(held).success[0]
+    rollout = frames(force=0.0)
+    rollout.force[..., :2] = 0.06
+    assert judged(rollout).success[0]
 
 
 @pytest.mark.parametrize(*any_two(axis=(0, 1, 2), step=(11, 12, 13, 14), shift=(0.0149, -0.0149, 0.0151, -0.0151)))
 def test_the_object_stays_within_15_millimetres(axis, step, shift):
-    held = frames()
-    held.qpos[0, step, 8 + axis] += shift
-    assert judged(held).success[0] == (abs(shift) < 0.015 or step < 12)
+    rollout = frames()
+    rollout.qpos[0, step, 8 + axis] += shift
+    assert judged(rollout).success[0] == (abs(shift) < 0.015 or step < 12)
 
 
 def test_the_shift_is_a_distance_not_a_component():
-    held = frames()
-    held.qpos[0, -1, 8:11] += 0.009  # 15.6 mm away
-    assert not judged(held).success[0]
+    rollout = frames()
+    rollout.qpos[0, -1, 8:11] += 0.009  # 15.6 mm away
+    assert not judged(rollout).success[0]
 
 
 AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 3))
@@ -88,28 +88,28 @@ AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 3))
 
 @pytest.mark.parametrize(*any_two(axis=AXES, step=(11, 12, 13, 14), degrees=(29.9, -29.9, 30.1, -30.1)), ids=str)
 def test_the_object_turns_less_than_30_degrees(axis, step, degrees):
-    held = frames()
-    held.qpos[0, step, 11:] = turned(math.radians(degrees), axis)
-    assert judged(held).success[0] == (abs(degrees) < 30 or step < 12)
-    held.qpos[0, step, 11:] *= -1
-    assert judged(held).success[0] == (abs(degrees) < 30 or step < 12)
+    rollout = frames()
+    rollout.qpos[0, step, 11:] = turned(math.radians(degrees), axis)
+    assert judged(rollout).success[0] == (abs(degrees) < 30 or step < 12)
+    rollout.qpos[0, step, 11:] *= -1
+    assert judged(rollout).success[0] == (abs(degrees) < 30 or step < 12)
 
 
 def test_the_pose_is_compared_with_that_at_release():
-    held = frames()
-    held.qpos[..., 8:11] += 0.1
-    held.qpos[..., 11:] = turned(1.0)
-    start = held.qpos[:, 0, 8:]
-    outcome = score(task(), held, np.zeros((1, STEPS, 8)), start, np.array([STEPS]), np.array([False]))
+    rollout = frames()
+    rollout.qpos[..., 8:11] += 0.1
+    rollout.qpos[..., 11:] = turned(1.0)
+    start = rollout.qpos[:, 0, 8:]
+    outcome = score(task(), rollout, np.zeros((1, STEPS, 8)), start, np.array([STEPS]), np.array([False]))
     assert outcome.success[0]
-    assert not judged(held).success[0]
+    assert not judged(rollout).success[0]
 
 
 @pytest.mark.parametrize("steps", [1, 12, 15])
 def test_a_dropped_object_is_no_success(steps):
-    held = frames()
-    held.force[0, steps - 1] = 0.0
-    outcome = judged(held, steps=steps)
+    rollout = frames()
+    rollout.force[0, steps - 1] = 0.0
+    outcome = judged(rollout, steps=steps)
     assert not outcome.success[0]
     assert outcome.terms[0, steps - 1, 4] == -400
 
@@ -123,16 +123,16 @@ def test_a_failed_rollout_gives_the_penalty_alone(steps, force):
 
 
 def test_a_success_on_the_way_that_does_not_last_is_none():
-    held = frames()
-    held.force[0, 13:, 1] = 0.0
-    assert not judged(held).success[0]
+    rollout = frames()
+    rollout.force[0, 13:, 1] = 0.0
+    assert not judged(rollout).success[0]
 
 
 def test_success_is_judged_at_the_end_of_longer_rollouts_too():
-    held = frames(steps=40)
-    assert judged(held, steps=40).success[0]
-    held.force[0, 37, 0] = 0.0
-    assert not judged(held, steps=40).success[0]
+    rollout = frames(steps=40)
+    assert judged(rollout, steps=40).success[0]
+    rollout.force[0, 37, 0] = 0.0
+    assert not judged(rollout, steps=40).success[0]
 
 
 def test_rollouts_of_a_batch_are_judged_apart():
@@ -142,12 +142,12 @@ def test_rollouts_of_a_batch_are_judged_apart():
     many.place[:] = rng.normal(size=many.place.shape) * TIP_RADIUS
     actions, failed = rng.normal(size=(6, STEPS, 8)), np.array([0, 0, 1, 0, 0, 1], dtype=bool)
     steps, start = np.array([15, 15, 4, 9, 15, 15]), np.tile(START, (6, 1))
-    made = task()
-    together = score(made, many, actions, start, steps, failed)
+    gait = task()
+    together = score(gait, many, actions, start, steps, failed)
     for i in range(6):
         row = slice(i, i + 1)
-        own = Frames(many.qpos[row], many.force[row], many.place[row])
-        alone = score(made, own, actions[row], start[row], steps[row], failed[row])
+        single = Frames(many.qpos[row], many.force[row], many.place[row])
+        alone = score(gait, single, actions[row], start[row], steps[row], failed[row])
         assert together.terms[i].tobytes() == alone.terms[0].tobytes()
         assert together.success[i] == alone.success[0]
 

@@ -89,10 +89,10 @@ SEEDS = [None, (5, 0, 0, 1), (5, 0, 0, 2), (5, 0, 0, 3)]
 
 @pytest.fixture(scope="module")
 def runner():
-    own = Turning(TurningConfig(state="phase+joints+forces", steps=STEPS))
-    made = Runner(own, Linear(PolicyConfig(), own.spec(), {}))
-    yield made
-    made.close()
+    turning = Turning(TurningConfig(state="phase+joints+forces", steps=STEPS))
+    simulator = Runner(turning, Linear(PolicyConfig(), turning.spec(), {}))
+    yield simulator
+    simulator.close()
 
 
 def played(runner, targets):
@@ -161,11 +161,11 @@ def test_tilting_and_losing_the_plate_cost():
     ("state", "size"), [("phase", 6), ("phase+joints", 14), ("phase+forces", 9), ("phase+joints+forces", 17)]
 )
 def test_what_is_seen(runner, state, size):
-    own = runner.task
-    before, own.config = own.config, TurningConfig(state=state, cycle=1.0, steps=STEPS)
+    turning = runner.task
+    before, turning.config = turning.config, TurningConfig(state=state, cycle=1.0, steps=STEPS)
 
     def look():
-        batch = Batch(own, runner.sim, SEEDS)
+        batch = Batch(turning, runner.sim, SEEDS)
         first = np.array(batch.observe())
         for _ in range(10):
             batch.step(np.zeros((len(SEEDS), len(JOINTS))))
@@ -173,9 +173,9 @@ def test_what_is_seen(runner, state, size):
 
     try:
         first, later = again(look)
-        assert first.shape == (len(SEEDS), own.spec().observation) == (len(SEEDS), size)
+        assert first.shape == (len(SEEDS), turning.spec().observation) == (len(SEEDS), size)
     finally:
-        own.config = before
+        turning.config = before
     assert (first[:, :6] == 0.0).all()
     np.testing.assert_allclose(later[:, :6], 0.0, atol=1e-12)
     assert (first[0, 6:] != first[1, 6:]).all()
@@ -190,12 +190,12 @@ def test_rollouts_do_not_depend_on_their_batch(runner):
 
 
 def test_a_plate_is_lost_where_it_is_let_go(runner):
-    opened = np.zeros((1, runner.size))
-    opened.reshape(len(JOINTS), -1)[:, -1] = -1.0
-    found = runner.rollouts(opened, [None])
-    assert found.ended[0]
-    assert not found.success[0]
-    assert found.returns[0] < -0.5
+    theta = np.zeros((1, runner.size))
+    theta.reshape(len(JOINTS), -1)[:, -1] = -1.0
+    rollouts = runner.rollouts(theta, [None])
+    assert rollouts.ended[0]
+    assert not rollouts.success[0]
+    assert rollouts.returns[0] < -0.5
 
 
 def test_settings_that_make_no_sense():
