@@ -39,7 +39,6 @@ def test_some_jobs_are_the_same_jobs(indices):
     assert subset.indices.tolist() == indices
     assert subset.theta(mu).tobytes() == JOBS.theta(mu)[rows].tobytes()
     assert subset.seeds() == [JOBS.seeds()[row] for row in rows]
-    Chunk.carrying(subset, **HEAD)
     back = codec.decode(codec.encode(Chunk.carrying(subset, **HEAD)), Chunk).take(range(len(indices)))
     assert back.theta(mu).tobytes() == subset.theta(mu).tobytes()
 
