@@ -58,7 +58,7 @@ class ChannelDrawing:
         raise NotImplementedError
 
     def curves(self) -> Mapping[str, int]:
-        """Its entities that are curves, and how many each is."""
+        """How many curves each of its entities has, if they are curves."""
         return {}
 
     @classmethod

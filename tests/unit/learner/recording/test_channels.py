@@ -1,6 +1,7 @@
 """How a recording shows a task's channels and primitives."""
 
 from dataclasses import replace
+from typing import get_args
 
 import mujoco
 import numpy as np
@@ -9,12 +10,13 @@ from made import report, stats
 from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
+from farm.sim.channels import Kind
 from farm.sim.model_files import compiled
 from farm.sim.scene import MODEL, Geometry, Scene
 from farm.sim.trajectory import Trajectory, joined
 from farm.tasks.base import Camera, Channel, TaskSpec
 from learner.recording.blueprint import Eye
-from learner.recording.channels import Arrows, changes, title
+from learner.recording.channels import KINDS, Arrows, changes, title
 from learner.recording.curves import ramp
 from learner.recording.drawing import Drawing
 from learner.recording.solids import ENDLESS, rotate, solid
@@ -244,3 +246,7 @@ def test_a_rollout_shows_the_geometries_of_its_own_model_only():
     for which, scales in ((0, [0.0, 0.0, 1.0, 1.0]), (1, [1.0, 1.0, 0.0, 0.0])):
         [column] = [each for each in parts[f"/world/ball/ball-{which}"] if "scale" in str(each.component_descriptor())]
         assert np.ravel(column.as_arrow_array().to_pylist()).tolist() == np.repeat(scales, 3).tolist()
+
+
+def test_every_kind_of_channel_is_drawn() -> None:
+    assert KINDS.keys() == set(get_args(Kind))
