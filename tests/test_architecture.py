@@ -14,7 +14,7 @@ MAY_IMPORT = {"farm": set(), "workers": {"farm"}, "learner": {"farm"}}
 """Of the project's own packages; no module is excused."""
 
 FLOORS = {
-    "farm/sim/": ("farm.arrays", "farm.errors", "farm.sim"),
+    "farm/sim/": ("farm.arrays", "farm.errors", "farm.returns", "farm.sim"),
     "farm/net/": ("farm.arrays", "farm.errors", "farm.net", "farm.sim.trajectory"),
     "farm/tasks/base.py": ("farm.arrays", "farm.errors", "farm.settings", "farm.sim"),
     "farm/policies/": (
@@ -58,6 +58,7 @@ PURE = (
         "farm/errors.py",
         "farm/elementary.py",
         "farm/moments.py",
+        "farm/returns.py",
         "farm/seeds.py",
         "farm/net/keys.py",
         "farm/net/work.py",

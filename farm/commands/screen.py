@@ -44,6 +44,11 @@ def plain(text: object) -> Text:
     return Text(printable(str(text)))
 
 
+def figure(value: float | None, form: str = ".3f") -> str:
+    """A number for display; a dash if it is not known."""
+    return "-" if value is None else format(value, form)
+
+
 def wide() -> Console:
     """Standard output: as wide as the terminal, or wide enough for all."""
     console = _Console()

@@ -12,7 +12,7 @@ from rich.live import Live
 
 from farm import settings as arguments
 from farm.commands import logs
-from farm.commands.screen import compact, plain, wide
+from farm.commands.screen import compact, figure, plain, wide
 from farm.commands.signals import stop_flag
 from farm.errors import FarmError, MessageError
 from farm.link import Joining
@@ -103,7 +103,7 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
         workers.add_column(name, justify="right" if right else "left", overflow="fold")
     for run in runs:
         ignored = _counts(run.ignored)
-        figures = ["-" if value is None else f"{value:.3f}" for value in (run.return_mean, run.mean_policy_return)]
+        figures = [figure(value) for value in (run.return_mean, run.mean_policy_return)]
         generation = f"{run.generation}/{run.generations}"
         what = (
             run.run,

@@ -15,16 +15,17 @@ class GenerationStats:
     """Number of updates so far including this one: 1, 2, ..."""
     rollouts: int
     """Exploring rollouts of the run so far."""
-    return_mean: float
-    return_min: float
-    return_max: float
-    return_std: float
-    best: float
-    """Best return of the run so far; with several episodes, the best mean over them."""
+    return_mean: float | None
+    """Mean, least, greatest and standard deviation of the returns of rollouts that have one; None if none has."""
+    return_min: float | None
+    return_max: float | None
+    return_std: float | None
+    best: float | None
+    """Best return of the run so far; with several episodes, the best mean over them. None if none had a return."""
     baseline: float | None
     """Baseline after the update, None where the algorithm has none."""
-    mean_policy_return: float
-    """Return of the mean policy that the generation explored around, unperturbed."""
+    mean_policy_return: float | None
+    """Return of the mean policy that the generation explored around, unperturbed; None if it failed."""
     mean_policy_success: bool | None
     """Whether that rollout succeeded, None if the task does not define success."""
     success_rate: float | None
@@ -37,9 +38,9 @@ class GenerationStats:
     ended: int
     """Rollouts that the task ended before their last step."""
     failed: int
-    """Rollouts whose simulation became unstable."""
+    """Rollouts that failed: the simulation became unstable, their task raised an error, or the return overflowed."""
     clamped: int
-    """Rollouts whose return overflowed and was clamped."""
+    """Rollouts without a return: those that failed, unless their task scores whole rollouts."""
     reissued: int
     """Jobs reissued since the run's start (lost workers, stragglers, idle workers)."""
     workers: int

@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from farm.arrays import AnyArray, FloatArray, array
+from farm.returns import RETURN_FLOOR
 
 _CHANNELS: Final = 100  # channels of a trajectory
 _FRAMES: Final = ("times", "bodies", "actions", "terms")
@@ -21,7 +22,7 @@ class Trajectory:
     """
 
     value: float
-    """The rollout's return"""
+    """The rollout's return; nan if nothing scored it, `RETURN_FLOOR` if it failed"""
     success: bool | None
     """Whether it succeeded; None if the task does not define success"""
     channels: dict[str, Any]
@@ -56,6 +57,18 @@ class Trajectory:
             value=value, success=success, times=times, **frames,
             channels={name: single(values) for name, values in channels.items()},
         )  # fmt: skip
+
+    @property
+    def returned(self) -> float | None:
+        """Its return; None if it failed, or nothing scored it."""
+        return self.value if self.value > RETURN_FLOOR else None
+
+    @property
+    def verdict(self) -> str:
+        """Its return in words: "return 3.200", "failed", or empty if nothing scored it."""
+        if np.isnan(self.value):
+            return ""
+        return "failed" if self.value <= RETURN_FLOOR else f"return {self.value:.3f}"
 
     def arrays(self) -> dict[str, AnyArray]:
         """Every array over the frames but the times: bodies, actions, terms, then `channels/NAME`."""

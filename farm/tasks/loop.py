@@ -16,11 +16,12 @@ import numpy as np
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, shaped
 from farm.errors import TaskError
 from farm.moments import Moments
+from farm.returns import RETURN_FLOOR
 from farm.sim.interfaces import Rebound
 from farm.sim.sim import Sim, unwritable
 from farm.sim.trajectory import single
 from farm.tasks.base import Record, Task
-from farm.tasks.rollouts import RETURN_FLOOR, Rollouts, Seed, discounted, drawn, measured
+from farm.tasks.rollouts import Rollouts, Seed, discounted, drawn, measured
 
 P = ParamSpec("P")
 T = TypeVar("T")

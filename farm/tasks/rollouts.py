@@ -2,19 +2,17 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, shaped
 from farm.errors import TaskError
+from farm.returns import RETURN_FLOOR
 from farm.sim.channels import flat
 from farm.sim.scene import MODEL, Scene
 from farm.sim.trajectory import Trajectory, single
 from farm.tasks.base import Record, Task, TaskSpec
-
-RETURN_FLOOR: Final = -1e12
-"""The return of a rollout that overflowed or failed: it must never look good."""
 
 Seed = tuple[int, ...] | None
 """Seed of a rollout's random numbers; None for nominal conditions."""

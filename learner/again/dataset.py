@@ -25,6 +25,7 @@ from farm import fingerprint, plugins, seeds
 from farm.errors import ConfigError, RunError, writing
 from farm.moments import normaliser_of
 from farm.net.work import Jobs
+from farm.returns import known
 from farm.settings import read_json
 from farm.tasks.rollouts import steps_shape
 from learner import parquet
@@ -213,9 +214,10 @@ class Work:
         return self.problem.runner()
 
     def _write(self, results: RoundResults, jobs: Jobs, first: int, hosts: list[str]) -> None:
+        returns = np.where(known(results.returns), results.returns, np.nan)
         episodes = [
             Episode(
-                seed=seed or (), steps=results.traces[row][: results.steps[row]], value=float(results.returns[row]),
+                seed=seed or (), steps=results.traces[row][: results.steps[row]], value=float(returns[row]),
                 success=bool(results.flags[row, 0]), failed=bool(results.flags[row, 2]),
             )
             for row, seed in enumerate(jobs.seeds())

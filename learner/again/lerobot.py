@@ -38,7 +38,7 @@ class Episode:
     steps: AnyArray
     """Its trace of kind `steps`, (T, N), float32"""
     value: float
-    """The return."""
+    """The return; nan if it failed."""
     success: bool
     failed: bool
     """Whether its simulation became unstable."""

@@ -25,6 +25,7 @@ from learner.again.replay import LoadedPolicy, Replay, restored, seeing
 from learner.algorithms import SearchState
 from learner.run import checkpoint as checkpoints
 from learner.run.checkpoint import Checkpoint
+from learner.run.evaluation import statistics
 from learner.run.folder import RunFolder
 from learner.run.learner import explored, learnt_from
 from learner.run.setup import Problem, start
@@ -190,10 +191,10 @@ def _compare(folder: RunFolder, rewound: Rewound) -> None:
     values = rewound.returns
     for line in folder.progress():
         if line.generation == rewound.generation:
-            stored = (line.return_mean, line.return_min, line.return_max, line.return_std)
-            if stored != (float(values.mean()), float(values.min()), float(values.max()), float(values.std())):
+            here = statistics(values)
+            if here != {name: getattr(line, name) for name in here}:
                 log.warning(
-                    "%s: these are not the rollouts of generation %d to the last bit: their mean return was %.6g and "
-                    "is %.6g here; code or --init-from run have changed, or this processor rounds differently",
-                    folder.path, rewound.generation, line.return_mean, values.mean(),
+                    "%s: these are not the rollouts of generation %d to the last bit: their mean return was %s and "
+                    "is %s here; code or --init-from run have changed, or this processor rounds differently",
+                    folder.path, rewound.generation, line.return_mean, here["return_mean"],
                 )  # fmt: skip

@@ -8,6 +8,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import TaskError
+from farm.returns import known
 from learner.algorithms.pgpe import PGPE, PGPEState
 from learner.algorithms.state import Diverged, SearchState, StateValue
 
@@ -89,11 +90,13 @@ def ask(algorithm: Algorithm[Any], state: SearchState, rng: np.random.Generator)
 
 
 def tell(algorithm: Algorithm[Any], state: SearchState, eps: FloatArray, returns: FloatArray) -> SearchState:
-    """The state after one update, from returns (rows, signs).
+    """The state after one update, from returns (rows, signs); only counted if no rollout has a return.
 
     Raises:
       TaskError: it is invalid; Diverged: it would not be finite.
     """
+    if not known(returns).any():
+        return replace(state, generation=state.generation + 1)
     after = algorithm.tell(state, eps, returns)
     return _checked(algorithm, "tell", after, state.mu.size, state.generation + 1)
 

@@ -18,7 +18,7 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows, moved
+from learner.algorithms.state import Diverged, SearchState, StateValue, comparable, finite_rows, moved
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +103,7 @@ class CMAES(Settings):
           Diverged: the update would not be finite.
         """
         eps = finite_rows("eps", eps, (self.population, state.mu.size))
-        returns = finite_rows("returns", returns, (self.population, 1))
+        returns = comparable(returns, (self.population, 1))
         search = self._write(state)
         with np.errstate(all="ignore"):
             try:

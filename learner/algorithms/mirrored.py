@@ -10,7 +10,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.settings import Settings, setting
-from learner.algorithms.state import SearchState, StateValue, finite_rows, moved
+from learner.algorithms.state import SearchState, StateValue, comparable, finite_rows, moved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Mirrored(Settings):
           Diverged: the update would not be finite.
         """
         eps = finite_rows("eps", eps, (self.pairs, state.mu.size))
-        returns = finite_rows("returns", returns, (self.pairs, 2))
+        returns = comparable(returns, (self.pairs, 2))
         with np.errstate(all="ignore"):
             return moved(state, returns, **self._step(state, eps, returns))
 

@@ -30,7 +30,7 @@ from learner.algorithms.gradients import (
     step_sigma,
     weighted_sum,
 )
-from learner.algorithms.state import Diverged, SearchState, StateValue, finite_rows
+from learner.algorithms.state import Diverged, SearchState, StateValue, comparable, finite_rows
 
 # The authors' code: b = 0.9 b + 0.1 mean return.
 _BASELINE_MEMORY = 0.9
@@ -137,7 +137,7 @@ class PGPE(Settings):
         self._check_memory(state)
         rows, columns = self.returns_shape
         eps = finite_rows("eps", eps, (rows, state.mu.size))
-        returns = finite_rows("returns", returns, (rows, columns))
+        returns = comparable(returns, (rows, columns))
         best = float(returns.max()) if state.best is None else max(state.best, float(returns.max()))
         with np.errstate(all="ignore"):
             to_mu, to_sigma, baseline = self._factors(state, eps, returns, best)

@@ -11,6 +11,7 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 
 from farm.arrays import FloatArray
+from farm.returns import penalised
 
 StateValue: TypeAlias = FloatArray | float | int | None
 
@@ -150,3 +151,12 @@ def finite_rows(name: str, array: FloatArray, shape: tuple[int, ...]) -> FloatAr
     if not np.isfinite(array).all():
         raise ValueError(f"{name} has non-finite values, expected finite ones everywhere")
     return array
+
+
+def comparable(returns: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Returns of a generation as an update uses them, `shape`: those of failed rollouts as in `farm.returns.penalised`.
+
+    Raises:
+      ValueError: the shape is wrong, or a value is not finite.
+    """
+    return penalised(finite_rows("returns", returns, shape))

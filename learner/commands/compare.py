@@ -9,6 +9,7 @@ import tyro
 
 from farm import settings as arguments
 from farm.commands.logs import say
+from farm.commands.screen import figure
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
 from farm.settings import Settings
@@ -111,7 +112,7 @@ def _settings(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
 def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     def cells(key: str, form: str) -> tuple[str, ...]:
         values = [run.summary.get(key) for run in runs]
-        return tuple("-" if value is None else format(value, form) for value in values)
+        return tuple(figure(value, form) for value in values)
 
     yield "generations done", *(str(run.progress[-1].generation) for run in runs)
     yield "rollouts", *(str(run.progress[-1].rollouts) for run in runs)

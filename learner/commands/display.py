@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from farm.commands.logs import Formatter, say
-from farm.commands.screen import plain
+from farm.commands.screen import figure, plain
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report, WorkerStatus
 from learner.run import config as configs
@@ -70,9 +70,19 @@ class PlainDisplay(Display):
             success = f" {'success' if p.mean_policy_success else '-':7}  success {p.success_rate:4.0%}"
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
-            f"  return {p.return_mean:8.3f}  mean policy {p.mean_policy_return:8.3f}"
+            f"  return {figure(p.return_mean):>8}{_failed(p)}  mean policy {_mean_policy(p):>8}"
             f"{success}{_measures(p)}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
         )
+
+
+def _failed(p: GenerationStats) -> str:
+    """How many rollouts failed, if any did."""
+    return f" ({p.failed} failed)" if p.failed else ""
+
+
+def _mean_policy(p: GenerationStats) -> str:
+    """The mean policy's return."""
+    return figure(p.mean_policy_return) if p.mean_policy_return is not None else "fails"
 
 
 def _measures(p: GenerationStats) -> str:
@@ -136,7 +146,8 @@ class LiveDisplay(Display):
 
     def show(self, report: Report) -> None:
         """Refresh."""
-        self._returns.append(report.progress.mean_policy_return)
+        if report.progress.mean_policy_return is not None:
+            self._returns.append(report.progress.mean_policy_return)
         self._bar.update(self._task, completed=report.progress.generation)
         self._live.update(self._screen(report))
 
@@ -147,12 +158,15 @@ class LiveDisplay(Display):
     def _learning(self, report: Report) -> Table:
         p = report.progress
         table = _grid()
-        table.add_row("return", f"{p.return_mean:.3f}", f"{p.return_min:.3f} to {p.return_max:.3f}, best {p.best:.3f}")
+        extremes = f"{figure(p.return_min)} to {figure(p.return_max)}, best {figure(p.best)}"
+        table.add_row("return", figure(p.return_mean), extremes)
         verdicts = {True: Text("succeeds", "green"), False: Text("does not succeed", "yellow"), None: Text()}
-        table.add_row("mean policy", f"{p.mean_policy_return:.3f}", verdicts[p.mean_policy_success])
-        first, now = self._returns[0], self._returns[-1]
-        width = max(_SPARK_LEAST, min(_SPARK, self._console.width - _BESIDE_SPARK))
-        table.add_row("  so far", f"{first:.3f}", Text.assemble((spark(self._returns, width), "cyan"), f" {now:.3f}"))
+        table.add_row("mean policy", _mean_policy(p), verdicts[p.mean_policy_success])
+        if self._returns:
+            first, now = self._returns[0], self._returns[-1]
+            width = max(_SPARK_LEAST, min(_SPARK, self._console.width - _BESIDE_SPARK))
+            curve = Text.assemble((spark(self._returns, width), "cyan"), f" {now:.3f}")
+            table.add_row("  so far", f"{first:.3f}", curve)
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:

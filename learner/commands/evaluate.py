@@ -14,7 +14,7 @@ from rich.table import Table
 from farm import settings
 from farm.arrays import IntArray
 from farm.commands.logs import say
-from farm.commands.screen import plain
+from farm.commands.screen import figure, plain
 from farm.net.work import Simulated
 from farm.seeds import SEEDS, trial
 from farm.settings import Settings, setting
@@ -23,7 +23,7 @@ from farm.tasks.base import TaskSpec
 from farm.tasks.rollouts import drawn
 from learner.again.replay import loaded
 from learner.run.config import MOST_GENERATIONS
-from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs
+from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs, failures, statistics
 from learner.run.folder import RunFolder
 
 
@@ -52,14 +52,15 @@ def main(words: Sequence[str]) -> int:
         return 0
     table = Table(title=plain(f"{figures['run']}, mean policy after generation {figures['generation']}"))
     measures = figures["nominal"].get("measures", {})
-    for column in ("conditions", "rollouts", "success", "return mean", "min", "max", "ended early", *measures):
+    counts = ("rollouts", "failed", "success")
+    for column in ("conditions", *counts, "return mean", "min", "max", "ended early", *measures):
         table.add_column(column, justify="left" if column == "conditions" else "right")
     of = {f"  {name}": row for name, row in figures.get("models", {}).items()}
     for name, row in ({name: figures[name] for name in ("nominal", "perturbed")} | of).items():
         success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
-        returns = [f"{row[key]:.3f}" for key in ("return_mean", "return_min", "return_max")]
-        cells = ["-" if value is None else f"{value:.3g}" for value in row.get("measures", {}).values()]
-        table.add_row(name, str(row["rollouts"]), success, *returns, str(row["ended"]), *cells)
+        returns = [figure(row[key]) for key in ("return_mean", "return_min", "return_max")]
+        cells = [figure(value, ".3g") for value in row.get("measures", {}).values()]
+        table.add_row(name, str(row["rollouts"]), str(row["failed"]), success, *returns, str(row["ended"]), *cells)
     Console().print(table)
     return 0
 
@@ -86,12 +87,10 @@ def _figures(spec: TaskSpec, results: Simulated, rows: IntArray) -> dict[str, An
     return {
         "rollouts": len(returns),
         "success_rate": float(flags[:, 0].mean()) if spec.success else None,
-        "return_mean": float(returns.mean()),
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
+        **statistics(returns),
         **({"measures": _measures(spec, results, rows)} if spec.measures else {}),
         "ended": int(flags[:, 1].sum()),
-        "failed": int(flags[:, 2].sum()),
+        "failed": failures(flags),
     }
 
 

@@ -2,17 +2,20 @@
 
 import gc
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from farm.commands import logs
+from farm.commands.screen import figure
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, NameTakenError
 from farm.settings import Settings
 from learner.commands import display, options, recordings
 from learner.commands.options import LearnerOptions, parse
 from learner.run.config import RunConfig
+from learner.run.evaluation import EVALUATION_ROLLOUTS
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, Run, how_to_join, open_run
 from learner.run.setup import fitted
@@ -105,16 +108,23 @@ def _announcement(run: Run, place: Placement) -> list[str]:
     return lines
 
 
+def _worth(summary: Mapping[str, Any]) -> str:
+    """What the mean policy returns, from the nominal start and from others."""
+    value, failed = summary["mean_policy_return"], summary["robust_failed"]
+    nominal = "is unstable" if value is None else f"returns {value:.3f}"
+    if summary["mean_policy_success"] is None:
+        others = f"; from other starts {figure(summary['robust_return'])} on average"
+    else:
+        success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
+        others = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
+    return f"the mean policy {nominal}{others}" + (f", {failed} of {EVALUATION_ROLLOUTS} unstable" if failed else "")
+
+
 def _conclusion(run: Run, place: Placement) -> list[str]:
     summary, folder = run.summary, run.learner.folder.path
     lines = []
-    if summary["mean_policy_return"] is not None:
-        if summary["mean_policy_success"] is None:
-            verdict = f"; from other starts {summary['robust_return']:.3f} on average"
-        else:
-            success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
-            verdict = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
-        lines.append(f"the mean policy returns {summary['mean_policy_return']:.3f}{verdict}")
+    if summary["state"] == "finished":
+        lines.append(_worth(summary))
     lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
     if not run.learner.folder.there:
         lines.append(run.learner.folder.gone)

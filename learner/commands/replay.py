@@ -104,7 +104,7 @@ def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -
     replay = policy.rollout()
     name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
     recordings.record(path, folder.name, policy.problem, name, replay.trajectory)
-    say(f"return {replay.trajectory.value:.3f}{_succeeds(replay)}")
+    say(f"{replay.trajectory.verdict}{_succeeds(replay)}")
     return policy, [replay]
 
 
@@ -125,7 +125,7 @@ def _rollouts(
     indices = _indices(command, rewound, ending)
     replays = rewound.again(indices, policy)
     names = [f"rollout {index}" for index in indices]
-    lines = [f"return {each.trajectory.value:.3f}{_succeeds(each)}" for each in replays]
+    lines = [f"{each.trajectory.verdict}{_succeeds(each)}" for each in replays]
     title = f"generation {rewound.generation}" + (f", {changed}" if changed else "")
     if len(replays) == 1:
         recordings.record(path, folder.name, policy.problem, f"{names[0]} of {title}", replays[0].trajectory)

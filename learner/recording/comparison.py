@@ -26,7 +26,7 @@ from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.channels import entities
-from learner.recording.curves import Colour, lines, palette
+from learner.recording.curves import Colour, band, lines, numbers, palette
 from learner.recording.drawing import Drawing
 from learner.recording.rows import begin, flush, log_static, markdown, times
 
@@ -71,7 +71,7 @@ def record_comparison(path: Path, runs: Sequence[Side], table: str, *, rollouts_
         names = [(root + entity, value) for entity, value in _names(run, colour, compared, learning=learning)]
         log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
         if learning:
-            _send_curves(stream, root, run.progress, run.rollout.value)
+            _send_curves(stream, root, run.progress, run.rollout.returned)
         _send_rollout(stream, root, run, compared)
     flush(stream)
     stream.disconnect()
@@ -111,7 +111,9 @@ def _names(run: Side, colour: Colour, compared: Channel | None, *, learning: boo
         yield entity, lines((run.name,), (colour,))
 
 
-def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats], final: float) -> None:
+def _send_curves(
+    stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats], final: float | None
+) -> None:
     """The learning curves. A mean policy's return is at the number of updates and rollouts before it."""
     at = [
         rr.TimeColumn("generation", sequence=[s.generation for s in progress]),
@@ -121,15 +123,14 @@ def _send_curves(stream: rr.RecordingStream, root: str, progress: Sequence[Gener
         rr.TimeColumn("generation", sequence=[s.generation - 1 for s in progress] + [progress[-1].generation]),
         rr.TimeColumn("rollouts", sequence=[0] + [s.rollouts for s in progress]),
     ]
-    returns = [s.mean_policy_return for s in progress] + [final]
+    returns = numbers([s.mean_policy_return for s in progress] + [final])
     stream.send_columns(f"{root}/return", behind, rr.Scalars.columns(scalars=returns))
     for entity, values in (
-        ("/success", [np.nan if s.success_rate is None else s.success_rate for s in progress]),
+        ("/success", [s.success_rate for s in progress]),
         ("/sigma", [s.sigma_mean for s in progress]),
     ):
-        stream.send_columns(root + entity, at, rr.Scalars.columns(scalars=values))
-    means, spreads = [s.return_mean for s in progress], [s.return_std**2 for s in progress]
-    stream.send_columns(f"{root}/band", at, rr.Measurements.columns(values=means, variances=spreads))
+        stream.send_columns(root + entity, at, rr.Scalars.columns(scalars=numbers(values)))
+    stream.send_columns(f"{root}/band", at, band(progress))
 
 
 def _send_rollout(stream: rr.RecordingStream, root: str, run: Side, compared: Channel | None) -> None:
@@ -144,4 +145,4 @@ def _send_rollout(stream: rr.RecordingStream, root: str, run: Side, compared: Ch
     if compared is not None:
         curves |= dict(zip(entities(compared), rollout.channels[compared.name].T, strict=True))
     for entity, values in curves.items():
-        stream.send_columns(root + entity, at[1:2], rr.Scalars.columns(scalars=values))
+        stream.send_columns(root + entity, at[1:2], rr.Scalars.columns(scalars=numbers(values)))

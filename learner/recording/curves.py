@@ -87,9 +87,9 @@ def pack(colour: Colour) -> int:
 
 _RETURNS: Final = ("mean", "min", "max", "best", "baseline")
 _MEAN_POLICY: Final = lines(("mean policy",), (YELLOW,))
-_CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float]]]]] = (
+_CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float | None]]]]] = (
     ("/learning/return", lines(_RETURNS, (SKY, VERMILLION, GREEN, ORANGE, GREY), hidden=_RETURNS[:3]),
-     lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, np.nan if s.baseline is None else s.baseline]),
+     lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, s.baseline]),
     ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",)),
      lambda s, _: [s.sigma_mean, s.sigma_min, s.sigma_max]),
     ("/learning/mean_norm", lines(("norm of mu",), (SKY,)), lambda s, _: [s.mean_norm]),
@@ -120,12 +120,22 @@ def static(*, success: bool, measures: Sequence[Measure] = ()) -> list[tuple[str
 def statistics(reports: Sequence[Report]) -> Iterator[Columns]:
     """Curves of some generations' exploring rollouts."""
     stats = [report.progress for report in reports]
-    means, variances = [each.return_mean for each in stats], [each.return_std**2 for each in stats]
-    yield Columns("/learning/return_std", rr.Measurements.columns(values=means, variances=variances))
+    yield Columns("/learning/return_std", band(stats))
     yield from _known("/learning/success", [each.success_rate for each in stats])
     yield from _measures("/learning/measures", [each.measures for each in stats])
     for entity, _, values in _CURVES:
         yield Columns(entity, scalars(np.array([values(each.progress, each.rate) for each in reports], dtype=float)))
+
+
+def band(stats: Sequence[GenerationStats]) -> rr.ComponentColumnList:
+    """Mean and spread of the returns of each generation; a gap where all rollouts failed."""
+    means = numbers([each.return_mean for each in stats])
+    return rr.Measurements.columns(values=means, variances=numbers([each.return_std for each in stats]) ** 2)
+
+
+def numbers(values: Sequence[float | None]) -> FloatArray:
+    """Values (n,) in which unknown ones are nan: a gap of a curve."""
+    return np.array(values, dtype=float)
 
 
 def mean_policies(stats: Sequence[GenerationStats]) -> Iterator[Columns]:
@@ -135,8 +145,8 @@ def mean_policies(stats: Sequence[GenerationStats]) -> Iterator[Columns]:
     yield from _measures("/learning/mean_policy/measures", [each.mean_policy_measures for each in stats])
 
 
-def last_policy(value: float, success: bool | None) -> Iterator[Columns]:
-    """The same of a finished run's last policy."""
+def last_policy(value: float | None, success: bool | None) -> Iterator[Columns]:
+    """The same of a finished run's last policy; no return if it failed."""
     yield from _known("/learning/mean_policy/return", [value])
     yield from _known("/learning/mean_policy/success", [success])
 

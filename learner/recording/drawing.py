@@ -98,8 +98,7 @@ class Drawing:
 
     def _texts(self, name: str, rollout: Trajectory) -> list[str]:
         success = {True: "success", False: "no success", None: ""}[rollout.success]
-        value = "" if np.isnan(rollout.value) else f"return {rollout.value:.3f}"
-        head = "\n".join(filter(None, (name, ", ".join(filter(None, (value, success))))))
+        head = "\n".join(filter(None, (name, ", ".join(filter(None, (rollout.verdict, success))))))
         if self.scene.free is None:
             return [head] * len(rollout.times)
         places = rollout.bodies[:, self.scene.bodies.index(self.scene.free), :3]

@@ -176,7 +176,7 @@ class Recorder:
         """
         self._drawing.check(rollout)
         now = time.time()
-        for part in curves.last_policy(rollout.value, rollout.success):
+        for part in curves.last_policy(rollout.returned, rollout.success):
             self._stream.send_columns(part.entity, self._at(now), part.columns)
         self._hold(rollout, self._generation, now)
         self._finished = blueprint.finished(self._drawing.spec, self._eye, self._generation)

@@ -52,7 +52,7 @@ def record_replay(
 
 
 def _caption(name: str, rollout: Trajectory) -> rr.TextDocument:
-    if np.isnan(rollout.value):
+    if not rollout.verdict:
         return markdown(f"### {name}")
     success = {True: ", success", False: ", no success", None: ""}[rollout.success]
-    return markdown(f"### {name}\n\nreturn {rollout.value:.4g}{success}")
+    return markdown(f"### {name}\n\n{rollout.verdict}{success}")

@@ -85,7 +85,7 @@ class RunRecording(logging.Handler):
             message = replace(message, sample=None, traces={})
             self.dropped += 1
         self._call(partial(self._recorder.generation, message))
-        if stats.return_max >= stats.best:
+        if stats.return_max is not None and stats.return_max == stats.best:
             self._line("INFO", f"new best rollout: return {stats.best:.3f}")
         if best is not None:
             self._write_replay([(f"best rollout, generation {message.replay_generation}", best)])
@@ -120,7 +120,8 @@ class RunRecording(logging.Handler):
         self.end = end
         rollouts = [] if end.best is None else [(f"best rollout, generation {end.best_generation}", end.best)]
         if end.mean is not None:
-            result = {"generations": self.done, "return": end.mean.value, "success": end.mean.success}
+            value = end.mean.returned
+            result = {"generations": self.done, "return": value, "success": end.mean.success}
             self._call(partial(self._recorder.result, result))
             self._call(partial(self._recorder.final, end.mean))
             rollouts.append((f"mean policy after generation {self.done}", end.mean))

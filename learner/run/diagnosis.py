@@ -37,7 +37,8 @@ class Diagnosis:
 
     def after(self, stats: GenerationStats, *, one_step: bool = False) -> list[str]:
         """New messages after a generation; `one_step`: all its rollouts ended in the first of several steps."""
-        self._window.append(stats.mean_policy_return)
+        if stats.mean_policy_return is not None:
+            self._window.append(stats.mean_policy_return)
         sound = not stats.failed  # instability has a message of its own
         self._equal = self._equal + 1 if sound and stats.return_min == stats.return_max else 0
         self._short = self._short + 1 if sound and one_step else 0
@@ -58,7 +59,8 @@ class Diagnosis:
                 f"all rollouts of {REPEATED} generations returned {stats.return_max:.4g}: no perturbation changes the "
                 "reward; look at observe and reward (farm check), then try a larger --initial-sigma",
             )
-        if len(self._window) == WINDOW and not stats.mean_policy_success:
+        judged = stats.mean_policy_return is not None and not stats.mean_policy_success
+        if judged and len(self._window) == WINDOW:
             yield from self._course(stats)
 
     def _course(self, stats: GenerationStats) -> Iterator[tuple[str, str]]:

@@ -6,8 +6,9 @@ from typing import Any, Final
 import numpy as np
 
 from farm import seeds
-from farm.arrays import BoolArray
+from farm.arrays import BoolArray, FloatArray
 from farm.net.work import Jobs, Simulated
+from farm.returns import known, mean, penalised
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
 from learner.scheduler.round import RoundResults
@@ -23,8 +24,8 @@ EVALUATION_SEED: Final = 0
 class Nominal:
     """The mean policy's rollout under nominal conditions, at physics rate."""
 
-    value: float
-    """Its return."""
+    value: float | None
+    """Its return; None if it failed."""
     success: bool | None
     """None if the task does not define success."""
     trajectory: Trajectory | None
@@ -37,8 +38,12 @@ class Evaluation:
     mean: Nominal
     robust_success_rate: float | None
     """Share of the perturbed rollouts that succeeded; None if the task does not define success."""
-    robust_return: float
-    """Mean return of the perturbed rollouts."""
+    robust_return: float | None
+    """Mean return of the perturbed rollouts that have one; None if none has."""
+    robust_failed: int
+    """Number of the perturbed rollouts that failed."""
+    robust_score: float | None
+    """Their mean return, with `farm.returns.penalised` for those that failed: what policies are compared by."""
     measures: tuple[dict[str, float | None], dict[str, float | None]]
     """The task's measures by name: of the nominal rollout, and means over the perturbed ones that did not fail."""
     replay: Trajectory | None
@@ -54,21 +59,40 @@ def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
 def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
     """The part of GenerationStats that follows from a round: exploring rollouts, then the mean policy's."""
     returns, flags = results.returns[:rollouts], results.flags[:rollouts]
-    _, ended, failed, clamped = np.count_nonzero(flags, axis=0).tolist()
     return {
-        "return_mean": float(returns.mean()),
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
-        "return_std": float(returns.std()),
-        "mean_policy_return": float(results.returns[rollouts]),
+        **statistics(returns),
+        "mean_policy_return": mean(results.returns[rollouts : rollouts + 1]),
         "mean_policy_success": bool(results.flags[rollouts, 0]) if spec.success else None,
         "success_rate": success_rate(spec, flags),
-        "ended": ended,
-        "failed": failed,
-        "clamped": clamped,
+        "ended": int(np.count_nonzero(flags[:, 1])),
+        "failed": failures(flags),
+        "clamped": int(np.count_nonzero(flags[:, 3])),
         "measures": means_of_measures(spec, results, slice(rollouts)),
         "mean_policy_measures": means_of_measures(spec, results, slice(rollouts, rollouts + 1)),
     }
+
+
+def statistics(returns: FloatArray) -> dict[str, float | None]:
+    """Mean, extremes and standard deviation of the returns that rollouts (S,) have; None if none has one."""
+    values = returns[known(returns)]
+    if not values.size:
+        return dict.fromkeys(("return_mean", "return_min", "return_max", "return_std"))
+    return {
+        "return_mean": float(values.mean()),
+        "return_min": float(values.min()),
+        "return_max": float(values.max()),
+        "return_std": float(values.std()),
+    }
+
+
+def failures(flags: BoolArray) -> int:
+    """Number of rollouts (S, 4) that failed, or whose return overflowed."""
+    return int(np.count_nonzero(flags[:, 2] | flags[:, 3]))
+
+
+def score(returns: FloatArray) -> float | None:
+    """Mean return (S,) by which policies are compared, with failed rollouts as penalised; None if all failed."""
+    return float(penalised(returns).mean()) if known(returns).any() else None
 
 
 def success_rate(spec: TaskSpec, flags: BoolArray) -> float | None:

@@ -20,6 +20,7 @@ from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report
 from farm.net.work import Jobs
+from farm.returns import known, mean, penalised
 from farm.tasks.base import Task
 from learner import algorithms
 from learner.algorithms import Algorithm, SearchState
@@ -34,8 +35,10 @@ from learner.run.evaluation import (
     Evaluation,
     Nominal,
     evaluation_jobs,
+    failures,
     means_of_measures,
     outcome,
+    score,
     success_rate,
 )
 from learner.run.folder import RunFolder
@@ -49,6 +52,9 @@ log = logging.getLogger(__name__)
 REPLAY_EVERY: Final = 10
 """Generations between two recordings of the best rollout at physics rate: late in a run, most have a new best."""
 
+
+HOPELESS: Final = 3
+"""Successive generations in which all rollouts failed, after which a run ends."""
 
 DURABLE_EVERY: Final = 1.0
 """Time between two checkpoints that survive a power failure [s]; the others survive a killed learner only."""
@@ -139,7 +145,7 @@ class Learner:
         diagnosis = Diagnosis(self.config.algorithm_config)
         for earlier in self.folder.progress():
             diagnosis.after(earlier, one_step=self._one_step)
-        eps, hopeless = self._explore(dispatcher), False
+        eps, all_failed = self._explore(dispatcher), 0
         while not self.over:
             results, last = self._collected(dispatcher), self._at
             jobs = len(eps) * self.config.episodes  # the following ones are the mean policy's, and perhaps the best's
@@ -151,6 +157,7 @@ class Learner:
             if not self.over:
                 eps = self._explore(dispatcher)
             progress = self._progress(results, returns, dispatcher)
+            all_failed = all_failed + 1 if progress.return_mean is None else 0
             try:
                 self._save(progress, last)
             except OSError as error:
@@ -162,9 +169,10 @@ class Learner:
                     f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to generation "
                     f"{before.generation}: {advice}"
                 ) from None
-            if progress.failed == returns.size and not hopeless:
-                log.warning("all %d rollouts became unstable: farm check shows how they start", returns.size)
-            hopeless = progress.failed == returns.size
+            if all_failed == HOPELESS:
+                raise RunError(
+                    f"all rollouts of {HOPELESS} generations failed, so that nothing is learnt: farm check says why"
+                )
             for message in diagnosis.after(progress, one_step=self._one_step):
                 log.warning("%s", message)
             dispatcher.report(progress)
@@ -219,12 +227,14 @@ class Learner:
         self.folder.save(self._at)
         return Evaluation(
             mean=Nominal(
-                value=float(results.returns[last]),
+                value=mean(results.returns[last : last + 1]),
                 success=bool(results.flags[last, 0]) if self._judged else None,
                 trajectory=results.trajectory(last),
             ),
             robust_success_rate=success_rate(self.problem.spec, results.flags[:last]),
-            robust_return=float(np.mean(results.returns[:last])),
+            robust_return=mean(results.returns[:last]),
+            robust_failed=failures(results.flags[:last]),
+            robust_score=score(results.returns[:last]),
             measures=(
                 means_of_measures(self.problem.spec, results, slice(last, last + 1)),
                 means_of_measures(self.problem.spec, results, slice(last)),
@@ -236,7 +246,7 @@ class Learner:
         """The results in summary.json."""
         at = self.state.generation
         rates = [p.success_rate for p in self.folder.progress() if p.generation == at]
-        mean = evaluation.mean if evaluation else None
+        nominal = evaluation.mean if evaluation else None
         numbers = self.state.mu.astype("<f8").tobytes() + self.state.sigma.astype("<f8").tobytes()
         return {
             "run": self.folder.name,
@@ -245,11 +255,13 @@ class Learner:
             "rollouts": self._at.rollouts,
             "steps": self._at.steps,
             "best_return": self.state.best,
-            "mean_policy_return": mean.value if mean else None,
-            "mean_policy_success": mean.success if mean else None,
+            "mean_policy_return": nominal.value if nominal else None,
+            "mean_policy_success": nominal.success if nominal else None,
             "success_rate": rates[-1] if rates else None,
             "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
             "robust_return": evaluation.robust_return if evaluation else None,
+            "robust_failed": evaluation.robust_failed if evaluation else None,
+            "robust_score": evaluation.robust_score if evaluation else None,
             **(
                 dict(zip(_MEASURED, evaluation.measures, strict=True))
                 if evaluation and self.problem.spec.measures
@@ -308,7 +320,7 @@ class Learner:
         best, generation = self._at.best, self._at.best_generation
         steps = int(results.steps[: returns.size].sum())
         replayed = self._at.replayed or len(results) > len(scores) * self.config.episodes + 1
-        if before.best is None or scores.max() > before.best:
+        if known(scores).any() and (before.best is None or scores.max() > before.best):
             row, column = divmod(int(scores.argmax()), len(self._signs))
             episode = int(returns.reshape(-1, *scores.shape)[:, row, column].argmax())  # the best one of the best
             job = results.jobs.take([episode * len(scores) + row])
@@ -334,12 +346,12 @@ class Learner:
         )
 
     def _progress(self, results: RoundResults, returns: FloatArray, dispatcher: Dispatcher) -> GenerationStats:
-        state = self.state
+        state, figures = self.state, outcome(self.problem.spec, results, returns.size)
         return GenerationStats(
-            **outcome(self.problem.spec, results, returns.size),
+            **figures,
             generation=state.generation,
             rollouts=self._at.rollouts,
-            best=float(returns.max()) if state.best is None else state.best,
+            best=figures["return_max"] if state.best is None else state.best,
             baseline=state.baseline,
             sigma_mean=float(state.sigma.mean()),
             sigma_min=float(state.sigma.min()),
@@ -382,6 +394,8 @@ def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[Flo
 def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:
     """What the algorithm is told, (rows, signs): mean returns over the episodes, with the reward's offset.
 
+    Failed rollouts count as in `farm.returns.penalised`, among all of the generation.
+
     Args:
       config: of the run.
       task: its task.
@@ -391,7 +405,9 @@ def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntAr
     task_config = config.task_config
     if task_config.reward_offset:
         weights = [task.return_scale * task_config.gamma**t * task_config.reward_offset for t in range(task.steps)]
-        returns = returns + np.array([0.0, *itertools.accumulate(weights)])[steps]
+        offsets = np.array([0.0, *itertools.accumulate(weights)])[steps]
+        returns = np.where(known(returns), returns + offsets, returns)
+    returns = penalised(returns)
     first, *others = returns.reshape(config.episodes, -1, len(config.algorithm_config.signs()))
     total = first.copy()
     for each in others:  # in their order

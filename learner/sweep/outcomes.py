@@ -11,7 +11,6 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import writing
-from farm.tasks.rollouts import RETURN_FLOOR
 from learner import parquet
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
@@ -20,7 +19,7 @@ from learner.sweep.grid import Sweep
 COLUMNS: Final = {
     "seed": "int", "state": "text", "generations": "int", "rollouts": "int", "first_mean_policy_return": "number",
     "mean_policy_return": "number", "mean_policy_success": "truth", "robust_success_rate": "number",
-    "robust_return": "number", "seconds": "number", "parameters_sha256": "text",
+    "robust_return": "number", "robust_failed": "int", "seconds": "number", "parameters_sha256": "text",
 }  # fmt: skip
 """Columns of the table after the varied settings (text as given), and their types: fields of summary.json, and the
 return of the mean policy before learning."""
@@ -87,7 +86,7 @@ class Curve:
     rollouts: FloatArray
     """Exploring rollouts before this policy, (G,)"""
     returns: FloatArray
-    """(runs, G); nan after a run's end and if the simulation became unstable"""
+    """(runs, G); nan after a run's end and where the mean policy failed"""
 
 
 def curves(sweep: Sweep) -> list[Curve]:
@@ -112,8 +111,7 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
     returns = [p.mean_policy_return for p in progress]
     if progress and summary.get("state") == "finished":  # from the evaluation after the last update
         rollouts, returns = [*rollouts, progress[-1].rollouts], [*returns, summary.get("mean_policy_return")]
-    values = np.array(returns, dtype=float)
-    return np.array(rollouts, dtype=float), np.where(values <= RETURN_FLOOR, np.nan, values)
+    return np.array(rollouts, dtype=float), np.array(returns, dtype=float)
 
 
 def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:

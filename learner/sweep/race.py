@@ -96,7 +96,8 @@ class Race:
     rollouts: int
     """Exploring rollouts of all entries together."""
     scores: list[dict[str, float | None]] = field(default_factory=list)
-    """For each rung that is over, the mean return from perturbed starts by entry; None if a run diverged."""
+    """For each rung that is over, the score from perturbed starts by entry: the mean return, in which a failed rollout
+    counts as the worst one less a standard deviation. None if a run diverged, or failed from every start."""
 
     @property
     def rungs(self) -> list[Rung]:
@@ -328,6 +329,6 @@ def _seconds(config: RunConfig) -> float:
 
 
 def _score(path: Path) -> float | None:
-    """The score of an entry whose run has ended; None if it diverged."""
+    """The score of an entry whose run has ended; None if it diverged, or failed from every start."""
     summary = RunFolder(path).read_summary() or {}
-    return summary.get("robust_return") if summary.get("state") == "finished" else None
+    return summary.get("robust_score") if summary.get("state") == "finished" else None

@@ -63,9 +63,10 @@ def page(race: Race, *, figure: bool) -> str:
     """The result as Markdown."""
     winner, table = race.winner, [heads(race), ["---"] * (len(race.rungs) + 1), *rows(race)]
     first = RunFolder(race.folder(race.entries[0])).progress()
+    untrained = first[0].mean_policy_return if first else None
     return _PAGE.format(
         task=winner.config.task, seed=winner.config.seed, rollouts=race.rollouts, starts=EVALUATION_ROLLOUTS,
-        untrained=f"{first[0].mean_policy_return:.4g}" if first else "nothing that is known",
+        untrained="-" if untrained is None else f"{untrained:.4g}",
         table="\n".join(f"| {' | '.join(line)} |" for line in table),
         winner=winner.name, folder=race.folder(winner).name, path=race.folder(winner), command=command(race),
         figure="\n![Return of the mean policies over rollouts](figure.svg)\n" if figure else "",

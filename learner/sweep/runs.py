@@ -246,7 +246,8 @@ def _conclude(learner: _Learner, watcher: RunWatcher) -> None:
     detail = " ".join(learner.messages)
     if state == "finished":
         judged = {True: " and succeeds", False: " and does not succeed", None: ""}[summary["mean_policy_success"]]
-        detail = f"mean policy returns {summary['mean_policy_return']:.3f}{judged}"
+        value = summary["mean_policy_return"]
+        detail = "mean policy fails" if value is None else f"mean policy returns {value:.3f}{judged}"
     watcher.ended(learner.run, state, detail)
 
 

@@ -12,10 +12,10 @@ from farm import plugins, seeds
 from farm.errors import ConfigError
 from farm.net.work import Jobs
 from farm.policies.fourier import Direct, FeaturesConfig
+from farm.returns import RETURN_FLOOR
 from farm.runner import Runner
 from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
 from farm.tasks.gymnasium_engine import NOMINAL, make
-from farm.tasks.rollouts import RETURN_FLOOR
 
 SEED = seeds.training(0, 3, 4)
 

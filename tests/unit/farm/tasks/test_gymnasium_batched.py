@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from farm.policies.networks import Linear
+from farm.returns import RETURN_FLOOR
 from farm.runner import Runner
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.loop import Batch, again
-from farm.tasks.rollouts import RETURN_FLOOR
 
 gymnasium = pytest.importorskip("gymnasium")
 

@@ -8,11 +8,12 @@ import pytest
 
 from farm.errors import ConfigError, TaskError
 from farm.policies.fourier import Direct, FeaturesConfig
+from farm.returns import RETURN_FLOOR
 from farm.runner import Runner
 from farm.settings import setting
 from farm.tasks.base import Channel, Record, Score, Task, TaskConfig
 from farm.tasks.probe import specification
-from farm.tasks.rollouts import RETURN_FLOOR, Rollouts, discounted, trajectory
+from farm.tasks.rollouts import Rollouts, discounted, trajectory
 
 XML = """<mujoco><option timestep="0.01"/><worldbody>
   <body pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0" damping="0.1"/><geom name="cart" size="0.1" mass="1"/>

@@ -250,7 +250,7 @@ def test_replays_follow_each_other(scene, spec, rollout, tmp_path, rows_of):
     assert rows.column("/reward/terms", "rollout") == [1] * 31 + [2] * 16
     captions = [text for (text,) in rows.column("/rollout", "text")]
     assert "best of generation 3" in captions[0]
-    assert "-3.25, success" in captions[1]
+    assert "-3.250, success" in captions[1]
     assert (np.diff(rows.times("/reward/terms")) > 0).all()
 
 

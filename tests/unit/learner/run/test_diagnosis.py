@@ -30,6 +30,11 @@ def test_a_run_that_succeeds_may_stay_where_it_is():
     assert messages([-1.0] * 300, mean_policy_success=True, sigma_max=1e-9) == {}
 
 
+def test_a_failed_mean_policy_is_no_fall():
+    returns = [*np.linspace(-100.0, -50.0, 40), *[None, -50.0] * 25]
+    assert messages(returns, failed=1) == {}
+
+
 def test_no_improvement():
     texts = messages([*np.linspace(-100.0, -50.0, 40), *[-50.0] * 150])
     [(generation, [message])] = texts.items()

@@ -18,6 +18,7 @@ from farm.net.telemetry import Report
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.config import configure
+from learner.run.folder import RunFolder
 from learner.run.learner import REPLAY_EVERY
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
@@ -185,17 +186,26 @@ def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path
     assert state(tmp_path / "plain") != state(tmp_path / "shifted")
 
 
-def test_physics_that_always_blows_up_is_said_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_in_which_all_rollouts_fail_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("fast.py").write_text(
         POLE.replace("        sim.qpos[row, 0] =", "        sim.qvel[row] = 1e30\n        sim.qpos[row, 0] =")
     )
-    assert [report.progress.failed for report in learnt(configure("fast.py:Pole"), tmp_path / "r")] == [8, 8, 8]
-    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [
-        "all 8 rollouts became unstable: farm check shows how they start"
-    ]
+    learner, alone = new_run(replace(configure("fast.py:Pole"), generations=9), tmp_path / "r")
+    before = learner.state
+    reports = []
+    with pytest.raises(RunError, match="all rollouts of 3 generations failed, .* farm check"):
+        reports.extend(learner.learn(alone))  # type: ignore[arg-type]
+    assert learner.state.generation == 3
+    assert learner.state.mu.tolist() == before.mu.tolist()
+    assert (learner.state.best, learner.state.baseline) == (None, None)
+    lines = RunFolder(tmp_path / "r").progress()
+    assert [line.failed for line in lines] == [8, 8, 8]
+    assert {(line.return_mean, line.return_std, line.best, line.mean_policy_return) for line in lines} == {
+        (None, None, None, None)
+    }
+    assert "1e+12" not in (tmp_path / "r" / "progress.jsonl").read_text().lower()
+    assert "1000000000000" not in (tmp_path / "r" / "progress.jsonl").read_text()
 
 
 def test_a_full_disk_leaves_the_last_generation(pole: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

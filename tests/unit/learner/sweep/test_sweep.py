@@ -8,7 +8,6 @@ import pytest
 from made import stats
 
 from farm.errors import ConfigError
-from farm.tasks.rollouts import RETURN_FLOOR
 from learner.commands import sweep as command
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
@@ -226,7 +225,7 @@ def test_a_curve_is_over_the_rollouts_behind_each_mean_policy(tmp_path):
     sweep = sweep_of(tmp_path, "0.1", "0.2")
     paths = list(sweep.runs)
     ran(paths[0], RunConfig(), [-5.0, -4.0, -4.0], final=-3.0)
-    ran(paths[2], RunConfig(), [-5.0, RETURN_FLOOR], state="interrupted")
+    ran(paths[2], RunConfig(), [-5.0, None], state="interrupted")
     (curve,) = outcomes.curves(sweep)
     assert curve.label == "initial_sigma 0.1"
     assert curve.rollouts.tolist() == [0, 30, 60, 90]

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from farm.returns import RETURN_FLOOR
 from farm.tasks.finger_gait.hand import LOWER, UPPER
 from farm.tasks.finger_gait.observations import Felt
 from farm.tasks.finger_gait.rewards import RETURN_SCALE, REWARDS, TERMS, WEIGHTS, end
-from farm.tasks.rollouts import RETURN_FLOOR
 from farm.tasks.rollouts import discounted as _discounted
 
 STEPS = 15
