@@ -21,6 +21,7 @@ from farm.arrays import FloatArray
 from farm.moments import merged, normaliser_of, usable
 from farm.runner import Runner
 from farm.tasks import loop
+from farm.tasks.loop import Kept
 from farm.tasks.rollouts import Rollouts, Seed
 from learner.run import setup
 from learner.run.config import RunConfig, configure
@@ -194,7 +195,8 @@ def _together(
     """Rollouts of each search's parameters, simulated together."""
     rows = [np.column_stack([theta, np.full(len(theta), i)]) for i, theta in enumerate(thetas)]
     policy, moments = SideBySide(searches), bool(searches[0].moments.size)
-    rollouts = loop.run(runner.task, policy, runner.sim, np.concatenate(rows), starts, moments=moments)
+    kept = Kept(moments=moments)
+    rollouts, _ = loop.run(runner.task, policy, runner.sim, np.concatenate(rows), starts, runner.spec, kept)
     ends = np.cumsum([len(theta) for theta in thetas])
     return [rollouts.at(slice(end - len(theta), end)) for end, theta in zip(ends.tolist(), thetas, strict=True)]
 

@@ -33,6 +33,7 @@ from farm.commands.signals import INTERRUPTED
 from farm.moments import merged, normaliser_of, usable
 from farm.runner import Runner
 from farm.tasks import loop
+from farm.tasks.loop import Kept
 from farm.tasks.rollouts import Rollouts, Seed
 from learner.run import setup
 from learner.run.config import RunConfig, configure
@@ -277,7 +278,7 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
         theta = np.concatenate([search.extended(rows) for search, (rows, _) in zip(going, proposals, strict=True)])
         starts = [start for _, each in proposals for start in each]
         moments = config.policy_config.normalise
-        rollouts = loop.run(task, policy, runner.sim, theta, starts, moments=moments)
+        rollouts, _ = loop.run(task, policy, runner.sim, theta, starts, runner.spec, Kept(moments=moments))
         first = 0
         for search, (rows, _) in zip(going, proposals, strict=True):
             search.tell(rollouts.at(slice(first, first + len(rows))), offsets)
@@ -296,7 +297,7 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
 def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntArray]:
     """Returns and lengths of the mean policy's rollouts."""
     theta, starts = search.extended(np.tile(search.state.mu, (count, 1))), [seeds.trial(0, i) for i in range(count)]
-    rollouts = loop.run(runner.task, SideBySide(search.policy), runner.sim, theta, starts)
+    rollouts, _ = loop.run(runner.task, SideBySide(search.policy), runner.sim, theta, starts, runner.spec)
     return rollouts.returns, rollouts.steps
 
 

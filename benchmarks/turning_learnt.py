@@ -120,7 +120,8 @@ def _tested(policy: LoadedPolicy, mean: FloatArray, *, shuffle: bool = False) ->
     """Results of a mean (P,) from the starts."""
     runner, theta = policy.runner, np.tile(mean, (len(STARTS), 1))
     acts = Shuffled(runner.policy) if shuffle else runner.policy
-    return _figures(_turned(loop.run(runner.task, acts, runner.sim, theta, STARTS)))
+    rollouts, _ = loop.run(runner.task, acts, runner.sim, theta, STARTS, runner.spec)
+    return _figures(_turned(rollouts))
 
 
 def _turned(rollouts: Rollouts) -> Turned:

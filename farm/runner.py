@@ -9,7 +9,7 @@ import numpy as np
 
 from farm import plugins, settings
 from farm.arrays import AnyArray, FloatArray, IntArray
-from farm.errors import ConfigError, UnservedError
+from farm.errors import ConfigError, FarmError, UnservedError, brief
 from farm.moments import usable
 from farm.net.messages import Spec
 from farm.net.work import NOT_NORMALISED, Jobs, Simulated, rows_with_trace
@@ -23,6 +23,7 @@ from farm.sim.sim import Sim
 from farm.sim.trajectory import Trajectory
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
+from farm.tasks.loop import Kept
 from farm.tasks.probe import specification
 from farm.tasks.rollouts import Rollouts, Seed, channel_traces, shares, step_traces, steps_shape, trajectory
 from farm.tasks.standard import standard
@@ -51,6 +52,8 @@ class Runner:
         self.sim = Sim(task.engine(make))
         self._judge = self.sim if exact else Sim(task.engine(BatchEngine))
         loop.again(lambda: task.setup(self._judge))
+        self.errors: list[Exception] = []
+        """Why rollouts of the last call of `rollouts` failed although their physics was fine."""
 
     @property
     def size(self) -> int:
@@ -85,6 +88,7 @@ class Runner:
         judged = (jobs.seen | ~jobs.explores) & ~jobs.physics & (self._judge is not self.sim)
         trajectories: dict[int, Trajectory] = {}
         done: list[_Part] = []
+        errors: list[Exception] = []
         for mask, policy, sim, every in (
             (~jobs.physics & ~judged, around, self.sim, 0),
             (judged, around, self._judge, 0),
@@ -96,9 +100,9 @@ class Runner:
                 continue
             batch = (theta, seeds) if mask.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
             moments = bool(size) and not every
-            rollouts = loop.run(
-                self.task, policy, sim, *batch, every, moments=moments, observed=traces == "steps" and not every
-            )  # fmt: skip
+            kept = Kept(every=every, moments=moments, observations=traces == "steps" and not every)
+            rollouts, raised = loop.run(self.task, policy, sim, *batch, self.spec, kept)
+            errors += raised
             for job in np.flatnonzero(jobs.seen & mask).tolist():
                 first = int(jobs.rollouts[:job].sum())
                 trajectories[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
@@ -107,6 +111,7 @@ class Runner:
         wanted_traces = traces if self.spec.trace_channels or traces == "steps" else "none"
         selection = rows_with_trace(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
+            **({} if not errors else told(errors[0])),
             returns=returns,
             flags=_placed(done, lambda part: part.flags),
             steps=_placed(done, lambda part: part.steps),
@@ -141,7 +146,9 @@ class Runner:
     @plugins.no_exit
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed], *, physics: bool = False) -> Rollouts:
         """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
-        return loop.run(self.task, self.policy, self.sim, theta, seeds, 1 if physics else 0)
+        kept = Kept(every=1 if physics else 0)
+        rollouts, self.errors = loop.run(self.task, self.policy, self.sim, theta, seeds, self.spec, kept)
+        return rollouts
 
     def trajectory(self, rollouts: Rollouts, row: int) -> Trajectory:
         """One of them, frame by frame."""
@@ -151,6 +158,13 @@ class Runner:
         """Release its resources."""
         for sim in {self.sim, self._judge}:
             sim.engine.close()
+
+
+def told(error: Exception) -> dict[str, Any]:
+    """Fields `error` and `traceback` of a message about an error in a task's or a policy's code."""
+    lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)
+    text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
+    return {"error": brief(text), "traceback": lines}
 
 
 _Part: TypeAlias = tuple[IntArray, Rollouts]

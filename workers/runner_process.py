@@ -11,7 +11,7 @@ import struct
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -119,7 +119,9 @@ def serve(link: socket.socket) -> None:
     while True:
         order = receive(link, Order)
         try:
-            answer = Answer(results=runner.run(order.mu, order.jobs, order.traces, order.normaliser, terms=order.terms))
+            results = runner.run(order.mu, order.jobs, order.traces, order.normaliser, terms=order.terms)
+            text, lines = _named((results.error, results.traceback), begin.files)
+            answer = Answer(results=replace(results, error=text, traceback=lines))
         except Exception as error:
             answer = _failed(error, begin.files)
         send(link, answer)
@@ -129,10 +131,18 @@ def _failed(error: Exception, files: tuple[str, ...], *, built: bool = True) -> 
     text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
     if isinstance(plugins.root(error), FileNotFoundError):
         text += "; files beside a class do not travel, but those that its xml names do"
-    lines = plugins.author_traceback(error)
-    for path in files:  # the author knows the file by its name, not by its path here
-        text, lines = text.replace(path, Path(path).name), tuple(line.replace(path, Path(path).name) for line in lines)
+    text, lines = _named((text, plugins.author_traceback(error)), files)
     return Answer(error=brief(text), served=built and not isinstance(error, UnservedError), traceback=lines)
+
+
+def _named(error: tuple[str, tuple[str, ...]], files: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+    """An error and its traceback, with names in place of paths: the author knows no path of this machine."""
+    text, lines = error
+    for path in files:
+        name = Path(path).name
+        text = text.replace(path, name)
+        lines = tuple(line.replace(path, name) for line in lines)
+    return text, lines
 
 
 def _bound() -> None:

@@ -15,15 +15,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import __version__, fingerprint, plugins
-from farm.errors import FarmError, MessageError, UnservedError, brief
+from farm import __version__, fingerprint
+from farm.errors import MessageError, UnservedError
 from farm.net import codec, keys
 from farm.net.events import Event
 from farm.net.messages import Refusal, WorkRequest
 from farm.net.notices import Notices
 from farm.net.session import Session, connect
 from farm.net.work import Chunk, Failure, Jobs, Results, RoundHeader
-from farm.runner import is_exact, make_backend
+from farm.runner import is_exact, make_backend, told
 from workers.config import WorkerConfig
 from workers.inbox import Inbox
 from workers.queries import ASK, Queries
@@ -206,9 +206,7 @@ class Worker:
         self._answer(chunk, Results.carrying(simulated, jobs, time.monotonic() - start, **self._head(chunk)))
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
-        lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)
-        text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
-        self._answer(chunk, Failure(index=index, error=brief(text), traceback=lines, **self._head(chunk)))
+        self._answer(chunk, Failure(index=index, **told(error), **self._head(chunk)))
 
     def _head(self, chunk: Chunk) -> dict[str, Any]:
         """The fields that every answer to a chunk begins with."""

@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 8
+SCHEMA: Final = 9
 """Version of all messages; included in each of them."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024

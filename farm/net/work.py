@@ -224,9 +224,14 @@ class Simulated:
     """Of the task's measures, (S, M); (0, 0) if it has none"""
     terms: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Each reward term's part of the return, (S, K); (0, 0) if the round does not ask for them"""
+    error: str = ""
+    """Of the first rollout that failed by an error of the task's code, one line; empty if none did"""
+    traceback: tuple[str, ...] = ()
+    """Lines for the author of that code."""
 
     def __post_init__(self) -> None:
         """Check that all arrays have the same number of rollouts."""
+        _check_told(self.error, self.traceback)
         if self.flags.shape != (len(self.returns), 4):
             raise ValueError(f"flags of shape {self.flags.shape} for {len(self.returns)} rollouts")
         if len(self.steps) != len(self.returns):
@@ -309,11 +314,16 @@ class Failure:
 
     def __post_init__(self) -> None:
         """Check that it can be displayed."""
-        if len(self.traceback) > _LINES:
-            raise ValueError(f"a traceback of {len(self.traceback)} lines")
-        for line in (self.error, *self.traceback):
-            if len(line) > _LINE or not line.isprintable():
-                raise ValueError(f"an error of more than {_LINE} characters a line, or unprintable ones")
+        _check_told(self.error, self.traceback)
+
+
+def _check_told(error: str, traceback: tuple[str, ...]) -> None:
+    """Check that an error that was sent can be displayed."""
+    if len(traceback) > _LINES:
+        raise ValueError(f"a traceback of {len(traceback)} lines")
+    for line in (error, *traceback):
+        if len(line) > _LINE or not line.isprintable():
+            raise ValueError(f"an error of more than {_LINE} characters a line, or unprintable ones")
 
 
 def _table(count: int, *, around: bool, explores: bool, rate: str, signs: tuple[int, ...]) -> IntArray:

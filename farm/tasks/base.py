@@ -53,6 +53,8 @@ class TaskConfig(Settings):
     """Train with random starts and conditions (the same for both rollouts of a pair)."""
     reward_offset: float = setting(0.0, least=-1e6, most=1e6)
     """Added to the reward of every control step, for learning only: -1 removes a bonus of 1 for not falling."""
+    strict: bool = False
+    """End the run if a rollout raises an error or gives a number that is not finite; otherwise it counts as failed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,7 +129,7 @@ class Record:
     steps: IntArray
     """Control steps of each including its last, (B,)"""
     failed: BoolArray
-    """Whether the simulation became unstable in the last of them, (B,)"""
+    """Whether it failed in the last of them: unstable physics, or a number of the task's that is not finite, (B,)"""
     which: IntArray
     """Which of the task's models each has, (B,)"""
 
@@ -168,7 +170,8 @@ class Task:
     simulator. The object holds no state of a rollout. What must be remembered is kept in `sim.own`, arrays (B, ...)
     whose rows stay with their rollouts when other rollouts end.
 
-    A method's result of a wrong shape, or that is not finite, ends the run with a TaskError that names it.
+    A method's result of a wrong shape ends the run with a TaskError that names it. A rollout in which a method raises
+    an error, or gives a number that is not finite, counts as failed, unless the run is `--strict`.
 
     Example:
       ```python

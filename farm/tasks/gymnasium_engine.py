@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from farm.errors import ConfigError
+from farm.errors import ConfigError, TaskError
 from farm.sim.engines import STATE
 from farm.sim.scene import quiet
 
@@ -147,7 +147,8 @@ class EnvironmentEngine:
         mujoco.mj_setState(model, data, self._fresh, STATE)  # an environment's own reset may leave some of it
         for kind in _UNSTABLE:
             data.warning[kind].number = 0
-        x, _ = self._envs[row].reset(seed=seed % _SEEDS if self._physics else seed)
+        with self._replaced(row):
+            x, _ = self._envs[row].reset(seed=seed % _SEEDS if self._physics else seed)
         self._take(row, x, 0.0)
 
     def step(self, ids: IntArray, count: int) -> None:
@@ -156,9 +157,22 @@ class EnvironmentEngine:
             env: Any = self._envs[row]
             for _ in range(count):
                 # dm_control raises an exception where its physics becomes unstable, unless it is told not to
-                with env.unwrapped.physics.suppress_physics_errors() if self._physics else contextlib.nullcontext():
+                physics = env.unwrapped.physics if self._physics else None
+                calm = physics.suppress_physics_errors() if physics else contextlib.nullcontext()
+                with self._replaced(row), calm:
                     x, reward, *over, _ = env.step(self._fields["ctrl"][row].astype(self._kind))
-                self._take(row, x, float(reward), over)
+                self._take(row, x, _number(reward), over)
+
+    @contextlib.contextmanager
+    def _replaced(self, row: int) -> Iterator[None]:
+        """Make an environment anew if it raises an error: nobody knows in what state that leaves it."""
+        try:
+            yield
+        except Exception:
+            with contextlib.suppress(Exception):
+                self._envs[row].close()
+            self._envs[row] = make(self._name, **self._arguments)
+            raise
 
     def _take(self, row: int, observation: Any, reward: float, over: Sequence[bool] = (False, False)) -> None:  # noqa: ANN401
         _, data = simulated(self._envs[row])
@@ -205,6 +219,19 @@ class EnvironmentEngine:
         """Close the environments."""
         for env in self._envs:
             env.close()
+
+
+def _number(reward: Any) -> float:  # noqa: ANN401  what an environment gives
+    """A reward as a number: also an array of one number, as Gymnasium's own checks allow.
+
+    Raises:
+      TaskError: it is something else.
+    """
+    values = np.asarray(reward)
+    if values.size != 1 or values.dtype.kind not in "biuf":
+        got = f"an array of {values.dtype} {values.shape}" if values.ndim else repr(reward)[:60]
+        raise TaskError(f"the environment's reward is {got}; expected a number")
+    return float(values.reshape(()))
 
 
 def blown_up(data: mujoco.MjData) -> bool:

@@ -6,21 +6,21 @@ order, or threads. They equal, bit for bit, those of one rollout at a time in a 
 
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, Final, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, shaped
-from farm.errors import TaskError
+from farm.errors import FarmError, TaskError
 from farm.moments import Moments
 from farm.returns import RETURN_FLOOR
 from farm.sim.interfaces import Rebound
 from farm.sim.sim import Sim, unwritable
 from farm.sim.trajectory import single
-from farm.tasks.base import Record, Task
+from farm.tasks.base import Record, Task, TaskSpec
 from farm.tasks.rollouts import Rollouts, Seed, discounted, drawn, measured
 
 P = ParamSpec("P")
@@ -115,7 +115,7 @@ class Batch:
     """Rollouts of one task that are stepped together, independent of how actions are chosen."""
 
     @_explained
-    def __init__(self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0) -> None:
+    def __init__(self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0, *, tolerant: bool = False) -> None:
         """Prepare their starts; rollouts with equal seeds share one.
 
         Args:
@@ -123,7 +123,9 @@ class Batch:
           sim: the simulations.
           seeds: one per rollout.
           every: physics steps between two frames; 0: one frame per control step.
+          tolerant: whether a rollout whose observation or reward is not finite fails alone; otherwise that is an error.
         """
+        self._tolerant = tolerant
         self.task, self.sim = task, sim
         self._parts = task.substeps // (every or task.substeps)
         self._substeps = task.substeps // self._parts
@@ -148,6 +150,8 @@ class Batch:
         self.names: tuple[str, ...] = ()
         """Names of the terms"""
         self._width = 0  # of an observation
+        self.errors: list[Exception] = []
+        """Why rollouts failed although their physics was fine."""
         self._steps = np.full(count, task.steps)
         self._failed, self._ended, self._success = (np.zeros(count, dtype=bool) for _ in range(3))
 
@@ -157,9 +161,19 @@ class Batch:
         x = self.task.observe(self.sim)
         self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
         x = shaped("observe", x, (len(self.sim), self._width))
-        if not np.isfinite(x).all():
-            raise TaskError(f"observe is not finite before control step {self.sim.t + 1}, though the physics is fine")
-        return x
+        if np.isfinite(x).all():
+            return x
+        where = f"before control step {self.sim.t + 1}, though the physics is fine"
+        bad: BoolArray = np.logical_not(np.isfinite(x).all(axis=1))
+        self._fail(TaskError(f"observe is not finite {where}"))
+        self._conclude(bad, np.zeros(len(bad), dtype=bool), self.sim.t)
+        return x[~bad]
+
+    def _fail(self, error: TaskError) -> None:
+        """Note why some rollouts fail; raise it if none may fail alone."""
+        if not self._tolerant:
+            raise error
+        self.errors.append(error)
 
     @_explained
     def step(self, action: FloatArray) -> None:
@@ -177,8 +191,7 @@ class Batch:
             for name, values in self._measured().items():
                 self.frames[name][self.rows, t * self._parts + part] = values
         sim.t += 1
-        failed = sim.blown_up()
-        self._reward(action, t, failed)
+        failed = self._reward(action, t, sim.blown_up())
         ended = task.ended(sim)
         ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)
         self._conclude(failed, ended & ~failed, t)
@@ -197,10 +210,10 @@ class Batch:
             return {}
         return {"mocap": np.concatenate([self.sim.mocap_pos, self.sim.mocap_quat], axis=2)}
 
-    def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> None:
-        """Store the reward terms of a control step, unless whole rollouts are scored."""
+    def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> BoolArray:
+        """Store the reward terms of a control step, unless whole rollouts are scored; return which rollouts fail."""
         if scores(self.task):
-            return
+            return failed
         reward = self.task.reward(self.sim, action)
         terms = reward if isinstance(reward, dict) else {"reward": reward}
         if not terms:
@@ -216,8 +229,11 @@ class Batch:
         values[failed] = 0.0
         if not np.isfinite(values).all():
             bad = next(n for n, column in zip(terms, values.T, strict=True) if not np.isfinite(column).all())
-            raise TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine")
+            self._fail(TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine"))
+            failed = failed | ~np.isfinite(values).all(axis=1)
+            values[failed] = 0.0
         self.terms[self.rows, t] = values
+        return failed
 
     def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
         """Remove the finished rollouts; all end with the last step."""
@@ -244,6 +260,20 @@ class Batch:
         """Whether all are over."""
         return self.sim.t >= self.task.steps or not len(self.active)
 
+    def raised(self, error: Exception, spec: TaskSpec) -> Rollouts:
+        """The batch's only rollout, in whose control step the task raised an error: it failed there."""
+        self.errors.append(error)
+        last = min(self.sim.t, self.task.steps - 1)
+        self._steps[:], self._failed[:] = last + 1, True
+        for values in self.frames.values():
+            values[:, last * self._parts :] = 0.0
+        if self._actions is None:
+            self._actions = np.zeros((1, self.task.steps, spec.action))
+        if self.terms is None:
+            self.terms = np.zeros((1, self.task.steps, len(spec.terms)))
+        low = np.array([[each.low for each in self.task.measures]]).reshape(1, -1)
+        return self._rollouts(np.array([RETURN_FLOOR]), self.terms, np.zeros(1, dtype=bool), self._failed, low)
+
     def record(self) -> Record:
         """What was measured after each control step so far."""
         assert self._actions is not None
@@ -261,13 +291,31 @@ class Batch:
         if score is None:
             clamped = clamped | self._failed
             returns = np.where(clamped, RETURN_FLOOR, returns)
+        success = np.zeros(len(returns), dtype=bool) if success is None else success
+        return self._rollouts(returns, terms, success, clamped, measured(self.task, record))
+
+    def _rollouts(
+        self, returns: FloatArray, terms: FloatArray, success: BoolArray, clamped: BoolArray, measures: FloatArray
+    ) -> Rollouts:
+        assert self._actions is not None
         return Rollouts(
-            returns=returns, success=np.zeros(len(returns), dtype=bool) if success is None else success,
-            ended=self._ended, failed=self._failed, clamped=clamped, steps=self._steps, terms=terms,
-            actions=record.actions, start=self.start, frames=self.frames, which=self.which,
-            measures=measured(self.task, record), moments=np.empty((len(returns), 0)),
+            returns=returns, success=success, ended=self._ended, failed=self._failed, clamped=clamped,
+            steps=self._steps, terms=terms, actions=self._actions, start=self.start, frames=self.frames,
+            which=self.which, measures=measures, moments=np.empty((len(returns), 0)),
             observations=np.empty((len(returns), 0), "<f4"),
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of rollouts beside their results."""
+
+    every: int = 0
+    """Physics steps between two frames; 0: one frame per control step."""
+    moments: bool = False
+    """The moments of their observations."""
+    observations: bool = False
+    """The observations themselves."""
 
 
 def run(
@@ -276,48 +324,92 @@ def run(
     sim: Sim,
     theta: FloatArray,
     seeds: Sequence[Seed],
-    every: int = 0,
-    *,
-    moments: bool = False,
-    observed: bool = False,
-) -> Rollouts:
-    """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes; perhaps with the
-    moments of their observations, or with these themselves."""  # noqa: D205, D209
-    size, parts = sim.engine.size, []
-    for first in range(0, len(theta), size):
-        rows = slice(first, first + size)
-        parts.append(
-            again(lambda rows=rows: _run(task, policy, sim, theta[rows], seeds[rows], every, moments, observed))
-        )
-    return Rollouts.joined(parts)
+    spec: TaskSpec,
+    kept: Kept = Kept(),
+) -> tuple[Rollouts, list[Exception]]:
+    """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes.
+
+    A rollout in which the task raises an error counts as failed, if the task is not strict: it is found by halving the
+    batch, which changes no number of the others. Errors that may be this machine's are raised (`NOT_OF_TASK`).
+
+    Returns:
+      the rollouts, and the errors of those that failed although their physics was fine, in their order.
+    """
+    rollouts, errors = [], []
+    for first in range(0, len(theta), sim.engine.size):
+        rows = slice(first, first + sim.engine.size)
+        part, raised = _tolerant(task, policy, sim, theta[rows], seeds[rows], spec, kept)
+        rollouts.append(part)
+        errors += raised
+    return Rollouts.joined(rollouts), errors
+
+
+NOT_OF_TASK: Final = (FarmError, MemoryError, OSError, ImportError)
+"""Errors that never count as a failed rollout: another machine might not raise them, or no rollout can be right."""
+
+
+def _tolerant(
+    task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], spec: TaskSpec, kept: Kept
+) -> tuple[Rollouts, list[Exception]]:
+    try:
+        return _run(task, policy, sim, theta, seeds, spec, kept)
+    except NOT_OF_TASK:
+        raise
+    except Exception:
+        if task.config.strict or len(seeds) == 1:
+            raise
+    half = len(seeds) // 2
+    parts = [
+        _tolerant(task, policy, sim, theta[rows], seeds[rows], spec, kept) for rows in (slice(half), slice(half, None))
+    ]
+    return Rollouts.joined([part for part, _ in parts]), [error for _, errors in parts for error in errors]
 
 
 def _run(
-    task: Task,
-    policy: Acts,
-    sim: Sim,
-    theta: FloatArray,
-    seeds: Sequence[Seed],
-    every: int,
-    moments: bool,
-    observed: bool,
-) -> Rollouts:
-    batch, sums = Batch(task, sim, seeds, every), None
-    history: AnyArray = np.empty((len(seeds), 0), "<f4")
-    acting = Acting(policy, theta)
+    task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], spec: TaskSpec, kept: Kept
+) -> tuple[Rollouts, list[Exception]]:
+    """Run one batch; if it is a single rollout of a task that is not strict, an error of the task's ends that."""
+    alone = len(seeds) == 1 and not task.config.strict
+
+    def attempt() -> tuple[Rollouts, list[Exception]]:
+        sums = Moments(len(seeds), spec.observation if kept.moments else 0)
+        steps = task.steps if kept.observations else 0
+        history = np.zeros((len(seeds), steps, spec.observation), "<f4")
+        batch: Batch | None = None
+        try:
+            batch = Batch(task, sim, seeds, kept.every, tolerant=not task.config.strict)
+            _act(batch, Acting(policy, theta), sums if kept.moments else None, history)
+            rollouts = batch.rollouts()
+        except (*NOT_OF_TASK, Rebound):
+            raise
+        except Exception as error:
+            if not alone or (batch is None and seeds[0] is None):
+                raise
+            # A rollout that has no start of its own has failed at the nominal one.
+            batch = batch or Batch(task, sim, [None], kept.every)
+            rollouts = batch.raised(error, spec)
+        observations = history if kept.observations else rollouts.observations
+        moments = sums.table if kept.moments else rollouts.moments
+        return replace(rollouts, moments=moments, observations=observations), batch.errors
+
+    done: tuple[Rollouts, list[Exception]] = again(attempt)
+    return done
+
+
+def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) -> None:
+    """Let a policy act until all rollouts are over; moments and observations (B, T, d) are added up, if wanted."""
+    sim = batch.sim
     while not batch.over:
         x = batch.observe()
-        if moments:
-            sums = sums or Moments(len(seeds), x.shape[1])
+        if batch.over:
+            return
+        if sums is not None:
             sums.add(batch.rows, x)
-        if observed:
-            history = history if history.ndim > 2 else np.zeros((len(seeds), task.steps, x.shape[1]), "<f4")
+        if history.shape[1]:
             history[batch.rows, sim.t] = single(x)
         action = acting.act(x, batch.active)
         columns = np.shape(action)[1:2] or (sim.model.nu,)
         batch.step(shaped("act of the policy", action, (len(batch.active), *columns)))
-    table = np.empty((len(seeds), 0)) if sums is None else sums.table
-    return replace(batch.rollouts(), moments=table, observations=history)
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`

@@ -29,9 +29,9 @@ class Rollouts:
     ended: BoolArray
     """(B,) whether the task ended it before its last step"""
     failed: BoolArray
-    """(B,) whether the simulation became unstable"""
+    """(B,) whether the simulation became unstable, or the task raised an error or gave numbers that are not finite"""
     clamped: BoolArray
-    """(B,) whether the return overflowed"""
+    """(B,) whether it has no return: it failed, or the return overflowed"""
     steps: IntArray
     """(B,) control steps until the end, including the last one"""
     terms: FloatArray

@@ -232,8 +232,9 @@ def resumed(
     changed = [name for name, digest in result.code.items() if at.code.get(name) != digest]
     if changed and not mixed:
         raise CheckpointError(
-            f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back, "
-            "begin a new run with --init-from, or continue with --mixed (then the run is not reproducible)"
+            f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back; or "
+            f"--resume {folder.path} --mixed keeps the optimiser's state and goes on with the new code (the run cannot "
+            "be repeated then); or begin a new run from its mean with --init-from"
         )
     return result, at
 

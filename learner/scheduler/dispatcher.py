@@ -88,6 +88,7 @@ class Dispatcher:
             spec=hashlib.sha256(simulated).hexdigest(), traces="none", mu=np.empty(0),
         )  # fmt: skip
         self._status, self._alone = StatusAnswer(), time.monotonic()
+        self._told = False  # why a rollout failed by an error of its code; once in a run
         self._progress: GenerationStats | None = None
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
         session.rates.most = max(session.rates.most, 4 * config.instances)  # each worker asks once per second
@@ -324,6 +325,10 @@ class Dispatcher:
         if "unasked" in verdicts:
             self.notices.once(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
         self._members.did(message.worker, len(message.returns), now)
+        if message.error and not self._told:
+            self._told = True
+            text = f"a rollout counts as failed, as its code raised an error: {message.error} (--strict ends the run)"
+            self.notices.once(text, message.traceback)
 
     def _expel(self, host: str, reason: str) -> None:
         """A host's numbers are wrong: exclude it, and repeat its jobs of this round."""

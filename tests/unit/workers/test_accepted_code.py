@@ -23,6 +23,7 @@ from farm.errors import ConfigError
 from farm.net import keys
 from farm.net.session import Session, connect, free_endpoint, listen
 from farm.net.tls import find
+from farm.net.work import Failure
 from workers import subprocess_runner
 from workers.config import WorkerConfig
 from workers.source_cache import SourceCache
@@ -208,11 +209,12 @@ def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Pa
     author, other = Author(safe, raises), Author(safe, write(tmp_path, guard), "other")
     worker = hire(safe, certs)
     author.send(worker.id, 3)
-    failure = safe.failure()
-    assert (failure.index, failure.error) == (3, "ZeroDivisionError: division by zero")
-    assert failure.traceback[0].startswith('  File "raises.py", line 11, in reward')
+    results = safe.results()
+    assert (results.jobs.tolist(), results.error) == ([3], "ZeroDivisionError: division by zero")
+    assert results.flags[:, 2].all()
+    assert results.traceback[0].startswith('  File "raises.py", line 11, in reward')
     other.send(worker.id, 0)
-    _, failure = safe.next("result of other", kind=type(failure))
+    _, failure = safe.next("result of other", kind=Failure)
     assert failure.index is None, "the task cannot be built here"  # type: ignore[attr-defined]
     assert failure.error.endswith("files beside a class do not travel, but those that its xml names do")  # type: ignore[attr-defined]
 
