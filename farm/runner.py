@@ -27,6 +27,7 @@ from farm.tasks.loop import Kept
 from farm.tasks.probe import specification
 from farm.tasks.rollouts import Rollouts, Seed, channel_traces, shares, step_traces, steps_shape, trajectory
 from farm.tasks.standard import standard
+from farm.tasks.trouble import Trouble
 
 SIMULATION = "farm.tasks.loop"
 """The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
@@ -52,8 +53,8 @@ class Runner:
         self.sim = Sim(task.engine(make))
         self._judge = self.sim if exact else Sim(task.engine(BatchEngine))
         loop.again(lambda: task.setup(self._judge))
-        self.errors: list[Exception] = []
-        """Why rollouts of the last call of `rollouts` failed although their physics was fine."""
+        self.trouble = Trouble()
+        """What went wrong in the last call of `rollouts`."""
 
     @property
     def size(self) -> int:
@@ -88,7 +89,7 @@ class Runner:
         judged = (jobs.seen | ~jobs.explores) & ~jobs.physics & (self._judge is not self.sim)
         trajectories: dict[int, Trajectory] = {}
         done: list[_Part] = []
-        errors: list[Exception] = []
+        trouble = Trouble()
         for mask, policy, sim, every in (
             (~jobs.physics & ~judged, around, self.sim, 0),
             (judged, around, self._judge, 0),
@@ -101,8 +102,8 @@ class Runner:
             batch = (theta, seeds) if mask.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
             moments = bool(size) and not every
             kept = Kept(every=every, moments=moments, observations=traces == "steps" and not every)
-            rollouts, raised = loop.run(self.task, policy, sim, *batch, self.spec, kept)
-            errors += raised
+            rollouts, its = loop.run(self.task, policy, sim, *batch, self.spec, kept)
+            trouble.add(its)
             for job in np.flatnonzero(jobs.seen & mask).tolist():
                 first = int(jobs.rollouts[:job].sum())
                 trajectories[job] = self.trajectory(rollouts, int(np.searchsorted(rows, first)))
@@ -111,7 +112,8 @@ class Runner:
         wanted_traces = traces if self.spec.trace_channels or traces == "steps" else "none"
         selection = rows_with_trace(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
         return Simulated(
-            **({} if not errors else told(errors[0])),
+            **(told(trouble.errors[0]) if trouble.errors else {}),
+            warned=dict(trouble.warned),
             returns=returns,
             flags=_placed(done, lambda part: part.flags),
             steps=_placed(done, lambda part: part.steps),
@@ -147,7 +149,7 @@ class Runner:
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed], *, physics: bool = False) -> Rollouts:
         """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
         kept = Kept(every=1 if physics else 0)
-        rollouts, self.errors = loop.run(self.task, self.policy, self.sim, theta, seeds, self.spec, kept)
+        rollouts, self.trouble = loop.run(self.task, self.policy, self.sim, theta, seeds, self.spec, kept)
         return rollouts
 
     def trajectory(self, rollouts: Rollouts, row: int) -> Trajectory:

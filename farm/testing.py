@@ -127,9 +127,9 @@ def _simulated(task: Task, policy: Any, words: Sequence[Seed]) -> dict[str, AnyA
     spec = specification(task)
     acts, theta = _policy(policy, task, spec)
     parameters = np.repeat(theta[None], len(words), axis=0)
-    rollouts, errors = tried(task, len(words), lambda sim: loop.run(task, acts, sim, parameters, words, spec))
-    if errors:
-        raise errors[0]
+    rollouts, trouble = tried(task, len(words), lambda sim: loop.run(task, acts, sim, parameters, words, spec))
+    if trouble.errors:
+        raise trouble.errors[0]
     states = {
         name: np.concatenate([rollouts.start[name][:, None], after], 1) for name, after in rollouts.frames.items()
     }

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -228,10 +228,14 @@ class Simulated:
     """Of the first rollout that failed by an error of the task's code, one line; empty if none did"""
     traceback: tuple[str, ...] = ()
     """Lines for the author of that code."""
+    warned: dict[str, int] = field(default_factory=dict)
+    """In how many rollouts MuJoCo warned of something, by kind: the name of mjtWarning without mjWARN_"""
 
     def __post_init__(self) -> None:
         """Check that all arrays have the same number of rollouts."""
         _check_told(self.error, self.traceback)
+        if not all(0 < count <= len(self.returns) for count in self.warned.values()):
+            raise ValueError(f"warnings of {str(self.warned)[:80]} in {len(self.returns)} rollouts")
         if self.flags.shape != (len(self.returns), 4):
             raise ValueError(f"flags of shape {self.flags.shape} for {len(self.returns)} rollouts")
         if len(self.steps) != len(self.returns):

@@ -9,6 +9,7 @@ import mujoco.batch
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from farm.sim import complaints
 from farm.sim.interfaces import Rebound
 from farm.sim.sim import as_rows, failed_rows, own_value
 
@@ -31,6 +32,7 @@ class BatchEngine:
         self._fields: dict[str, AnyArray] = {}
         self._data: mujoco.MjData | None = None
         self._rows = _Rows(model, size)
+        self._complaint = ""
 
     def takes(self, model: mujoco.MjModel) -> bool:
         """Whether rows can be of this model as well, as its data have the same layout; `assign` then says which are."""
@@ -82,6 +84,7 @@ class BatchEngine:
         try:
             yield
         except mujoco.batch.SimulationError as error:
+            self._complaint = " ".join(self._batch.error(int(error.ids[0])).split())
             self._batch.state[error.ids] = np.nan
 
     def copy(self, sources: IntArray) -> None:
@@ -91,6 +94,15 @@ class BatchEngine:
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number."""
         return failed_rows(self._batch.state[as_rows(ids)])
+
+    def complaint(self) -> str:
+        """MuJoCo's words about the last error that ended a row, once; empty without one."""
+        words, self._complaint = self._complaint, ""
+        return words
+
+    def warned(self, ids: IntArray) -> IntArray:
+        """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K): it never counts down."""
+        return complaints.chosen(self._batch.warning[ids, :, 1])
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Forces of contacts on every body of rows, (n, nbody, 6)."""

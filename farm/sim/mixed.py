@@ -14,7 +14,7 @@ from farm.sim.engines import check_field
 from farm.sim.interfaces import Engine, MakeEngine, Rebound
 from farm.sim.model_files import Files, compiled
 from farm.sim.scene import Scene
-from farm.sim.sim import ability, own_values
+from farm.sim.sim import ability, complaint, own_values, warned
 
 T = TypeVar("T")
 
@@ -169,6 +169,15 @@ class MixedEngine:
         """Rows whose state is no longer a reasonable number."""
         [unstable] = self._gathered(ids, lambda part, _, slots: (part.engine.blown_up(slots),))
         return unstable
+
+    def complaint(self) -> str:
+        """MuJoCo's words about an error that ended a row, once; empty without one."""
+        return "; ".join(filter(None, [complaint(part.engine) for part in self._parts]))
+
+    def warned(self, ids: IntArray) -> IntArray:
+        """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K)."""
+        [counts] = self._gathered(ids, lambda part, _, slots: (warned(part.engine, slots),))
+        return counts
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Forces of contacts on every body of rows, (n, nbody, 6)."""

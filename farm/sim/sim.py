@@ -21,6 +21,7 @@ import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
+from farm.sim.complaints import KINDS
 from farm.sim.interfaces import Engine
 from farm.sim.named import Named
 
@@ -375,6 +376,18 @@ def unwritable(line: str) -> str:
     if match[1] in WRITABLE:
         return f"{match[0]} can be written in act, reset and prepare only, and in no environment of Gymnasium"
     return f"{match[0]} is computed by MuJoCo; {_CAN}"
+
+
+def warned(engine: Engine, ids: IntArray) -> IntArray:
+    """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K); zeros if the engine does not count."""
+    count = getattr(engine, "warned", None)
+    return np.zeros((len(ids), len(KINDS)), dtype=int) if count is None else count(ids)
+
+
+def complaint(engine: Engine) -> str:
+    """MuJoCo's words about the last error that ended a row, once; empty without one."""
+    tell = getattr(engine, "complaint", None)
+    return "" if tell is None else tell()
 
 
 def failed_rows(state: FloatArray) -> BoolArray:

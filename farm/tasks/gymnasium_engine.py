@@ -12,6 +12,7 @@ import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, TaskError
+from farm.sim import complaints
 from farm.sim.engines import STATE
 from farm.sim.scene import quiet
 
@@ -203,6 +204,10 @@ class EnvironmentEngine:
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Which simulations became unstable or have a number that is not finite."""
         return self._bad[ids]
+
+    def warned(self, ids: IntArray) -> IntArray:
+        """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K)."""
+        return np.array([complaints.counters(simulated(self._envs[row])[1]) for row in ids.tolist()])
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Not available: an environment observes them itself."""

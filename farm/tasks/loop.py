@@ -5,23 +5,26 @@ order, or threads. They equal, bit for bit, those of one rollout at a time in a 
 """
 
 import traceback
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, Final, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, shaped
-from farm.errors import FarmError, TaskError
+from farm.errors import TaskError
 from farm.moments import Moments
 from farm.returns import RETURN_FLOOR
+from farm.sim.complaints import KINDS
 from farm.sim.interfaces import Rebound
-from farm.sim.sim import Sim, unwritable
+from farm.sim.sim import Sim, complaint, unwritable, warned
 from farm.sim.trajectory import single
 from farm.tasks.base import Record, Task, TaskSpec
 from farm.tasks.rollouts import Rollouts, Seed, discounted, drawn, measured
+from farm.tasks.trouble import NOT_OF_TASK, Trouble
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -150,8 +153,8 @@ class Batch:
         self.names: tuple[str, ...] = ()
         """Names of the terms"""
         self._width = 0  # of an observation
-        self.errors: list[Exception] = []
-        """Why rollouts failed although their physics was fine."""
+        self._errors: list[Exception] = []
+        self._warned = warned(sim.engine, np.arange(count))  # before the first step
         self._steps = np.full(count, task.steps)
         self._failed, self._ended, self._success = (np.zeros(count, dtype=bool) for _ in range(3))
 
@@ -163,9 +166,13 @@ class Batch:
         x = shaped("observe", x, (len(self.sim), self._width))
         if np.isfinite(x).all():
             return x
-        where = f"before control step {self.sim.t + 1}, though the physics is fine"
         bad: BoolArray = np.logical_not(np.isfinite(x).all(axis=1))
-        self._fail(TaskError(f"observe is not finite {where}"))
+        where = f"before control step {self.sim.t + 1}"
+        if (self.sim.blown_up() >= bad).all():
+            why = complaint(self.sim.engine) or "its start makes no sense: farm check looks for the cause"
+            self._fail(TaskError(f"the physics is unstable {where}: {why}"))
+        else:
+            self._fail(TaskError(f"observe is not finite {where}, though the physics is fine"))
         self._conclude(bad, np.zeros(len(bad), dtype=bool), self.sim.t)
         return x[~bad]
 
@@ -173,7 +180,14 @@ class Batch:
         """Note why some rollouts fail; raise it if none may fail alone."""
         if not self._tolerant:
             raise error
-        self.errors.append(error)
+        self._errors.append(error)
+
+    @property
+    def trouble(self) -> Trouble:
+        """What went wrong so far."""
+        mask = warned(self.sim.engine, np.arange(len(self._steps))) > self._warned
+        counts = zip(KINDS, np.count_nonzero(mask, axis=0).tolist(), strict=True)
+        return Trouble(self._errors, Counter({kind: count for kind, count in counts if count}))
 
     @_explained
     def step(self, action: FloatArray) -> None:
@@ -191,6 +205,8 @@ class Batch:
             for name, values in self._measured().items():
                 self.frames[name][self.rows, t * self._parts + part] = values
         sim.t += 1
+        if words := complaint(sim.engine):
+            self._errors.append(TaskError(f"MuJoCo cannot go on: {words}"))
         failed = self._reward(action, t, sim.blown_up())
         ended = task.ended(sim)
         ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)
@@ -262,7 +278,7 @@ class Batch:
 
     def raised(self, error: Exception, spec: TaskSpec) -> Rollouts:
         """The batch's only rollout, in whose control step the task raised an error: it failed there."""
-        self.errors.append(error)
+        self._errors.append(error)
         last = min(self.sim.t, self.task.steps - 1)
         self._steps[:], self._failed[:] = last + 1, True
         for values in self.frames.values():
@@ -326,31 +342,27 @@ def run(
     seeds: Sequence[Seed],
     spec: TaskSpec,
     kept: Kept = Kept(),
-) -> tuple[Rollouts, list[Exception]]:
+) -> tuple[Rollouts, Trouble]:
     """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes.
 
     A rollout in which the task raises an error counts as failed, if the task is not strict: it is found by halving the
     batch, which changes no number of the others. Errors that may be this machine's are raised (`NOT_OF_TASK`).
 
     Returns:
-      the rollouts, and the errors of those that failed although their physics was fine, in their order.
+      the rollouts, and what went wrong in them.
     """
-    rollouts, errors = [], []
+    rollouts, trouble = [], Trouble()
     for first in range(0, len(theta), sim.engine.size):
         rows = slice(first, first + sim.engine.size)
-        part, raised = _tolerant(task, policy, sim, theta[rows], seeds[rows], spec, kept)
+        part, its = _tolerant(task, policy, sim, theta[rows], seeds[rows], spec, kept)
         rollouts.append(part)
-        errors += raised
-    return Rollouts.joined(rollouts), errors
-
-
-NOT_OF_TASK: Final = (FarmError, MemoryError, OSError, ImportError)
-"""Errors that never count as a failed rollout: another machine might not raise them, or no rollout can be right."""
+        trouble.add(its)
+    return Rollouts.joined(rollouts), trouble
 
 
 def _tolerant(
     task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], spec: TaskSpec, kept: Kept
-) -> tuple[Rollouts, list[Exception]]:
+) -> tuple[Rollouts, Trouble]:
     try:
         return _run(task, policy, sim, theta, seeds, spec, kept)
     except NOT_OF_TASK:
@@ -359,19 +371,19 @@ def _tolerant(
         if task.config.strict or len(seeds) == 1:
             raise
     half = len(seeds) // 2
-    parts = [
-        _tolerant(task, policy, sim, theta[rows], seeds[rows], spec, kept) for rows in (slice(half), slice(half, None))
-    ]
-    return Rollouts.joined([part for part, _ in parts]), [error for _, errors in parts for error in errors]
+    first, trouble = _tolerant(task, policy, sim, theta[:half], seeds[:half], spec, kept)
+    second, its = _tolerant(task, policy, sim, theta[half:], seeds[half:], spec, kept)
+    trouble.add(its)
+    return Rollouts.joined([first, second]), trouble
 
 
 def _run(
     task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], spec: TaskSpec, kept: Kept
-) -> tuple[Rollouts, list[Exception]]:
+) -> tuple[Rollouts, Trouble]:
     """Run one batch; if it is a single rollout of a task that is not strict, an error of the task's ends that."""
     alone = len(seeds) == 1 and not task.config.strict
 
-    def attempt() -> tuple[Rollouts, list[Exception]]:
+    def attempt() -> tuple[Rollouts, Trouble]:
         sums = Moments(len(seeds), spec.observation if kept.moments else 0)
         steps = task.steps if kept.observations else 0
         history = np.zeros((len(seeds), steps, spec.observation), "<f4")
@@ -390,9 +402,9 @@ def _run(
             rollouts = batch.raised(error, spec)
         observations = history if kept.observations else rollouts.observations
         moments = sums.table if kept.moments else rollouts.moments
-        return replace(rollouts, moments=moments, observations=observations), batch.errors
+        return replace(rollouts, moments=moments, observations=observations), batch.trouble
 
-    done: tuple[Rollouts, list[Exception]] = again(attempt)
+    done: tuple[Rollouts, Trouble] = again(attempt)
     return done
 
 

@@ -24,6 +24,7 @@ from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError, TaskError
+from farm.returns import known
 from farm.settings import Settings
 from farm.tasks.base import Task, TaskConfig
 from learner import algorithms
@@ -117,8 +118,8 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
     runner = problem.runner()
     theta, starts = _batch(problem)
     together = runner.rollouts(theta, starts)
-    least, most = together.returns.min(), together.returns.max()
-    yield f"returns {least:.4g} to {most:.4g}, {int(together.ended.sum())} ended early"
+    yield from _returns(together)
+    yield from _failures(config, runner, theta, starts, together)
     odd = (*_odd(together), *_still(problem, runner), *_unread(type(problem.task)))
     yield from (f"warning: {each}" for each in odd)
     order = np.random.default_rng(1).permutation(ROWS)
@@ -174,11 +175,46 @@ def _batch(problem: "Problem") -> tuple[FloatArray, list[tuple[int, ...] | None]
     return theta, [None if i == 0 else seeds.trial(0, i // 2) for i in range(ROWS)]
 
 
+def _returns(rollouts: "Rollouts") -> Iterator[str]:
+    """The returns that there are."""
+    values = rollouts.returns[known(rollouts.returns)]
+    if values.size:
+        yield f"returns {values.min():.4g} to {values.max():.4g}, {int(rollouts.ended.sum())} ended early"
+
+
+def _failures(
+    config: RunConfig, runner: "Runner", theta: FloatArray, starts: list[tuple[int, ...] | None], rollouts: "Rollouts"
+) -> Iterator[str]:
+    """Warnings about rollouts that failed, with what is known of the causes, and about MuJoCo's own warnings.
+
+    Raises:
+      TaskError: all failed.
+    """
+    from farm.runner import told
+    from farm.sim.complaints import explained
+    from learner.run.instability import causes
+
+    for kind, warned in runner.trouble.warned.items():
+        yield f"warning: in {warned} of {ROWS} rollouts {explained(kind)}"
+    count, errors = int(rollouts.failed.sum()), runner.trouble.errors
+    if not count:
+        return
+    if errors:
+        if count == ROWS:
+            raise errors[0]
+        text = told(errors[0])
+        yield f"warning: {count} of {ROWS} rollouts failed, the first with {text['error']}"
+        yield from (f"  {line}" for line in text["traceback"])
+        return
+    yield f"warning: the simulation of {count} of {ROWS} rollouts became unstable:"
+    yield from (f"  {line}" for line in causes(config, theta, starts, rollouts))
+    if count == ROWS:
+        raise TaskError(f"all {ROWS} rollouts became unstable, so that nothing can be learnt: see above")
+
+
 def _odd(rollouts: "Rollouts") -> Iterator[str]:
     """What rollouts of a finished task hardly ever do."""
     count = int(rollouts.failed.sum())
-    if count:
-        yield f"the simulation of {count} of {ROWS} rollouts became unstable"
     if (rollouts.ended & (rollouts.steps == 1)).all():
         yield "every rollout ends in its first control step; is `ended` what you mean?"
     elif not count and len(set(rollouts.returns.tolist())) == 1:

@@ -24,6 +24,7 @@ from farm.net.session import FLOOD, Session
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import RunStatus, WorkerStatus
 from farm.net.work import NOT_NORMALISED, Chunk, Failure, Jobs, Results, RoundHeader
+from farm.sim.complaints import KINDS, explained
 from learner.scheduler.judging import Judge, Judging
 from learner.scheduler.ledger import Ledger
 from learner.scheduler.membership import Admission, Attendance, Members
@@ -88,6 +89,8 @@ class Dispatcher:
             spec=hashlib.sha256(simulated).hexdigest(), traces="none", mu=np.empty(0),
         )  # fmt: skip
         self._status, self._alone = StatusAnswer(), time.monotonic()
+        self.warned: Counter[str] = Counter()
+        """In how many rollouts MuJoCo warned of something, by kind; also in those that were repeated."""
         self._told = False  # why a rollout failed by an error of its code; once in a run
         self._progress: GenerationStats | None = None
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
@@ -325,6 +328,10 @@ class Dispatcher:
         if "unasked" in verdicts:
             self.notices.once(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
         self._members.did(message.worker, len(message.returns), now)
+        for kind, count in message.warned.items():
+            if kind in KINDS and kind not in self.warned:
+                log.warning("%s", explained(kind))
+            self.warned[kind] += count
         if message.error and not self._told:
             self._told = True
             text = f"a rollout counts as failed, as its code raised an error: {message.error} (--strict ends the run)"

@@ -89,7 +89,7 @@ def test_it_fails_alone(kind):
     assert rollouts.clamped.tolist() == rollouts.failed.tolist()
     assert not rollouts.success[rollouts.failed].any()
     assert rollouts.measures[rollouts.failed, 0].tolist() == [-9.0] * int(rollouts.failed.sum())
-    assert runner.errors, "why"
+    assert runner.trouble.errors, "why"
     for row in range(len(SEEDS)):
         same(rollouts, row, runner.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
     order = np.random.default_rng(0).permutation(len(SEEDS))

@@ -189,7 +189,7 @@ def test_an_observation_that_is_not_finite_later_is_a_failure():
     runner = broken(observe=lambda _, sim: sim.qpos / (1.0 if sim.t < 2 else np.zeros(1)))
     with np.errstate(all="ignore"):
         assert runner.rollouts(np.zeros((2, runner.size)), [None, None]).failed.all()
-    assert str(runner.errors[0]).startswith("observe is not finite before control step 3, though")
+    assert str(runner.trouble.errors[0]).startswith("observe is not finite before control step 3, though")
 
 
 @pytest.mark.parametrize(
