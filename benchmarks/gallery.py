@@ -18,6 +18,7 @@ import json
 import shlex
 import subprocess
 import sys
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +34,7 @@ ROOT: Final = Path(__file__).parents[1]
 SECONDS: Final = 5.0  # of a film
 SIZE: Final = (200, 150)  # of a film [pixels]
 COLOURS: Final = 32
+_WIDTH: Final = 96  # characters of a line of a command
 TRIES: Final = (50, 5)  # constant actions, starts of each
 
 
@@ -152,7 +154,10 @@ def page(rows: dict[str, Any]) -> str:
         lines += ["", f"## {title}", "", f"![{piece.what}](pictures/gallery/{piece.name}.gif)", ""]
         cost = f"after {row['rollouts']} rollouts, {row['seconds']} s. {piece.needs}".rstrip()
         lines += [f"{piece.what} **{scores}** {cost}", ""]
-        lines += [f"    farm {shlex.join(piece.words)}"]
+        command = textwrap.wrap(
+            f"farm {shlex.join(piece.words)}", _WIDTH, break_long_words=False, break_on_hyphens=False
+        )
+        lines += [" \\\n        ".join([f"    {command[0]}", *command[1:]])]
     return "\n".join(lines) + "\n"
 
 

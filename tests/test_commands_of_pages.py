@@ -55,7 +55,7 @@ class Accepted(Exception):  # noqa: N818  not an error
 def commands(page: Path) -> Iterator[tuple[str, bool]]:
     """The commands of a page, and whether each is a line of code, not a part of the text."""
     inside, text = "", ""
-    for line in page.read_text("utf-8").splitlines():
+    for line in page.read_text("utf-8").replace(" \\\n", " ").splitlines():
         if line.startswith("```"):
             inside = "" if inside else line
         elif inside in ("```sh", "```bash") or (not inside and line.startswith("    ")):
