@@ -14,8 +14,9 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import RunError
 from farm.sim.channels import Camera, Channel
+from farm.sim.framing import View
 from farm.sim.marks import Marks, glow
-from farm.sim.scene import AWAY, BESIDE, Scene, place
+from farm.sim.scene import Scene, place
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
@@ -27,7 +28,6 @@ _DIFFUSE: Final = (0.55, 0.55, 0.55)
 _FOG: Final = (3.0, 6.0)  # where fog begins and is complete, in distances from the camera to its target
 _WALL: Final = 7.0  # distance of the background's wall: in complete fog
 _PAINT: Final = (213, 94, 0)  # for channels without colours
-_SLACK: Final = 0.4  # how far what moves may be from the middle before the camera follows, in radii of what moves
 _SMOOTH: Final = 2  # factor of the size drawn, for smooth edges
 
 
@@ -47,7 +47,7 @@ def pictures(
       model: of the physics; it is not changed.
       qpos: (F, nq) positions; the first is the start.
       size: width and height [pixels].
-      camera: point of view; None: from the side of the moving bodies, which it follows.
+      camera: point of view; None: from beside what moves, all of which is in view.
       mocap: (F, nmocap, 7) poses of the mocap bodies; None: the model's own.
       channels: of the task: arrows and points are drawn, geometries that scalars name in `geoms` painted.
       values: of these channels, by name, (F, ...).
@@ -59,7 +59,7 @@ def pictures(
       RunError: MuJoCo cannot draw on this machine.
     """
     scene = Scene(model, qpos[0], None if mocap is None else mocap[0])
-    view, marks = View(scene, camera), Marks(scene, channels if values else ())
+    view, marks = View(scene, camera, [scene.poses(qpos, mocap)]), Marks(scene, channels if values else ())
     painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
     model = lit(model, view.camera.distance, size)
     free = aimed(mujoco.MjvCamera(), view.camera)
@@ -76,41 +76,6 @@ def pictures(
             marks.put(renderer.scene, data, {name: each[frame] for name, each in (values or {}).items()})
             _backdrop(renderer.scene, model)
             yield _halved(renderer.render())
-
-
-class View:
-    """A point of view: a task's camera, which stays; or beside the moving bodies, which it follows.
-
-    It follows the first of them, and only as far as it leaves the middle: a swinging pendulum does not swing the scene.
-    """
-
-    def __init__(self, scene: Scene, camera: Camera | None) -> None:
-        """Frame a scene, by the task's camera if there is one."""
-        self.camera = camera or beside(scene)
-        """At the start."""
-        self.mover = None if camera else scene.mover
-        """What it follows; None: nothing."""
-        self._shift = np.zeros(3)
-
-    def moved(self, place: FloatArray) -> FloatArray:
-        """How far the camera has to move if the body is at this place now, [m], (3,)."""
-        assert self.mover is not None
-        away = place - self.mover.place - self._shift
-        slack = _SLACK * self.mover.radius
-        step = away * (1.0 - slack / max(float(np.linalg.norm(away)), slack))
-        self._shift += step
-        return step
-
-    def back(self) -> FloatArray:
-        """How far it has to move to be at the start again [m], (3,)."""
-        step, self._shift = -self._shift, np.zeros(3)
-        return step
-
-
-def beside(scene: Scene) -> Camera:
-    """The default camera: looks at the moving bodies, or at the middle of the scene if nothing moves."""
-    x, y, z = scene.model.stat.center.tolist() if scene.mover is None else scene.mover.centre
-    return Camera(lookat=(x, y, z), distance=AWAY * scene.radius, azimuth=BESIDE[0], elevation=BESIDE[1])
 
 
 def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)) -> mujoco.MjModel:

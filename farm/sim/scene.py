@@ -15,12 +15,6 @@ from farm.errors import ConfigError
 MODEL: Final = "model"
 """Name of the channel that says which of several models a rollout has, by flags."""
 
-BESIDE: Final = (106.0, -25.0)
-"""Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots walk along x."""
-
-AWAY: Final = 3.5
-"""Distance from which it is seen, in radii of the moving part."""
-
 _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
     mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",

@@ -11,7 +11,8 @@ import mujoco.viewer
 
 from farm.errors import RunError
 from farm.sim.engines import DataEngine
-from farm.sim.rendering import View, aimed
+from farm.sim.framing import View
+from farm.sim.rendering import aimed
 from farm.sim.sim import Sim
 
 _CLOSING: Final = 10.0  # [s]

@@ -52,7 +52,7 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(
             f"no display to open a window on: farm replay {command.run} --video rollout.gif draws without one"
         )
-    from farm.sim.rendering import View
+    from farm.sim.framing import View
     from farm.sim.viewer import watch
 
     logs.set_up("WARNING")

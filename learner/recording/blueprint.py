@@ -9,9 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from farm.arrays import FloatArray
-from farm.sim.channels import Camera, Channel
-from farm.sim.rendering import beside
-from farm.sim.scene import Scene
+from farm.sim.channels import Channel
+from farm.sim.framing import View
 from farm.tasks.base import TaskSpec
 from learner.recording.channels import Panel, entities, panels, title
 
@@ -42,13 +41,13 @@ class Eye:
     """Entity that the eye follows."""
 
     @classmethod
-    def of(cls, scene: Scene, camera: Camera | None) -> "Eye":
-        """The task's camera; by default an eye beside the moving bodies that follows them."""
-        view = camera or beside(scene)
-        a, e = np.deg2rad([view.azimuth, view.elevation])
+    def of(cls, view: View) -> "Eye":
+        """The eye of a point of view: it follows what that follows."""
+        camera = view.camera
+        a, e = np.deg2rad([camera.azimuth, camera.elevation])
         ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        tracked = None if camera or scene.mover is None else FOLLOWED
-        return cls(np.array(view.lookat), -_NEARER * view.distance * ahead, tracked)
+        tracked = None if view.mover is None else FOLLOWED
+        return cls(np.array(camera.lookat), -_NEARER * camera.distance * ahead, tracked)
 
 
 def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:

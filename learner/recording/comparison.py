@@ -21,7 +21,6 @@ import rerun as rr
 from farm.arrays import FloatArray
 from farm.net.stats import GenerationStats
 from farm.sim.channels import Channel
-from farm.sim.rendering import beside
 from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
 from learner.recording.blueprint import Eye
@@ -81,12 +80,14 @@ def _arrangement(runs: Sequence[Side]) -> tuple[FloatArray, Eye]:
     """The vector from each scene to the next [m] (3,), across the line of sight; and the eye that sees all of them."""
     sizes = [run.drawing.scene.radius for run in runs]
     largest = runs[int(np.argmax(sizes))].drawing
-    camera = largest.camera or replace(beside(largest.scene), azimuth=_VIEW[0], elevation=_VIEW[1])
-    eye = Eye.of(largest.scene, camera)
+    view = largest.view([run.rollout for run in runs if run.drawing is largest])
+    if largest.camera is None:
+        view.camera = replace(view.camera, azimuth=_VIEW[0], elevation=_VIEW[1])
+    eye = Eye.of(view)
     along_y = abs(eye.away[0]) >= abs(eye.away[1])
     step = _SPACING * max(sizes) * np.array([0.0, 1.0, 0.0] if along_y else [1.0, 0.0, 0.0])
     further = len(runs) - 1
-    wider = 1.0 + _WIDER * further * float(np.linalg.norm(step)) / camera.distance
+    wider = 1.0 + _WIDER * further * float(np.linalg.norm(step)) / view.camera.distance
     return step, Eye(eye.target + 0.5 * further * step, eye.away * wider)
 
 
@@ -100,7 +101,7 @@ def _compared(runs: Sequence[Side]) -> Channel | None:
 def _names(run: Side, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:
     """Static entities besides the scene: names and the run's colour."""
     size = run.drawing.scene.radius
-    above = Eye.of(run.drawing.scene, run.drawing.camera).target + (0.0, 0.0, size)
+    above = Eye.of(run.drawing.view()).target + (0.0, 0.0, size)
     point = rr.Points3D([above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True)
     yield "/label", point
     if learning:

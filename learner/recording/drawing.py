@@ -12,7 +12,7 @@ import rerun as rr
 
 from farm.arrays import FloatArray
 from farm.sim.channels import Camera
-from farm.sim.rendering import View
+from farm.sim.framing import View
 from farm.sim.scene import MODEL, Geometry, Scene
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
@@ -74,13 +74,19 @@ class Drawing:
             if present != (count, *shape):
                 raise ValueError(f"{name} of shape {present}, expected {(count, *shape)}: another scene or task?")
 
-    def captions(self, rollouts: Sequence[tuple[str, Trajectory]]) -> Iterator[Columns]:
+    def view(self, rollouts: Sequence[Trajectory] = ()) -> View:
+        """From where it is seen: so that all of these rollouts is in view, or what can be reached from the start."""
+        return View(self.scene, self.camera, [rollout.bodies for rollout in rollouts])
+
+    def captions(self, rollouts: Sequence[tuple[str, Trajectory]], view: View | None = None) -> Iterator[Columns]:
         """Texts in the scene for the frames of named rollouts, one rollout after the other; and what the eye follows.
 
         Each has the rollout's name, return and success, and how far the first free body has moved since its start.
+        The view is the one that the eye was placed by; by default that of the start.
         """
-        eye = Eye.of(self.scene, self.camera)
-        shifts = np.concatenate([self._shifts(rollout) for _, rollout in rollouts])
+        view = view or self.view()
+        eye = Eye.of(view)
+        shifts = np.concatenate([self._shifts(rollout, view) for _, rollout in rollouts])
         texts = [text for name, rollout in rollouts for text in self._texts(name, rollout)]
         place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
         values, one = rr.Points3D.columns(positions=place + shifts, labels=texts), np.ones(len(texts), dtype=int)
@@ -88,13 +94,11 @@ class Drawing:
         if eye.tracked:
             yield Columns(eye.tracked, rr.Points3D.columns(positions=eye.target + shifts).partition(one))
 
-    def _shifts(self, rollout: Trajectory) -> FloatArray:
+    def _shifts(self, rollout: Trajectory, view: View) -> FloatArray:
         """How far the eye has moved since the start [m], (F, 3)."""
-        view = View(self.scene, self.camera)
         if view.mover is None:
             return np.zeros((len(rollout.times), 3))
-        places = rollout.bodies[:, self.scene.bodies.index(view.mover.body), :3]
-        return np.cumsum([view.moved(place) for place in places], axis=0)
+        return view.shifts(rollout.bodies[:, self.scene.bodies.index(view.mover.body), :3])
 
     def _texts(self, name: str, rollout: Trajectory) -> list[str]:
         success = {True: "success", False: "no success", None: ""}[rollout.success]

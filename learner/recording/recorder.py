@@ -19,7 +19,7 @@ import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -120,7 +120,7 @@ class Recorder:
             sinks.append(rr.GrpcServerSink(host, port))
         if path is not None:
             sinks.append(file_sink(path))
-        self._eye = Eye.of(scene, drawing.camera)
+        self._eye = Eye.of(drawing.view())
         self._stream = begin(run, sinks, blueprint.learning(spec, self._eye))
         send_properties(self._stream, "run", properties or {})
         static = [
@@ -179,7 +179,10 @@ class Recorder:
         for part in curves.last_policy(rollout.returned, rollout.success):
             self._stream.send_columns(part.entity, self._at(now), part.columns)
         self._hold(rollout, self._generation, now)
-        self._finished = blueprint.finished(self._drawing.spec, self._eye, self._generation)
+        # What is followed was recorded by the view of the start; that of this rollout knows how far away to be.
+        shown = Eye.of(self._drawing.view([rollout]))
+        eye = replace(self._eye, away=shown.away) if shown.tracked else shown
+        self._finished = blueprint.finished(self._drawing.spec, eye, self._generation)
         self._stream.send_blueprint(self._finished)
         self.settle()
 

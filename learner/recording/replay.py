@@ -32,7 +32,8 @@ def record_replay(
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
     aside = path.with_name(f"{path.stem}.new{path.suffix}")
     aside.unlink(missing_ok=True)
-    layout = blueprint.replay(drawing.spec, Eye.of(drawing.scene, drawing.camera), longest)
+    view = drawing.view([rollout for _, rollout in rollouts])
+    layout = blueprint.replay(drawing.spec, Eye.of(view), longest)
     stream = begin(f"{run}-replay", [file_sink(aside)], layout)
     log_static(stream, [*drawing.static(), ("/config", markdown(config))])
     start = 0.0
@@ -40,7 +41,7 @@ def record_replay(
         at = times("rollout", np.array([number]), np.array([start]))
         stream.send_columns("/rollout", at, row(_caption(name, rollout)))
         numbers = np.full(len(rollout.times), number)
-        columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)])]
+        columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)], view)]
         send(stream, columns, "rollout", numbers, start + rollout.times)
         start += float(rollout.times[-1]) + PAUSE
         if number < len(rollouts):

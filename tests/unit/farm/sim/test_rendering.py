@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from farm.sim.channels import Camera
+from farm.sim.framing import AWAY, View, beside
 from farm.sim.model_files import compiled
-from farm.sim.rendering import View, beside, lit
-from farm.sim.scene import AWAY, Scene
+from farm.sim.rendering import lit
+from farm.sim.scene import Scene
 
 MJCF = """
 <mujoco>

@@ -11,6 +11,7 @@ from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
 from farm.sim.channels import Kind
+from farm.sim.framing import View
 from farm.sim.model_files import compiled
 from farm.sim.scene import MODEL, Geometry, Scene
 from farm.sim.trajectory import Trajectory, joined
@@ -144,12 +145,12 @@ def test_the_layout_travels_in_the_file(start, tmp_path):
 
 
 def test_the_eye_is_the_cameras_or_beside_what_moves(scene):
-    eye = Eye.of(scene, Camera(lookat=(1, 2, 3), distance=2.0, azimuth=90.0, elevation=-30.0))
+    eye = Eye.of(View(scene, Camera(lookat=(1, 2, 3), distance=2.0, azimuth=90.0, elevation=-30.0)))
     assert (eye.target.tolist(), eye.tracked) == ([1, 2, 3], None)
     np.testing.assert_allclose(eye.away / np.linalg.norm(eye.away), [0, -np.cos(np.pi / 6), 0.5], atol=1e-12)
-    assert Eye.of(scene, None).tracked == "/world/view"
+    assert Eye.of(View(scene, None)).tracked == "/world/view"
     still = Scene(compiled('<mujoco><worldbody><geom type="plane" size="4 4 1"/></worldbody></mujoco>', "still"))
-    assert Eye.of(still, None).tracked is None
+    assert Eye.of(View(still, None)).tracked is None
 
 
 def test_another_tasks_rollout_is_refused(scene, spec, plain, rollout):

@@ -276,7 +276,7 @@ def test_no_curve_goes_from_a_rollout_that_ended_early_to_the_next_generations(s
 def test_the_eye_follows_a_body_that_moves_away(scene, spec, rollout, tmp_path, rows_of):
     sample, mover = rollout(), scene.mover
     bodies = np.tile(scene.poses(scene.model.qpos0[None]), (16, 1, 1))
-    bodies[8:, scene.bodies.index(mover.body), 0] += 10.0
+    bodies[8:, [at for at, name in enumerate(scene.bodies) if name not in scene.fixed], 0] += 10.0
     away = dataclasses.replace(sample, bodies=bodies.astype("<f4"))
     record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=[("gone", away)])
     places = np.array(rows_of("r.rrd").column("/world/view", "positions"))[:, 0]
