@@ -114,10 +114,10 @@ def main() -> None:
         _farm(folder, "run", "--task", "fragile-bar", "--name", "bar", "--quiet")
         for name, source, tab, at in (
             ("viewer", "runs/first/run.rrd", "", ("generation", {"sequence": 90})),
-            ("rollout", "runs/first/run.rrd", "Rollout", ("sim_time", {"duration": 135.7})),
+            ("rollout", "runs/first/run.rrd", "Rollout (sim_time)", ("sim_time", {"duration": 135.7})),
             ("replay", "runs/first/rollout.rrd", "", ("sim_time", {"duration": 1.2})),
             ("compare", "compare.rrd", "", None),
-            ("fragile", "runs/bar/run.rrd", "Rollout", ("sim_time", {"duration": 51.2})),
+            ("fragile", "runs/bar/run.rrd", "Rollout (sim_time)", ("sim_time", {"duration": 51.2})),
             ("gym", "runs/swim/run.rrd", "", ("generation", {"sequence": 15})),
         ):
             with viewer() as window:

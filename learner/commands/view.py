@@ -68,7 +68,7 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
       Interrupted: Ctrl-C or SIGTERM, which end the viewer as well.
     """
     from learner.recording.files import program, quiet
-    from learner.recording.viewing import free_port, listens, once_loaded, show_newest, show_table
+    from learner.recording.viewing import free_port, listens, once_loaded, show_table
 
     port, page = free_port(), free_port(_PAGE)
     command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
@@ -84,9 +84,9 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
             def gone() -> bool:
                 return viewer.poll() is not None or stop.is_set()
 
-            if not web:
-                once_loaded(port, gone, show_table if table else show_newest)
-            elif listens(page, gone):
+            if table and not web:
+                once_loaded(port, gone, show_table)
+            elif web and listens(page, gone):
                 live = [source for source in sources if "://" in source]  # a browser can open these
                 address, tunnel = _address(page, live or [f"rerun+http://127.0.0.1:{port}/proxy"])
                 say(f"open {address}   {tunnel}")

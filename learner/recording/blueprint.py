@@ -24,7 +24,6 @@ _PICTURES: Final = 0.42  # height of the pictures below a scene of 1
 _CAPTION: Final = 0.16  # and of a caption alone
 _LEGEND: Final = 6  # no legend for more curves than this: it would hide them
 _MARGIN: Final = 1.6  # number of rollouts shown before the cursor; the legend covers older ones
-_SEAM: Final = 1000  # [ns] from a rollout's last frame to its end
 _FIRST: Final = 1.2  # height of the first plots, whose legend is mostly the longest; of others 1
 _ROWS: Final = 3  # more plots of a rollout are in two columns
 
@@ -52,36 +51,32 @@ class Eye:
 
 def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
     """Layout of a run while it learns: the newest generation is in view."""
-    return _blueprint(_run(spec, eye, "Learning"), rrb.TimePanel(timeline="generation", play_state="following"))
-
-
-def finished(spec: TaskSpec, eye: Eye, generations: int) -> rrb.Blueprint:
-    """Layout of a finished run with this number of generations: its last policy's rollout plays repeatedly.
-
-    All views are drawn on the timeline that plays, which is not that of generations; the tab of the curves says so.
-    """
-    horizon = spec.steps * spec.period
-    start, end = (round(1e9 * number * horizon) for number in (generations, generations + 1))
-    panel = rrb.TimePanel(
-        timeline="sim_time",
-        play_state="playing",
-        loop_mode="selection",
-        time_selection=rrb.components.AbsoluteTimeRange(min=start, max=end - _SEAM),
+    return _blueprint(
+        _run(spec, eye, "The mean policy's rollout"), rrb.TimePanel(timeline="generation", play_state="following")
     )
-    return _blueprint(_run(spec, eye, f"Learning (sim_time: {horizon:g} s per generation)"), panel)
 
 
-def _run(spec: TaskSpec, eye: Eye, curves: str) -> rrb.Container:
-    """`curves` is the name of the tab of the learning curves."""
+def finished(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
+    """Layout of a finished run: its curves over the generations, and the end of its last policy's rollout.
+
+    All views are drawn on one timeline, and curves read best over generations; rollouts move on sim_time.
+    """
+    scene = "The last policy's rollout: it moves on the timeline sim_time"
+    panel = rrb.TimePanel(timeline="generation", play_state="following")
+    return _blueprint(_run(spec, eye, scene), panel)
+
+
+def _run(spec: TaskSpec, eye: Eye, scene: str) -> rrb.Container:
+    """`scene` is the name of the scene's view."""
     pictures = rrb.Horizontal(*_images(spec), name="Images")
     traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
     parts = [
         part for part, present in ((pictures, bool(_images(spec))), (traces, bool(spec.trace_channels))) if present
     ]
-    left = [_scene("The mean policy's rollout", eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
+    left = [_scene(scene, eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
     horizon = spec.steps * spec.period
-    tabs = rrb.Tabs(_learning(spec, curves), _rollout(spec, horizon), _farm(), again, _config())
+    tabs = rrb.Tabs(_learning(spec), _rollout(spec, horizon, "Rollout (sim_time)"), _farm(), again, _config())
     return _beside(left, _PICTURES, tabs, 0.45)
 
 
@@ -90,7 +85,7 @@ def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
     caption = rrb.TextDocumentView(origin="/rollout", name="Shown")
     images = _images(spec)
     below = rrb.Horizontal(caption, *images) if images else caption
-    tabs = rrb.Tabs(_rollout(spec, window), _config())
+    tabs = rrb.Tabs(_rollout(spec, window, "Rollout"), _config())
     left = [_scene("Replay", eye), below]
     return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), _playing())
 
@@ -176,7 +171,7 @@ def _config() -> rrb.View:
     return rrb.TextDocumentView(origin="/config", name="Config")
 
 
-def _learning(spec: TaskSpec, name: str) -> rrb.Container:
+def _learning(spec: TaskSpec) -> rrb.Container:
     """Learning curves with legends where curves seldom are: returns rise, sigma falls."""
     bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
     log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
@@ -197,7 +192,7 @@ def _learning(spec: TaskSpec, name: str) -> rrb.Container:
         ),
         rrb.TextLogView(origin="/log", name="Log", columns=log),
         row_shares=[2.2, *([1.4] if measures else []), 1.4, 1],
-        name=name,
+        name="Learning",
     )
 
 
@@ -221,7 +216,7 @@ def _plot(name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.
     return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=key, axis_x=whole)
 
 
-def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:
+def _rollout(spec: TaskSpec, horizon: float, name: str) -> rrb.Container:
     """Curves and lanes of a rollout, `horizon` [s] to either side of the cursor."""
     window = rr.VisibleTimeRange(
         "sim_time",
@@ -246,7 +241,7 @@ def _rollout(spec: TaskSpec, horizon: float) -> rrb.Container:
     lanes: list[rrb.View] = [
         rrb.StateTimelineView(origin=each.origin, name=each.name) for each in panels(spec.channels, "lanes")
     ]
-    return _stacked(plots, lanes, "Rollout")
+    return _stacked(plots, lanes, name)
 
 
 def _stacked(views: list[rrb.View], lanes: list[rrb.View], name: str) -> rrb.Container:

@@ -168,7 +168,7 @@ class Recorder:
             self._flush()
 
     def final(self, rollout: Trajectory) -> None:
-        """Record the finished run's mean policy, and make viewers open with its rollout, playing repeatedly.
+        """Record the finished run's mean policy, and make viewers open with the end of its rollout.
 
         Raises:
           ValueError: it is a rollout of another scene or task.
@@ -182,7 +182,7 @@ class Recorder:
         # What is followed was recorded by the view of the start; that of this rollout knows how far away to be.
         shown = Eye.of(self._drawing.view([rollout]))
         eye = replace(self._eye, away=shown.away) if shown.tracked else shown
-        self._finished = blueprint.finished(self._drawing.spec, eye, self._generation)
+        self._finished = blueprint.finished(self._drawing.spec, eye)
         self._stream.send_blueprint(self._finished)
         self.settle()
 

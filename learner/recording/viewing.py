@@ -47,16 +47,6 @@ def show_table(viewer: ViewerClient, state: ViewerState) -> None:
     viewer.set_location(f"{state.catalog_url}/entry/{application}")
 
 
-def show_newest(viewer: ViewerClient, state: ViewerState) -> None:
-    """Start playing the recording at the newest rollout: a layout cannot contain the cursor."""
-    recording = next(each for each in state.recordings if each.store_id == state.active_recording)
-    last = {line.name: line.end for line in recording.timelines}
-    if recording.current_timeline == "sim_time" and last.get("generation"):
-        rollouts = last["generation"] + 1  # one after the other, all given the same time
-        start = 1e-9 * (last["sim_time"] or 0) * (rollouts - 1) / rollouts
-        viewer.set_time("sim_time", duration=start, play_state="playing")
-
-
 def once_loaded(port: int, ended: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
     """Call a function with the viewer on this port as soon as its recordings are loaded; return whether it was done."""
     until = time.monotonic() + _LOADING

@@ -82,8 +82,8 @@ def test_what_falls_for_ever_leaves_a_picture_of_what_stays():
     qpos[:, 10] = -np.linspace(0.0, 500.0, 50)
     assert scene.mover is not None
     view = View(scene, None, [scene.poses(qpos)])
-    assert view.camera.distance < 1000.0
-    assert np.isfinite(view.camera.lookat).all()
+    assert view.camera.distance < 20.0 * scene.mover.radius
+    assert np.linalg.norm(np.subtract(view.camera.lookat, scene.mover.centre)) < scene.mover.radius
 
 
 def examples() -> list[str]:
@@ -98,7 +98,7 @@ def examples() -> list[str]:
 @pytest.mark.parametrize(
     "task", [*examples(), "finger-gait", "turning", "gym:Hopper-v5", "gym:Ant-v5", "gym:Reacher-v5"]
 )
-def test_all_that_moves_is_in_each_picture_of_an_example(task: str, monkeypatch: pytest.MonkeyPatch):
+def test_all_that_moves_is_in_each_picture_of_an_example(task: str):
     if task.startswith("gym:"):
         pytest.importorskip("gymnasium")
     try:
