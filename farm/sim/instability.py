@@ -1,5 +1,6 @@
 """Why a simulation becomes unstable: how its model starts, what its joints lack, which of them left first."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,7 +16,48 @@ _LEAST_INSIDE: Final = 1e-3  # [m]; resting contacts are less deep
 _BEYOND: Final = 0.01  # share of a joint's range
 _HINGE: Final = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE: Final = int(mujoco.mjtJoint.mjJNT_SLIDE)
+_ARMATURE: Final = 0.01  # [kg m^2] or [kg]
+_DAMPING: Final = 0.1  # [N m s / rad] or [N s / m]
+_FINER: Final = 5
 _MOST: Final = 3  # findings of a kind that are named
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """A change of a model that may keep its simulation stable."""
+
+    words: str
+    change: Callable[[mujoco.MjModel], None]
+    finer: int = 1
+    """How many physics steps it makes of one."""
+
+
+def remedies(model: mujoco.MjModel) -> list[Remedy]:
+    """The changes that fit a model."""
+    bare = len(bare_dofs(model))
+    heavy = f'armature="{_ARMATURE:g}" and damping="{_DAMPING:g}" for the {bare} joints that have neither'
+    step = model.opt.timestep / _FINER
+    chosen = [
+        Remedy(f"a timestep of {step:g} s", _finer, _FINER),
+        *([Remedy(heavy, _heavier)] if bare else []),
+    ]
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        chosen.append(Remedy('<option integrator="implicitfast"/>', _implicit))
+    return chosen
+
+
+def _finer(model: mujoco.MjModel) -> None:
+    model.opt.timestep /= _FINER
+
+
+def _implicit(model: mujoco.MjModel) -> None:
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+
+def _heavier(model: mujoco.MjModel) -> None:
+    dofs = bare_dofs(model)
+    model.dof_armature[dofs] = _ARMATURE
+    model.dof_damping[dofs] = _DAMPING
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,12 @@ def main(words: Sequence[str]) -> int:
         cells = [figure(value, ".3g") for value in row.get("measures", {}).values()]
         table.add_row(name, str(row["rollouts"]), str(row["failed"]), success, *returns, str(row["ended"]), *cells)
     Console().print(table)
+    if figures["nominal"]["failed"]:
+        say("the mean policy is unstable from its nominal start: farm check looks for the cause")
+    elif failed := figures["perturbed"]["failed"]:
+        say(
+            f"unstable in {failed} of {command.rollouts} rollouts, which are in no mean: farm check looks for the cause"
+        )
     return 0
 
 

@@ -120,13 +120,15 @@ def _print(sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
     robust = ("robust success", "robust_success_rate") if judged else ("robust return", "robust_return")
     measures = outcomes.measures(table)
     names = [column.removeprefix(outcomes.MEASURE) for column in measures]
-    for name in (*sweep.vary, "runs", "untrained", "return", robust[0], *names, "minutes"):
+    failed = ["robust_failed"] if any(row.get("robust_failed") for row in table) else []
+    results = ("untrained", "return", robust[0], *("failed" for _ in failed), *names)
+    for name in (*sweep.vary, "runs", *results, "minutes"):
         output.add_column(name, justify="left" if name in sweep.vary else "right", no_wrap=True)
     count = len(sweep.seeds)
     for i, setting in enumerate(sweep.settings):
         rows = table[i * count : (i + 1) * count]
         finished = sum(row["state"] == "finished" for row in rows)
-        columns = ("first_mean_policy_return", "mean_policy_return", robust[1], *measures)
+        columns = ("first_mean_policy_return", "mean_policy_return", robust[1], *failed, *measures)
         cells = [_spread(outcomes.spread(rows, column), percent=column == "robust_success_rate") for column in columns]
         minutes = sum(row["seconds"] or 0.0 for row in rows) / 60
         output.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")

@@ -1,15 +1,23 @@
 """Why rollouts become unstable: how they start, which joint leaves first, and which remedies help when tried."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-import mujoco
 import numpy as np
 
 from farm.arrays import FloatArray
 from farm.runner import Runner
 from farm.sim.engines import BatchEngine
-from farm.sim.instability import WatchedEngine, bare_dofs, first_joint, outside, overlapping, too_stiff
+from farm.sim.instability import (
+    Remedy,
+    WatchedEngine,
+    first_joint,
+    outside,
+    overlapping,
+    remedies,
+    too_stiff,
+)
+from farm.sim.interfaces import MakeEngine
 from farm.tasks.base import Task
 from farm.tasks.rollouts import Rollouts, Seed
 from learner.run import setup
@@ -18,10 +26,7 @@ from learner.run.config import RunConfig
 if TYPE_CHECKING:
     from farm.policies.base import Policy
 
-_ARMATURE: Final = 0.01  # [kg m^2] or [kg]
-_DAMPING: Final = 0.1  # [N m s / rad] or [N s / m]
 _WEAKER: Final = 0.1
-_FINER: Final = 5
 
 
 def causes(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollouts: Rollouts) -> Iterator[str]:
@@ -44,7 +49,7 @@ def causes(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollout
         return
     watched: list[WatchedEngine] = []
 
-    def engine(model: mujoco.MjModel) -> WatchedEngine:
+    def engine(model: Any) -> WatchedEngine:  # noqa: ANN401  MuJoCo's
         watched.append(WatchedEngine(model))
         return watched[-1]
 
@@ -56,39 +61,30 @@ def causes(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollout
     unlimited = int(np.count_nonzero(task.model.actuator_ctrllimited == 0))
     if unlimited:
         yield f"{unlimited} of {task.model.nu} actuators have no ctrlrange, so that commands have no limit"
-    yield from _remedies(config, theta, starts, task.model)
+    for remedy in remedies(task.model):
+        yield _words(remedy.words, _tried(config, theta, starts, remedy), len(theta))
+    weaker = f"actions times {_WEAKER:g}, so that commands do not use their full range"
+    yield _words(weaker, _tried(config, theta, starts, share=_WEAKER), len(theta))
 
 
-def _remedies(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], model: mujoco.MjModel) -> Iterator[str]:
-    """How many rollouts stay unstable with each remedy that fits the model."""
-    count, step = len(theta), model.opt.timestep / _FINER
-    remedies: list[tuple[str, Callable[[Task], None], float]] = [
-        (f"a timestep of {step:g} s", _finer, 1.0),
-        (f"actions times {_WEAKER:g}, so that commands do not use their full range", _nothing, _WEAKER),
-    ]
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        remedies.insert(1, ('<option integrator="implicitfast"/>', _implicit, 1.0))
-    if bare := len(bare_dofs(model)):
-        text = f'armature="{_ARMATURE:g}" and damping="{_DAMPING:g}" for the {bare} joints that have neither'
-        remedies.insert(1, (text, _heavier, 1.0))
-    for words, change, share in remedies:
-        failed = _tried(config, theta, starts, change=change, share=share)
-        yield f"tried {words}: {f'{failed} of {count} unstable' if failed else 'none is unstable'}"
+def _words(remedy: str, failed: int, count: int) -> str:
+    return f"tried {remedy}: {f'{failed} of {count} unstable' if failed else 'none is unstable'}"
 
 
 def _tried(
     config: RunConfig,
     theta: FloatArray,
     starts: Sequence[Seed],
+    remedy: Remedy | None = None,
     *,
-    change: Callable[[Task], None] | None = None,
     share: float = 1.0,
-    engine: Callable[[mujoco.MjModel], BatchEngine] = BatchEngine,
+    engine: MakeEngine = BatchEngine,
 ) -> int:
-    """How many of the rollouts fail with a changed task, a share of the actions, or another engine."""
+    """How many of the rollouts fail with a changed model, a share of the actions, or another engine."""
     problem = setup.problem(config)
-    if change is not None:
-        change(problem.task)
+    if remedy is not None:
+        remedy.change(problem.task.model)
+        problem.task.substeps *= remedy.finer
     runner = Runner(problem.task, problem.policy, engine)
     if share != 1.0:
         runner.policy = _Weaker(problem.policy, share)  # type: ignore[assignment]  # it acts
@@ -116,22 +112,3 @@ class _Weaker:
         """A share of its actions."""
         action = self._policy.act(*given)
         return (self._share * action[0], action[1]) if isinstance(action, tuple) else self._share * action
-
-
-def _nothing(task: Task) -> None:
-    """Leave the task as it is."""
-
-
-def _finer(task: Task) -> None:
-    task.model.opt.timestep /= _FINER
-    task.substeps *= _FINER
-
-
-def _implicit(task: Task) -> None:
-    task.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-
-
-def _heavier(task: Task) -> None:
-    dofs = bare_dofs(task.model)
-    task.model.dof_armature[dofs] = _ARMATURE
-    task.model.dof_damping[dofs] = _DAMPING
