@@ -199,10 +199,12 @@ class Task:
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """The task's own settings: flags, help and config.json follow from its fields."""
     xml: str | Path = ""
-    """MJCF of what is simulated, or its file in the folder of the task's file; or override `files` or `compiled`.
+    """MJCF or URDF of what is simulated, or the path of its file; or override `files` or `compiled`.
 
     What it includes and reads (meshes, textures, height fields) travels with a run. A worker does not look at it.
     """
+    root: str | Path = ""
+    """Folder of all files of `xml`, seen from the folder of the task's file; empty: that folder itself."""
     steps: int = 100
     """Control steps of a rollout."""
     substeps: int = 1
@@ -242,10 +244,12 @@ class Task:
     # Simulation
 
     def files(self) -> "Mapping[str, Content]":
-        """What decides numbers and is sent with a run, by path: texts, or bytes; the first .xml is the model."""
+        """What decides numbers and is sent with a run, by path: texts, or bytes; the first model is what is simulated."""
         from farm.sim.model_files import read
 
-        return read(self.xml, self._folder) if self.xml else {}
+        if not self.xml:
+            return {}
+        return read(self.xml, self._folder / self.root if self._folder else None)
 
     @property
     def _folder(self) -> Path | None:
@@ -288,7 +292,9 @@ class Task:
     @property
     def main(self) -> str:
         """Path of the model among `sources`; empty if there is none."""
-        return next((path for path in self.sources if path.endswith(".xml")), "")
+        from farm.sim.model_files import SUFFIXES
+
+        return next((path for path in self.sources if path.lower().endswith(SUFFIXES)), "")
 
     def mjcf(self) -> str:
         """The model's MJCF text, from `sources`."""
