@@ -13,7 +13,7 @@ import struct
 import sys
 import threading
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import IO, Any, Final
 
 ABOVE: Final = "/up"
 """The folder that MuJoCo sees; nothing of this name need exist."""
@@ -37,14 +37,14 @@ REFUSED: Final = b"!"
 _ERROR: Final = 1000  # [bytes], as MuJoCo's own programs have
 
 
-def send(stream: BinaryIO, kind: bytes, content: Any = b"") -> None:  # noqa: ANN401  bytes, or ctypes' buffer
+def send(stream: IO[bytes], kind: bytes, content: Any = b"") -> None:  # noqa: ANN401  bytes, or ctypes' buffer
     """Send a message."""
     stream.write(HEADER.pack(kind, len(content)))
     stream.write(content)
     stream.flush()
 
 
-def receive(stream: BinaryIO) -> tuple[bytes, bytes]:
+def receive(stream: IO[bytes]) -> tuple[bytes, bytes]:
     """Receive a message: its kind and content; EOFError if the other side is gone."""
     header = stream.read(HEADER.size)
     if len(header) < HEADER.size:
@@ -83,7 +83,7 @@ class _Provider(ctypes.Structure):
 class _Folder:
     """The folder that MuJoCo sees."""
 
-    def __init__(self, questions: BinaryIO, answers: BinaryIO) -> None:
+    def __init__(self, questions: IO[bytes], answers: IO[bytes]) -> None:
         self._questions = questions
         self._answers = answers
         self._lock = threading.Lock()  # MuJoCo reads meshes in threads

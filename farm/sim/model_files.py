@@ -4,7 +4,7 @@ import hashlib
 import posixpath
 import re
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -119,15 +119,6 @@ def _compiled(contents: Files, main: str) -> Compiled:
     return model
 
 
-def write(folder: Path, files: Files) -> None:
-    """Write files whose paths lead nowhere else into a folder."""
-    for path, content in files.items():
-        _inside([path], "a file's name")
-        target = folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(content.encode() if isinstance(content, str) else content)
-
-
 def split(files: Files) -> tuple[dict[str, str], dict[str, str]]:
     """Texts, which travel and are kept as they are, and the SHA-256 of the other files, which travel once."""
     texts = {name: content for name, content in files.items() if isinstance(content, str)}
@@ -204,17 +195,15 @@ class _Folder:
         file = _OPENING.search(str(error))
         if file is None:
             return f"MuJoCo refuses the model: {error}"
-        if file[1].startswith("/"):
-            return f"{file[1]} lies outside of {self._folder}: put the file there, and name it from there"
         name = posixpath.basename(file[1])
-        missing = [path for path in dict.fromkeys(error.missing) if posixpath.basename(path) == name]
-        outside = next((path for path in missing if path.startswith("..")), "")
-        if outside:
-            return self.lies_outside(outside)
-        return f"there is no file {' or '.join(missing) or file[1]}"
+        missing = [path for path in dict.fromkeys(error.missing) if posixpath.basename(path) == name] or [file[1]]
+        outside = next((path for path in missing if path.startswith(("/", "../"))), "")
+        return self.lies_outside(outside) if outside else f"there is no file {' or '.join(missing)}"
 
     def lies_outside(self, path: str) -> str:
         """That a path leads out of the folder, and what to do."""
+        if path.startswith("/"):
+            return f"{path} lies outside of {self._folder}: put the file there, and name it from there"
         above = path.split("/").count("..")
         folder = self._folder.parents[min(above, len(self._folder.parents)) - 1]
         return (

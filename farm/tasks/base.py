@@ -244,7 +244,7 @@ class Task:
     # Simulation
 
     def files(self) -> "Mapping[str, Content]":
-        """What decides numbers and is sent with a run, by path: texts, or bytes; the first model is what is simulated."""
+        """What decides numbers and is sent with a run, by path: texts, or bytes; the first model is simulated."""
         from farm.sim.model_files import read
 
         if not self.xml:
