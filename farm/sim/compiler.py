@@ -7,7 +7,6 @@ a script, so that it starts within some milliseconds, and imports nothing of the
 
 import ctypes
 import os
-import resource
 import signal
 import struct
 import sys
@@ -115,7 +114,7 @@ class _Folder:
 
 def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
     """MuJoCo, with the plug-ins that it comes with."""
-    [path] = folder.glob("libmujoco*")
+    [path] = (each for each in folder.iterdir() if each.name.startswith(("libmujoco.", "mujoco.dll")))
     library = ctypes.CDLL(str(path))
     library.mj_loadPluginLibrary.argtypes = [ctypes.c_char_p]
     library.mj_mountVFS.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
@@ -131,7 +130,12 @@ def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
 
 
 def _limit(seconds: int, size: int) -> None:
-    """Let the system end this process after some time, give it no more memory, and open no file for it."""
+    """Let the system end this process after some time, give it no more memory, and open no file for it.
+
+    Without these limits, as on Windows, nothing is compiled.
+    """
+    import resource
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its starter decides
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(seconds)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from farm.arrays import BoolArray, FloatArray, IntArray
-from farm.errors import ConfigError
+from farm.errors import ConfigError, TaskError
 from farm.settings import Settings, setting
 from farm.sim.channels import Camera, Channel, Measure, Quantity
 
@@ -223,8 +223,11 @@ class Task:
     """Sizes of the observation's parts if they differ in kind; empty: one part."""
     observations: tuple[Quantity, ...] = ()
     """What the observation's numbers are, for exports; empty: numbered, or qpos and qvel if those are observed."""
-    actions: tuple[Quantity, ...] = ()
-    """The same of the action's; empty: the actuators' names, with -1 to 1 unless `act` is overridden."""
+    actions: int | tuple[Quantity, ...] = ()
+    """How many numbers an action has, or what they are; empty: one for each actuator.
+
+    Without actuators it is three for each mocap body. `act` makes controls of any other number.
+    """
     ends: tuple[str, str] | None = None
     """Names of the states in which rollouts begin and should end; with `reached` and `lost` policies can be chained."""
     ending: ClassVar[str] = "ended"
@@ -337,6 +340,8 @@ class Task:
         goals, jumps. They hold from this control step's first physics step on.
         """
         low, high = self.limits
+        if action.shape[1] != len(low):
+            raise TaskError(f"Task.act got actions of {action.shape[1]} numbers; expected {len(low)}, one per actuator")
         return rescaled(action, low, high)
 
     def reward(self, sim: "Sim", action: FloatArray) -> FloatArray | dict[str, FloatArray]:  # noqa: ARG002
@@ -389,6 +394,13 @@ class Task:
         limited = self.model.actuator_ctrllimited.astype(bool)
         low, high = self.model.actuator_ctrlrange.T
         return np.where(limited, low, -1.0), np.where(limited, high, 1.0)
+
+    @property
+    def action_size(self) -> int:
+        """Length A of the action; 0 if nothing says it."""
+        if isinstance(self.actions, int):
+            return self.actions
+        return len(self.actions) or self.model.nu or 3 * self.model.nmocap
 
     @property
     def period(self) -> float:

@@ -20,6 +20,9 @@ from farm.tasks.loop import Batch, again, scores
 
 T = TypeVar("T")
 
+ACTION_LIMIT: Final = 10_000
+"""Numbers of an action, at most."""
+
 _METHODS: Final = (
     *("models", "which", "setup", "prepare", "reset", "observe", "act", "reward", "ended", "success", "measure"),
     *("score", "outcomes"),
@@ -33,6 +36,8 @@ def specification(task: Task) -> TaskSpec:
       ConfigError: the class cannot be a task.
       TaskError: it returns invalid arrays.
     """
+    for what in ("observations", "actions"):
+        _check_quantities(task, what)
     spec = task.spec() or _found(task)
     measures: object = task.measures
     if not isinstance(measures, tuple | list) or not all(isinstance(each, Measure) for each in measures):
@@ -41,20 +46,29 @@ def specification(task: Task) -> TaskSpec:
     if len(set(names)) < len(names):
         raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
-        _check_quantities(task, what, count)
+        _check_count(task, what, count)
     several = (_models(task),) if len(task.simulated) > 1 else ()
     return replace(spec, measures=tuple(task.measures), channels=(*spec.channels, *several))
 
 
-def _check_quantities(task: Task, what: str, count: int) -> None:
-    """Check the quantities that a task names in an attribute, if it names any."""
+def _check_quantities(task: Task, what: str) -> None:
+    """Check that an attribute names quantities, if it names any, or says how many numbers an action has."""
     quantities: object = getattr(task, what)
+    if what == "actions" and type(quantities) is int and 1 <= quantities <= ACTION_LIMIT:
+        return
     if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
+        number = f"a number from 1 to {ACTION_LIMIT} or " if what == "actions" else ""
         raise ConfigError(
-            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected a tuple of farm.Quantity"
+            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of farm.Quantity"
         )
-    if quantities and len(quantities) != count:
-        raise ConfigError(f"task {type(task).__name__}: {what} names {len(quantities)} numbers; there are {count}")
+
+
+def _check_count(task: Task, what: str, count: int) -> None:
+    """Check that an attribute names as many numbers as there are, if it names any."""
+    quantities = getattr(task, what)
+    named = quantities if isinstance(quantities, int) else len(quantities)
+    if named and named != count:
+        raise ConfigError(f"task {type(task).__name__}: {what} names {named} numbers; there are {count}")
 
 
 def _models(task: Task) -> Channel:
@@ -89,14 +103,14 @@ def _found(task: Task) -> TaskSpec:
         batch = Batch(task, sim, [None])
         x = batch.observe()
         with np.errstate(all="ignore"):
-            batch.step(np.zeros((1, task.model.nu)))
+            batch.step(np.zeros((1, task.action_size)))
             _check_channels(task, batch.frames)
         return x.shape[1], batch.names
 
     size, names = tried(task, 1, look)
     success = None if scores(task) else type(task).success is not Task.success
     return TaskSpec(
-        observation=size, action=task.model.nu, steps=task.steps, period=task.period, terms=names or ("reward",),
+        observation=size, action=task.action_size, steps=task.steps, period=task.period, terms=names or ("reward",),
         success=bool(success), channels=task.channels,
     )  # fmt: skip
 
@@ -120,14 +134,32 @@ def _check_class(task: Task) -> None:
     for geom in (geom for channel in task.channels for geom in channel.geoms):
         if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
             raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
-    if not task.model.nu:
-        raise ConfigError(f"task {name}: its model has no actuator, so that there is nothing to learn")
+    _check_action(task)
     for method in _METHODS:
         signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
         try:
             signature.bind(*base.parameters)
         except TypeError:
             raise ConfigError(f"task {name}: {method}{signature}; expected ({', '.join(base.parameters)})") from None
+
+
+def _check_action(task: Task) -> None:
+    """Check that an action has numbers, and that something uses them.
+
+    Raises:
+      ConfigError: says what is missing.
+    """
+    name, size, actuators = type(task).__name__, task.action_size, task.model.nu
+    if not size:
+        raise ConfigError(
+            f"task {name}: its model has no actuator: say how many numbers an action has (actions = 3), and use them "
+            "in act(self, sim, action)"
+        )
+    if size != actuators and type(task).act is Task.act:
+        raise ConfigError(
+            f"task {name}: actions have size {size}, but the model has {actuators or 'no'} actuators: give it "
+            f"act(self, sim, action), which makes controls (B, {actuators}) of actions (B, {size})"
+        )
 
 
 def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:

@@ -25,7 +25,7 @@ def interface(policy: LoadedPolicy) -> dict[str, Any]:
     moved = [quantities.moved(model, i) for i in range(model.nu)]
     return {
         "observations": _rows(task.observations or _observations(task, spec.observation)),
-        "actions": _rows(task.actions or _actions(task, spec.action)),
+        "actions": _rows(_actions(task, spec.action)),
         "controls": [row | {"moves": name} for row, name in zip(_rows(quantities.controls(model)), moved, strict=True)],
         "joints": quantities.joints(model),
         "normaliser": None
@@ -43,6 +43,9 @@ def _observations(task: Task, count: int) -> tuple[Quantity, ...]:
 
 
 def _actions(task: Task, count: int) -> tuple[Quantity, ...]:
+    """The action's numbers, as the task names them, or by the actuators."""
+    if isinstance(task.actions, tuple) and task.actions:
+        return task.actions
     bounds = (-1.0, 1.0) if type(task).act is Task.act else ()
     controls = quantities.controls(task.model)
     names = [each.name for each in controls] if len(controls) == count else [f"action {i}" for i in range(count)]
