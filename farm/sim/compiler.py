@@ -124,8 +124,11 @@ def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
     library.mj_sizeModel.argtypes = [ctypes.c_void_p]
     library.mj_sizeModel.restype = ctypes.c_int64
     library.mj_saveModel.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int64]
-    for plugin in sorted((folder / "plugin").glob("*")):
-        library.mj_loadPluginLibrary(bytes(plugin))
+    # In the order in which mujoco's package loads them: a compiled model has their numbers.
+    for directory, _, names in os.walk(folder / "plugin"):
+        for name in names:
+            if name.endswith((".so", ".dylib")):
+                library.mj_loadPluginLibrary(bytes(Path(directory, name)))
     return library
 
 

@@ -20,6 +20,7 @@ from learner.recording.blueprint import Eye
 from learner.recording.channels import KINDS, Arrows, changes, title
 from learner.recording.curves import ramp
 from learner.recording.drawing import Drawing
+from learner.recording.entities import SceneEntities
 from learner.recording.solids import ENDLESS, rotate, solid
 
 
@@ -115,7 +116,8 @@ def test_arrows_stand_on_their_bodies(written, scene):
 
 def test_long_arrows_are_cut(scene):
     channel = Channel(name="a", kind="arrows", shape=(1, 6), length=2.0, longest=0.5)
-    _, vectors = Arrows(channel, scene).arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
+    drawing = Arrows(channel, scene, SceneEntities(scene, [channel]))
+    _, vectors = drawing.arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
     np.testing.assert_allclose(vectors, [[[0.3, 0.0, 0.4]]])
 
 
