@@ -120,7 +120,6 @@ def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
     library.mj_mountVFS.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     library.mj_loadXML.argtypes = [ctypes.c_char_p, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
     library.mj_loadXML.restype = ctypes.c_void_p
-    library.mj_makeData.argtypes = [ctypes.c_void_p]
     library.mj_sizeModel.argtypes = [ctypes.c_void_p]
     library.mj_sizeModel.restype = ctypes.c_int64
     library.mj_saveModel.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int64]
@@ -167,7 +166,6 @@ def main() -> None:
     if not model:
         send(questions, REFUSED, error.value)
         return
-    library.mj_makeData(model)  # ends this process if a state takes too much memory
     content = ctypes.create_string_buffer(library.mj_sizeModel(model))
     library.mj_saveModel(model, None, content, len(content))
     send(questions, COMPILED, content)

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -57,7 +56,7 @@ def compile_model(main: str, get: Get) -> Compiled:
     """
     read: list[str] = []
     missing: list[str] = []
-    with tempfile.TemporaryFile() as printed, _started(main, printed.fileno()) as process:
+    with _started(main) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
@@ -70,9 +69,7 @@ def compile_model(main: str, get: Get) -> Compiled:
                 else:
                     compiler.send(process.stdin, compiler.FOUND, content)
         except (EOFError, BrokenPipeError):
-            status = process.wait()
-            printed.seek(0)
-            raise RefusedError(_ended(status, printed.read(1000).decode(errors="replace"))) from None
+            raise RefusedError(_ended(process.wait())) from None
         finally:
             process.kill()
             with suppress(BrokenPipeError):
@@ -90,7 +87,7 @@ def _relative(path: str) -> str:
     return posixpath.relpath(path, compiler.ROOT) if f"{path}/".startswith(f"{compiler.ABOVE}/") else path
 
 
-def _started(main: str, printed: int) -> "subprocess.Popen[bytes]":
+def _started(main: str) -> "subprocess.Popen[bytes]":
     """The process, without this one's environment."""
     package = importlib.util.find_spec("mujoco")  # not imported: commands choose how it draws before
     assert package is not None
@@ -98,19 +95,17 @@ def _started(main: str, printed: int) -> "subprocess.Popen[bytes]":
     folder = str(Path(package.origin).parent)
     return subprocess.Popen(
         [sys.executable, "-I", "-S", compiler.__file__, folder, str(SECONDS), str(MEMORY), main],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=printed,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         env={name: os.environ[name] for name in ("LD_LIBRARY_PATH",) if name in os.environ},
     )  # fmt: skip
 
 
-def _ended(status: int, printed: str) -> str:
+def _ended(status: int) -> str:
     """Why the process ended without an answer."""
     if status == -signal.SIGALRM:
         return f"it takes more than {SECONDS} s to compile"
-    if "bad_alloc" in printed or not printed.strip():
-        how = f"signal {-status}" if status < 0 else f"status {status}"
-        return _with_limit(f"the process that compiles it ended ({how}), perhaps as it could not allocate memory")
-    return _with_limit(brief(printed.strip().splitlines()[-1].removeprefix("ERROR: ")))
+    how = f"signal {-status}" if status < 0 else f"status {status}"
+    return _with_limit(f"the process that compiles it ended ({how}), perhaps as it could not allocate memory")
 
 
 def _with_limit(error: str) -> str:
