@@ -25,8 +25,10 @@ MEMORY: Final = 4 << 30
 _FOLDER: Final = re.compile(rf"{compiler.ABOVE}/[^'\"\n]*")
 
 Get: TypeAlias = Callable[[str], bytes | None]
-"""A file's content, by its path in the model's folder; None if it has none. A path
-outside of this folder begins with .. or /."""
+"""A file's content, by its path in the model's folder; None if it has none.
+
+A path outside of this folder begins with .. or /.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def compile_model(main: str, get: Get) -> Compiled:
     Raises:
       RefusedError: MuJoCo refuses it, or it takes too much time or memory.
     """
-    read: list[str] = []
+    paths: list[str] = []
     missing: list[str] = []
     with _started(main) as process:
         assert process.stdin is not None
@@ -63,7 +65,7 @@ def compile_model(main: str, get: Get) -> Compiled:
             while (message := compiler.receive(process.stdout))[0] == compiler.ASKED:
                 path = _relative(os.fsdecode(message[1]))
                 content = get(path)
-                (missing if content is None else read).append(path)
+                (missing if content is None else paths).append(path)
                 if content is None:
                     compiler.send(process.stdin, compiler.MISSING)
                 else:
@@ -76,9 +78,9 @@ def compile_model(main: str, get: Get) -> Compiled:
                 process.stdin.close()
     kind, content = message
     if kind != compiler.COMPILED:
-        error = _FOLDER.sub(lambda found: _relative(found[0]), content.decode(errors="replace"))
+        error = _FOLDER.sub(lambda match: _relative(match[0]), content.decode(errors="replace"))
         raise RefusedError(_with_limit(brief(error)), tuple(missing))
-    return Compiled(content, tuple(dict.fromkeys(read)))
+    return Compiled(content, tuple(dict.fromkeys(paths)))
 
 
 def _relative(path: str) -> str:

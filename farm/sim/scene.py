@@ -103,11 +103,10 @@ class Scene:
     @cached_property
     def bodies(self) -> tuple[str, ...]:
         """Names of every body that is drawn, in the model's order: all that have a geometry."""
-        named = {i: self.model.body(i).name for i in self._drawn}
-        unnamed = [i for i, name in named.items() if not name]
-        others = {name for name in named.values() if name}
-        named |= zip(unnamed, distinct([f"body_{i}" for i in unnamed], others), strict=True)
-        return tuple(named.values())
+        names = {i: self.model.body(i).name for i in self._drawn}
+        nameless = [i for i, name in names.items() if not name]
+        substitutes = distinct([f"body_{i}" for i in nameless], set(names.values()))
+        return tuple((names | dict(zip(nameless, substitutes, strict=True))).values())
 
     @cached_property
     def fixed(self) -> frozenset[str]:
@@ -263,14 +262,14 @@ def quiet() -> None:
     mujoco.MjLogConfig.set(config)
 
 
-def distinct(names: Sequence[str], taken: Set[str] = frozenset()) -> list[str]:
-    """Names of which no two are equal and none is taken: those that are get a _, or several, behind them."""
+def distinct(names: Sequence[str], others: Set[str]) -> list[str]:
+    """Names of which no two are equal, and none is among others: those that are get a _, or several, behind them."""
     out: list[str] = []
-    used, own = set(taken), set(names)
+    before, all_names = set(others), set(names)
     for name in names:
         new = name
-        while new in used or (new != name and new in own):
+        while new in before or (new != name and new in all_names):
             new += "_"
         out.append(new)
-        used.add(new)
+        before.add(new)
     return out

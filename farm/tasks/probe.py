@@ -15,13 +15,11 @@ from farm.sim.channels import Camera, Channel, Measure, Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
+from farm.tasks import actions
 from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
 
 T = TypeVar("T")
-
-ACTION_LIMIT: Final = 10_000
-"""Numbers of an action, at most."""
 
 _METHODS: Final = (
     *("models", "which", "setup", "prepare", "reset", "observe", "act", "reward", "ended", "success", "measure"),
@@ -54,10 +52,10 @@ def specification(task: Task) -> TaskSpec:
 def _check_quantities(task: Task, what: str) -> None:
     """Check that an attribute names quantities, if it names any, or says how many numbers an action has."""
     quantities: object = getattr(task, what)
-    if what == "actions" and type(quantities) is int and 1 <= quantities <= ACTION_LIMIT:
+    if what == "actions" and actions.is_size(quantities):
         return
     if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
-        number = f"a number from 1 to {ACTION_LIMIT} or " if what == "actions" else ""
+        number = f"a number from 1 to {actions.LIMIT} or " if what == "actions" else ""
         raise ConfigError(
             f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of farm.Quantity"
         )
@@ -66,9 +64,9 @@ def _check_quantities(task: Task, what: str) -> None:
 def _check_count(task: Task, what: str, count: int) -> None:
     """Check that an attribute names as many numbers as there are, if it names any."""
     quantities = getattr(task, what)
-    named = quantities if isinstance(quantities, int) else len(quantities)
-    if named and named != count:
-        raise ConfigError(f"task {type(task).__name__}: {what} names {named} numbers; there are {count}")
+    size = quantities if isinstance(quantities, int) else len(quantities)
+    if size and size != count:
+        raise ConfigError(f"task {type(task).__name__}: {what} names {size} numbers; there are {count}")
 
 
 def _models(task: Task) -> Channel:
@@ -134,32 +132,13 @@ def _check_class(task: Task) -> None:
     for geom in (geom for channel in task.channels for geom in channel.geoms):
         if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
             raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
-    _check_action(task)
+    actions.check(task)
     for method in _METHODS:
         signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
         try:
             signature.bind(*base.parameters)
         except TypeError:
             raise ConfigError(f"task {name}: {method}{signature}; expected ({', '.join(base.parameters)})") from None
-
-
-def _check_action(task: Task) -> None:
-    """Check that an action has numbers, and that something uses them.
-
-    Raises:
-      ConfigError: says what is missing.
-    """
-    name, size, actuators = type(task).__name__, task.action_size, task.model.nu
-    if not size:
-        raise ConfigError(
-            f"task {name}: its model has no actuator: say how many numbers an action has (actions = 3), and use them "
-            "in act(self, sim, action)"
-        )
-    if size != actuators and type(task).act is Task.act:
-        raise ConfigError(
-            f"task {name}: actions have size {size}, but the model has {actuators or 'no'} actuators: give it "
-            f"act(self, sim, action), which makes controls (B, {actuators}) of actions (B, {size})"
-        )
 
 
 def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:

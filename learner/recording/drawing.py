@@ -15,6 +15,7 @@ from farm.sim.channels import Camera
 from farm.sim.framing import View
 from farm.sim.scene import MODEL, Scene
 from farm.sim.trajectory import Trajectory
+from farm.tasks.actions import described
 from farm.tasks.base import TaskSpec
 from farm.tasks.standard import start
 from learner.recording.blueprint import Eye
@@ -31,9 +32,17 @@ _ABOVE: Final = 0.75  # height of the caption above the scene's middle, in radii
 class Drawing:
     """How a task's scene and rollouts are drawn."""
 
-    def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None) -> None:
-        """Draw a scene with its task's channels; seen from a camera, or (None) from the side of the moving bodies."""
+    def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None, actions: Sequence[str] = ()) -> None:
+        """Draw a scene with its task's channels.
+
+        Args:
+          scene: the model.
+          spec: of the task.
+          camera: from where it is seen; None: from the side of the moving bodies.
+          actions: names of the action's numbers; empty: they are counted.
+        """
         self.scene, self.spec, self.camera = scene, spec, camera
+        self._actions = actions or [str(i + 1) for i in range(spec.action)]
         self._entities = SceneEntities(scene, spec.channels)
         self._channels = {
             channel.name: KINDS[channel.kind](channel, scene, self._entities) for channel in spec.channels
@@ -43,10 +52,11 @@ class Drawing:
     def of(cls, problem: Problem) -> "Drawing":
         """How a run's task is drawn; without a camera of its own it is framed at its start."""
         task, scene = problem.task, problem.scene
+        names = [each.name for each in described(task, problem.spec.action)]
         if task.camera:
-            return cls(scene, problem.spec, task.camera)
+            return cls(scene, problem.spec, task.camera, names)
         qpos, mocap = start(task)
-        return cls(replace(scene, start=qpos, mocap=mocap), problem.spec)
+        return cls(replace(scene, start=qpos, mocap=mocap), problem.spec, actions=names)
 
     def static(self) -> Iterator[tuple[str, Any]]:
         """Entities and archetypes that are logged once."""
@@ -62,7 +72,7 @@ class Drawing:
         if self.camera is None:
             yield FOLLOWED, rr.Points3D.from_fields(radii=[0.0])
         yield "/reward/terms", lines(self.spec.terms)
-        yield "/actions", lines([str(i + 1) for i in range(self.spec.action)])
+        yield "/actions", lines(self._actions)
         for channel in self._channels.values():
             yield from channel.static()
 

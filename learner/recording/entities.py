@@ -28,17 +28,17 @@ class SceneEntities:
 
     def __init__(self, scene: Scene, channels: Sequence[Channel]) -> None:
         """Choose them, for a scene with a task's channels."""
-        taken = {channel.name.partition("/")[0] for channel in channels}
-        above = {each.rpartition("/")[2] for each in (CAPTION, FOLLOWED)}
-        names = distinct(scene.bodies, taken | above)
+        parts_of_channels = {channel.name.partition("/")[0] for channel in channels}
+        fixed = {each.rpartition("/")[2] for each in (CAPTION, FOLLOWED)}
+        names = distinct(scene.bodies, parts_of_channels | fixed)
         self.bodies = tuple(f"/world/{rr.escape_entity_path_part(name)}" for name in names)
         """In the order of `scene.bodies`."""
         self.geometries: list[tuple[str, Geometry]] = []
         """Everything to draw, with its entity."""
-        drawn: dict[str, list[Geometry]] = {body: [] for body in scene.bodies}
+        by_body: dict[str, list[Geometry]] = {body: [] for body in scene.bodies}
         for geometry in scene.geometries():
-            drawn[geometry.body].append(geometry)
-        for entity, its in zip(self.bodies, drawn.values(), strict=True):
-            parts = distinct([geometry.name for geometry in its], taken)
+            by_body[geometry.body].append(geometry)
+        for entity, its in zip(self.bodies, by_body.values(), strict=True):
+            parts = distinct([geometry.name for geometry in its], parts_of_channels)
             for geometry, part in zip(its, parts, strict=True):
                 self.geometries.append((f"{entity}/{rr.escape_entity_path_part(part)}", geometry))

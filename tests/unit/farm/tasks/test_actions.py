@@ -10,7 +10,7 @@ from farm.errors import ConfigError, FarmError
 from farm.sim.channels import Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
-from farm.tasks import loop
+from farm.tasks import actions, loop
 from farm.tasks.base import Task
 from farm.tasks.probe import specification
 
@@ -119,3 +119,19 @@ def test_what_is_no_size(value: object) -> None:
         ConfigError, match=r"actions is .*; expected a number from 1 to 10000 or a tuple of farm.Quantity"
     ):
         specification(of(Together, actions=value))
+
+
+@pytest.mark.parametrize(
+    ("task", "names"),
+    [
+        (Driven(), ["a", "b"]),
+        (Together(), ["action 0"]),
+        (of(Moved, actions=(Quantity("torque", "N m"), Quantity("other", "N m"))), ["torque", "other"]),
+        (of(Moved, actions=[Quantity("torque", "N m")]), ["torque"]),
+    ],
+)
+def test_the_names_of_its_numbers(task: Task, names: list[str]) -> None:
+    described = actions.described(task, task.action_size)
+    assert [each.name for each in described] == names
+    bounded = type(task).act is Task.act
+    assert np.isfinite([described[0].low, described[0].high]).all() == bounded

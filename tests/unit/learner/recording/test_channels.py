@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made import report, stats
 from rerun.chunk import RrdReader
+from robot import robot
 
 from farm.errors import ConfigError
 from farm.sim.channels import Kind
@@ -22,6 +23,8 @@ from learner.recording.curves import ramp
 from learner.recording.drawing import Drawing
 from learner.recording.entities import SceneEntities
 from learner.recording.solids import ENDLESS, rotate, solid
+from learner.run.config import configure
+from learner.run.setup import start as begin
 
 
 @pytest.fixture
@@ -112,6 +115,13 @@ def test_arrows_stand_on_their_bodies(written, scene):
             mujoco.mju_rotVecQuat(vector, 0.5 * values[frame, i, 3:], pose[3:])
             np.testing.assert_allclose(origins[frame][i], pose[:3] + place, atol=1e-6)
             np.testing.assert_allclose(vectors[frame][i], vector, atol=1e-6)
+
+
+def test_the_actions_curves_have_the_tasks_names(tmp_path):
+    task = robot(tmp_path / "mine")
+    problem, _ = begin(configure(f"{task}:Reach", policy="linear"), "r")
+    entities = dict(Drawing.of(problem).static())
+    assert entities["/actions"].names.as_arrow_array().to_pylist() == ["hinge"]
 
 
 def test_long_arrows_are_cut(scene):
