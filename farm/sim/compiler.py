@@ -114,8 +114,8 @@ class _Folder:
 
 def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
     """MuJoCo, with the plug-ins that it comes with."""
-    [path] = (each for each in folder.iterdir() if each.name.startswith(("libmujoco.", "mujoco.dll")))
-    library = ctypes.CDLL(str(path))
+    beside = [str(path) for path in folder.glob("libmujoco.*")]
+    library = ctypes.CDLL(beside[0] if beside else "libmujoco.so")  # conda has it elsewhere
     library.mj_loadPluginLibrary.argtypes = [ctypes.c_char_p]
     library.mj_mountVFS.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     library.mj_loadXML.argtypes = [ctypes.c_char_p, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
@@ -142,7 +142,10 @@ def _limit(seconds: int, size: int) -> None:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(seconds)
     # On Linux what is used counts, not what threads reserve.
-    resource.setrlimit(resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS, (size, size))
+    memory = resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS
+    _, most = resource.getrlimit(memory)
+    size = size if most == resource.RLIM_INFINITY else min(size, most)
+    resource.setrlimit(memory, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
 

@@ -159,6 +159,10 @@ class Scene:
             raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
         return self.bodies.index(body)
 
+    def number(self, body: str) -> int:
+        """Number in the model of the body with this name; a ConfigError if it has no geometry."""
+        return self._drawn[self.index(body)]
+
     def poses(self, qpos: FloatArray, mocap: FloatArray | None = None) -> FloatArray:
         """Poses of the drawn bodies.
 

@@ -65,6 +65,8 @@ def test_no_two_share_an_entity() -> None:
     for name, path in zip(NAMES, drawing.bodies, strict=False):
         assert path == f"/world/{rr.escape_entity_path_part(name)}" or name in ("caption", "view", "force", "touch")
         assert scene.index(name) == NAMES.index(name)
+        assert scene.number(name) == scene.model.body(name).id
+    assert scene.number(scene.bodies[-1]) == scene.model.nbody - 1, "it has no name in the model"
 
 
 def test_a_recording_has_them_all(tmp_path: Path) -> None:
