@@ -16,6 +16,7 @@ from farm import Task
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks import loop
+from farm.tasks.probe import specification
 from learner.commands import new_task
 
 ROOT = Path(__file__).parent.parent
@@ -115,6 +116,72 @@ def test_what_the_page_says_of_sim() -> None:
     assert record["goal"].shape == (2, 2)
     assert (record["goal"][0] == 0.0).all()
     assert (record["goal"][1] != 0.0).all()
+
+
+LEGS = "".join(
+    f"""<body pos="{i} 0 1"><joint name="{name}" axis="0 1 0" damping="1"/><geom size=".1" pos="0 0 -.3"/></body>"""
+    for i, name in enumerate("abcd")
+)
+MOTORS = "".join(f'<motor joint="{name}" ctrlrange="-2 2"/>' for name in "abcd")
+PUCK = '<body name="puck"><freejoint/><geom size=".1"/></body>'
+MODELS = {
+    "Dragged": f"""<worldbody><body name="target" mocap="true"/>{PUCK}</worldbody>
+      <equality><weld body1="target" body2="puck"/></equality>""",
+    "Pushed": f"<worldbody>{PUCK}</worldbody>",
+    "Synergies": f"<worldbody>{LEGS}</worldbody><actuator>{MOTORS}</actuator>",
+    "Generator": f"<worldbody>{LEGS}</worldbody><actuator>{MOTORS}</actuator>",
+    "Symmetric": f"<worldbody>{LEGS}</worldbody><actuator>{MOTORS}</actuator>",
+}
+"""A model for each of the page's actions."""
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_an_action_of_the_page_moves_the_model(name: str) -> None:
+    [source] = re.findall(r"### What an action is\n.*?```python\n(.*?)```", PAGE, re.S)
+    classes: dict[str, Any] = {}
+    exec(source, classes)
+    assert {each for each, value in classes.items() if isinstance(value, type) and value.__module__ != "farm"} >= {name}
+    attributes = {
+        "xml": f"<mujoco><option gravity='0 0 0'/>{MODELS[name]}</mujoco>",
+        "reward": lambda self, sim, action: np.zeros(len(sim)),
+        "steps": 5,
+        "substeps": 10,
+    }
+    task = type(name, (classes[name],), attributes)()
+    size = specification(task).action
+    assert size == (3 if name == "Dragged" else 2)
+    sim = Sim(BatchEngine(task.model, 2))
+
+    def moved() -> np.ndarray:
+        batch = loop.Batch(task, sim, [None, None])
+        for _ in range(task.steps):
+            batch.observe()
+            batch.step(np.array([np.zeros(size), np.full(size, 0.5)]))
+        return abs(sim.qvel).max(axis=1)
+
+    still, moving = loop.again(moved)
+    assert still == 0.0
+    assert moving > 1e-3
+
+
+def test_a_keyframe_of_the_page_is_the_start() -> None:
+    [source] = re.findall(r"A \*\*keyframe\*\*.*?\n\n((?:    .*\n)+)", PAGE)
+    methods: dict[str, Any] = {}
+    exec(textwrap.dedent(source), methods)
+    attributes = {
+        "xml": """<mujoco><worldbody><body><joint name="x"/><geom size="1"/></body></worldbody>
+          <actuator><muscle name="m" joint="x" ctrlrange="0 1" lengthrange="0 1"/><motor joint="x"/></actuator>
+          <keyframe><key name="home" qpos="0.3" qvel="0.1" act="0.5"/></keyframe></mujoco>""",
+        "reset": methods["reset"],
+        "observe": lambda self, sim: np.concatenate([sim.qpos, sim.qvel, sim.act], axis=1),
+        "reward": lambda self, sim, action: np.zeros(len(sim)),
+    }
+    task = type("Home", (Task,), attributes)()
+    assert specification(task).observation == 3
+    sim = Sim(BatchEngine(task.model, 1))
+    start = loop.again(lambda: loop.Batch(task, sim, [None]).observe())
+    np.testing.assert_array_equal(start, [[0.3, 0.1, 0.5]])
+    np.testing.assert_array_equal(task.limits, [[0.0, -1.0], [1.0, 1.0]])
 
 
 @pytest.mark.slow

@@ -26,10 +26,7 @@ class Marks:
         """Take those that can be drawn; a ConfigError if one names a body that the scene does not have."""
         self._radius = scene.radius
         self._channels = [each for each in channels if each.kind in ("arrows", "points") or each.places is not None]
-        for channel in self._channels:
-            for body in channel.bodies:
-                scene.index(body)
-        self._bodies = {each.name: [scene.model.body(body).id for body in each.bodies] for each in self._channels}
+        self._bodies = {each.name: [scene.number(body) for body in each.bodies] for each in self._channels}
 
     def put(self, scene: mujoco.MjvScene, data: mujoco.MjData, values: Mapping[str, FloatArray]) -> None:
         """Add one frame's to the scene, as long as it has room.

@@ -1,18 +1,15 @@
-"""The files that a MuJoCo model is made of: reading those that an MJCF names, and compiling it where only they are.
-
-MuJoCo itself opens any path that a model names. Here a model reads only what lies in its own folder, and on another
-machine only what was sent: names are compared with the files that are there before MuJoCo sees them.
-"""
+"""The files that a MuJoCo model is made of: MuJoCo itself says which they are, and compiles it from nothing else."""
 
 import hashlib
 import posixpath
-import tempfile
-import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from farm.errors import ConfigError, brief
+from farm.sim.compiling import Compiled, RefusedError, compile_model
 
 if TYPE_CHECKING:
     import mujoco
@@ -30,45 +27,55 @@ Content: TypeAlias = str | bytes
 Files: TypeAlias = Mapping[str, Content]
 """Texts and other files by their paths in a folder, with /."""
 
-_Get: TypeAlias = Callable[[str, bool], Content | None]  # by path, and whether as a text
+SUFFIXES: Final = (".xml", ".mjcf", ".urdf")
+"""Of texts that are models, or parts of them; other files are taken as they are."""
 
-_DIRS: Final = {
-    **dict.fromkeys(("mesh", "skin", "flexcomp", "hfield"), ("meshdir", "assetdir")),
-    "texture": ("texturedir", "assetdir"),
-}
-"""Attributes of `compiler` that say where such an element's file lies; all of them for other elements."""
+_OPENING: Final = re.compile(r"[Oo]pening file '(.*?)'")
+_KEPT: Final = 4  # compiled models
+_KEPT_SIZE: Final = 64 << 20  # [bytes] of one
 
 
 def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
     """Everything that a model reads, by path; the model comes first, as a text.
 
+    MuJoCo compiles the model, and what it opens is read.
+
     Args:
-      model: an MJCF text, or a file: in this folder, or anywhere by its absolute path.
-      folder: where a text's files and a relative path are; None if there is no such folder. The files of an absolute
-        path are in its own.
+      model: a text of MJCF or URDF, or a file: in this folder, or by its absolute path, given as Path or text.
+      folder: where all its files are; None: in the folder of the file that an absolute path names.
 
     Raises:
-      ConfigError: a file is missing, too large, or outside the folder; names it, and the file that asks for it.
+      ConfigError: MuJoCo refuses the model, or a file is missing, too large, or outside the folder.
     """
-    if isinstance(model, str):
+    if isinstance(model, str) and "<" in model:
         if "file" not in model:
             return {TEXT: model}
         name, texts = TEXT, {TEXT: model}
-    elif model.is_absolute():
-        name, folder, texts = model.name, model.parent, {}
     else:
-        name, texts = posixpath.normpath(model.as_posix()), {}
+        name, texts, path = posixpath.normpath(Path(model).as_posix()), {}, Path(model)
+        if path.is_absolute():
+            folder = folder if folder is not None and path.is_relative_to(folder) else path.parent
+            name = path.relative_to(folder).as_posix()
+        if path.suffix.lower() not in SUFFIXES:
+            raise ConfigError(f"xml: {name}: expected a model, with a name that ends in {', '.join(SUFFIXES)}")
     if folder is None:
         raise ConfigError("the model reads files, but its class is in no file: give xml an absolute path")
-    source = _Folder(folder, texts)
-    _inside([name], "xml")
-    if source.get(name, True) is None:
+    source = _Folder(folder, name, texts)
+    if source.get(name) is None:
+        if source.outside:
+            raise ConfigError(f"xml: {source.lies_outside(name)}")
         raise ConfigError(f"xml: there is no file {folder / name}")
-    return _named(name, source.get)
+    try:
+        result = compile_model(name, source.get)
+    except RefusedError as error:
+        raise ConfigError(f"{name}: {source.explained(error)}") from None
+    contents = {path: source.contents[path] for path in result.paths}
+    _keep(_key(contents, name), result)
+    return contents
 
 
 def compiled(mjcf: str, name: str, files: Files | None = None, main: str = TEXT) -> "mujoco.MjModel":
-    """Compile an MJCF text.
+    """Compile a text of MJCF or URDF.
 
     Args:
       mjcf: the text.
@@ -77,13 +84,14 @@ def compiled(mjcf: str, name: str, files: Files | None = None, main: str = TEXT)
       main: the text's own path among them.
 
     Raises:
-      ConfigError: MuJoCo refuses it, or it reads another file.
+      ConfigError: MuJoCo refuses it, it reads another file, or it takes too much time or memory.
     """
     import mujoco  # here, because commands choose how it draws before it is imported
 
     try:
-        model = mujoco.MjModel.from_xml_string(mjcf) if "file" not in mjcf else _from_files(mjcf, files or {}, main)
-    except (ValueError, mujoco.FatalError) as error:
+        binary = _compiled({**(files or {}), main: mjcf}, main).binary
+        model = mujoco.MjModel.from_binary_path("model.mjb", assets={"model.mjb": binary})
+    except (RefusedError, ValueError, mujoco.FatalError) as error:
         raise ConfigError(f"{name}: MuJoCo refuses the model: {brief(str(error))}") from None
     # An unstable state is not reset, so that its rollout is reported as failed.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -91,35 +99,24 @@ def compiled(mjcf: str, name: str, files: Files | None = None, main: str = TEXT)
 
 
 def needed(mjcf: str, files: Files, main: str) -> dict[str, Content]:
-    """What an MJCF text reads of these files, by path, itself first; a ConfigError if it reads others."""
-    if "file" not in mjcf:
-        return {main: mjcf}
+    """What a text reads of these files, by path, itself first; a ConfigError if MuJoCo refuses it."""
     contents = {**files, main: mjcf}
-    return _named(main, lambda path, _: contents.get(path))
+    return {path: contents[path] for path in _compiled(contents, main).paths}
 
 
-def _from_files(mjcf: str, files: Files, main: str) -> "mujoco.MjModel":
-    """Compile it in a folder that has these files only."""
-    import mujoco
+def _compiled(contents: Files, main: str) -> Compiled:
+    """The compiled model of texts and other files; some of them are kept, since a process needs one several times."""
+    key = _key(contents, main)
+    if key in _kept:
+        return _kept[key]
 
-    contents = needed(mjcf, files, main)
-    if len(contents) == 1:
-        return mujoco.MjModel.from_xml_string(mjcf)
-    with tempfile.TemporaryDirectory(prefix="rolloutfarm-model-") as folder:
-        write(Path(folder), contents)
-        try:
-            return mujoco.MjModel.from_xml_path(str(Path(folder) / main))
-        except ValueError as error:
-            raise ValueError(str(error).replace(f"{folder}/", "")) from None
+    def get(path: str) -> bytes | None:
+        content = contents.get(path)
+        return content.encode() if isinstance(content, str) else content
 
-
-def write(folder: Path, files: Files) -> None:
-    """Write files whose paths lead nowhere else into a folder."""
-    for path, content in files.items():
-        _inside([path], "a file's name")
-        target = folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(content.encode() if isinstance(content, str) else content)
+    model = compile_model(main, get)
+    _keep(key, model)
+    return model
 
 
 def split(files: Files) -> tuple[dict[str, str], dict[str, str]]:
@@ -146,114 +143,87 @@ def digest(content: bytes) -> str:
 class _Folder:
     """A folder from which a model reads, within its limits."""
 
-    def __init__(self, folder: Path, contents: Mapping[str, Content]) -> None:
-        self._folder, self._read = folder.resolve(), dict(contents)
+    def __init__(self, folder: Path, main: str, texts: Mapping[str, str]) -> None:
+        self._folder = folder.resolve()
+        self._named = folder
+        self._main = main
+        self.contents: dict[str, Content] = {path: self._relative(text) for path, text in texts.items()}
+        """What was read, by path."""
+        self.outside = ""
+        """The first path that leads out of the folder."""
 
-    def get(self, name: str, text: bool) -> Content | None:
+    def get(self, path: str) -> bytes | None:
         """A file's content, read once; None if there is no such file."""
-        if name not in self._read:
-            path = self._folder / name
-            if not path.is_file():
-                return None
-            if not path.resolve().is_relative_to(self._folder):
-                raise ConfigError(f"{name} is a link that leads out of {self._folder}: copy the file there")
-            if (size := path.stat().st_size) > FILE_LIMIT:
-                raise ConfigError(f"{name} has {size >> 20} MiB; a model's file has at most {FILE_LIMIT >> 20} MiB")
-            self._read[name] = path.read_bytes()
-            if sum(map(len, self._read.values())) > LIMIT:
-                raise ConfigError(f"with {name} the model's files have more than {LIMIT >> 20} MiB together")
-        content = self._read[name]
-        if text and isinstance(content, bytes):
-            try:
-                content = self._read[name] = content.decode()
-            except UnicodeDecodeError:
-                raise ConfigError(f"{name} is not a text in UTF-8, but the model reads it as MJCF") from None
-        return content
-
-
-def _named(main: str, get: _Get) -> dict[str, Content]:
-    """Everything that a model reads by path, itself first.
-
-    MuJoCo looks for a file in the folders of the model and of the file that names it, and in those of `compiler`.
-    Whatever is in one of these places counts.
-
-    Raises:
-      ConfigError: a file is in none of them, or one of them is outside.
-    """
-    contents: dict[str, Content] = {}
-    models = [main]
-    for model in models:  # grows by the models that are attached
-        texts: dict[str, ET.Element] = {}
-        waiting = [model]
-        while waiting:
-            name = waiting.pop(0)
-            if name in texts:
-                continue
-            contents[name] = get(name, True) or ""
-            texts[name] = _parsed(name, contents[name])
-            for file in (each.get("file", "") for each in texts[name].iter("include")):
-                waiting += _places(name, "include", file, _bases(model, name), get, text=True)
-        for name, element, file in _references(texts):
-            bases, text = _bases(model, name), element.tag == "model"
-            if not text:
-                bases = [f"{base}/{way}" for base in bases for way in _ways(texts.values(), element.tag)]
-                if any(each.get("strippath") == "true" for root in texts.values() for each in root.iter("compiler")):
-                    file = posixpath.basename(file)
-            places = _places(name, element.tag, file, bases, get, text=text)
-            contents |= {place: content for place in places if (content := get(place, text)) is not None}
-            models += [place for place in places if text and place not in models]
-    return contents
-
-
-def _references(texts: Mapping[str, ET.Element]) -> Iterator[tuple[str, ET.Element, str]]:
-    """Every file that texts name in an element, but for those that are included: text, element, path."""
-    for name, root in texts.items():
-        for element in root.iter():
-            for attribute, file in element.attrib.items():
-                if attribute.startswith("file") and file and element.tag != "include":  # also fileright and the like
-                    yield name, element, file
-
-
-def _places(asking: str, tag: str, file: str, bases: Iterable[str], get: _Get, *, text: bool) -> list[str]:
-    """Where a file is: those of these folders' that have it."""
-    what = f"{asking}: {tag} {file!r}"
-    if ":" in file or "\\" in file:
-        raise ConfigError(f"{what}: expected a path in the task's folder, with /")
-    paths = list(dict.fromkeys(posixpath.normpath(posixpath.join(base, file)) for base in bases))
-    _inside(paths, what)
-    places = [path for path in paths if get(path, text) is not None]
-    if not places:
-        raise ConfigError(f"{what}: there is no file {' or '.join(paths)}")
-    return places
-
-
-def _inside(paths: Iterable[str], what: str) -> None:
-    for path in paths:
         if path.startswith(("/", "../")) or path == "..":
-            raise ConfigError(f"{what} leads out of the task's folder: put the file there, and name it from there")
+            self.outside = self.outside or path
+            return None
+        if path not in self.contents:
+            file = self._folder / path
+            if not file.is_file():
+                return None
+            self.contents[path] = self._content(path, file)
+            if sum(map(len, self.contents.values())) > LIMIT:
+                raise ConfigError(f"with {path} the model's files have more than {LIMIT >> 20} MiB together")
+        content = self.contents[path]
+        return content.encode() if isinstance(content, str) else content
+
+    def _content(self, path: str, file: Path) -> Content:
+        if not file.resolve().is_relative_to(self._folder):
+            raise ConfigError(f"{path} is a link that leads out of {self._folder}: copy the file there")
+        if (size := file.stat().st_size) > FILE_LIMIT:
+            raise ConfigError(f"{path} has {size >> 20} MiB; a model's file has at most {FILE_LIMIT >> 20} MiB")
+        content = file.read_bytes()
+        if file.suffix.lower() not in SUFFIXES:
+            return content
+        try:
+            text = content.decode()
+        except UnicodeDecodeError:
+            text = content.decode("latin-1")
+        return self._relative(text)
+
+    def _relative(self, text: str) -> str:
+        """A text whose absolute paths in the folder are relative to the model's: it is compiled elsewhere, too."""
+        way = posixpath.relpath(".", posixpath.dirname(self._main) or ".")
+        for folder in {str(self._folder), str(self._named)} - {"/"}:
+            for quote in "\"'":
+                text = text.replace(f"{quote}{folder}/", f"{quote}{way}/")
+                text = text.replace(f"{quote}{folder}{quote}", f"{quote}{way}{quote}")
+        return text
+
+    def explained(self, error: RefusedError) -> str:
+        """MuJoCo's refusal, with what to do if it is about a file."""
+        file = _OPENING.search(str(error))
+        if file is None:
+            return f"MuJoCo refuses the model: {error}"
+        name = posixpath.basename(file[1])
+        missing = [path for path in dict.fromkeys(error.missing) if posixpath.basename(path) == name] or [file[1]]
+        outside = next((path for path in missing if path.startswith(("/", "../"))), "")
+        return self.lies_outside(outside) if outside else f"there is no file {' or '.join(missing)}"
+
+    def lies_outside(self, path: str) -> str:
+        """That a path leads out of the folder, and what to do."""
+        if path.startswith("/"):
+            return f"{path} lies outside of {self._folder}: put the file there, and name it from there"
+        above = path.split("/").count("..")
+        folder = self._folder.parents[min(above, len(self._folder.parents)) - 1]
+        return (
+            f"{path} lies outside of the task's folder {self._folder}: put the task's file into {folder} and name "
+            "the model from there, or give the class that folder: root = Path(...)"
+        )
 
 
-def _bases(model: str, name: str) -> list[str]:
-    """Folders in which a file's names begin."""
-    return [posixpath.dirname(model) or ".", posixpath.dirname(name) or "."]
+def _key(contents: Files, main: str) -> str:
+    """What a compiled model depends on."""
+    digests = [(path, digest(each.encode() if isinstance(each, str) else each)) for path, each in contents.items()]
+    return digest(repr((main, sorted(digests))).encode())
 
 
-def _ways(roots: Iterable[ET.Element], tag: str) -> list[str]:
-    """Folders that `compiler` gives for an element's files."""
-    attributes = _DIRS.get(tag, ("meshdir", "texturedir", "assetdir"))
-    compilers = [each for root in roots for each in root.iter("compiler")]
-    folders = [value for each in compilers for name in attributes if (value := each.get(name))]
-    if any(value.startswith("/") or "\\" in value for value in folders):
-        raise ConfigError(f"compiler: {folders[0]!r} leads out of the task's folder: give a path inside it, with /")
-    return folders or ["."]
+_kept: OrderedDict[str, Compiled] = OrderedDict()
 
 
-def _parsed(name: str, content: Content) -> ET.Element:
-    if not isinstance(content, str):
-        raise ConfigError(f"{name} is not a text, but the model reads it as MJCF")
-    if "<!DOCTYPE" in content or "<!ENTITY" in content:  # MuJoCo and Python read them differently
-        raise ConfigError(f"{name} has a document type, which MJCF does not use: remove it")
-    try:
-        return ET.fromstring(content)
-    except ET.ParseError as error:
-        raise ConfigError(f"{name} is not well-formed XML: {error}") from None
+def _keep(key: str, model: Compiled) -> None:
+    """Keep a compiled model in place of the oldest, unless it is large."""
+    if len(model.binary) <= _KEPT_SIZE:
+        _kept[key] = model
+    while len(_kept) > _KEPT:
+        _kept.popitem(last=False)

@@ -1,7 +1,6 @@
 """A compiled MuJoCo model, and the parts of it that are drawn."""
 
-import re
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
@@ -104,7 +103,10 @@ class Scene:
     @cached_property
     def bodies(self) -> tuple[str, ...]:
         """Names of every body that is drawn, in the model's order: all that have a geometry."""
-        return tuple(_name(self.model.body(i).name, f"body_{i}") for i in self._drawn)
+        names = {i: self.model.body(i).name for i in self._drawn}
+        nameless = [i for i, name in names.items() if not name]
+        substitutes = distinct([f"body_{i}" for i in nameless], set(names.values()))
+        return tuple((names | dict(zip(nameless, substitutes, strict=True))).values())
 
     @cached_property
     def fixed(self) -> frozenset[str]:
@@ -153,10 +155,13 @@ class Scene:
 
     def index(self, body: str) -> int:
         """Index among `bodies` of the body with this name in the model; a ConfigError if it has no geometry."""
-        name = _name(body, body)
-        if name not in self.bodies:
+        if body not in self.bodies:
             raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
-        return self.bodies.index(name)
+        return self.bodies.index(body)
+
+    def number(self, body: str) -> int:
+        """Number in the model of the body with this name; a ConfigError if it has no geometry."""
+        return self._drawn[self.index(body)]
 
     def poses(self, qpos: FloatArray, mocap: FloatArray | None = None) -> FloatArray:
         """Poses of the drawn bodies.
@@ -204,7 +209,7 @@ class Scene:
         geoms = [model.geom(i) for i in ids]
         return [
             Geometry(
-                name=_name(geom.name, f"geom_{geom.id}"),
+                name=geom.name or f"geom_{geom.id}",
                 body=bodies[int(geom.bodyid[0])],
                 shape=_SHAPES[mujoco.mjtGeom(int(geom.type[0]))],
                 size=tuple(geom.size.tolist()),
@@ -261,6 +266,14 @@ def quiet() -> None:
     mujoco.MjLogConfig.set(config)
 
 
-def _name(text: str, fallback: str) -> str:
-    """A name that can be part of a path; models may use any name, or none."""
-    return re.sub(r"[^\w.-]", "_", text, flags=re.ASCII) or fallback
+def distinct(names: Sequence[str], others: Set[str]) -> list[str]:
+    """Names of which no two are equal, and none is among others: those that are get a _, or several, behind them."""
+    out: list[str] = []
+    before, all_names = set(others), set(names)
+    for name in names:
+        new = name
+        while new in before or (new != name and new in all_names):
+            new += "_"
+        out.append(new)
+        before.add(new)
+    return out

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from farm.arrays import BoolArray, FloatArray, IntArray
-from farm.errors import ConfigError
+from farm.errors import ConfigError, TaskError
 from farm.settings import Settings, setting
 from farm.sim.channels import Camera, Channel, Measure, Quantity
 
@@ -199,10 +199,12 @@ class Task:
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """The task's own settings: flags, help and config.json follow from its fields."""
     xml: str | Path = ""
-    """MJCF of what is simulated, or its file in the folder of the task's file; or override `files` or `compiled`.
+    """MJCF or URDF of what is simulated, or the path of its file; or override `files` or `compiled`.
 
     What it includes and reads (meshes, textures, height fields) travels with a run. A worker does not look at it.
     """
+    root: str | Path = ""
+    """Folder of all files of `xml`, seen from the folder of the task's file; empty: that folder itself."""
     steps: int = 100
     """Control steps of a rollout."""
     substeps: int = 1
@@ -221,8 +223,11 @@ class Task:
     """Sizes of the observation's parts if they differ in kind; empty: one part."""
     observations: tuple[Quantity, ...] = ()
     """What the observation's numbers are, for exports; empty: numbered, or qpos and qvel if those are observed."""
-    actions: tuple[Quantity, ...] = ()
-    """The same of the action's; empty: the actuators' names, with -1 to 1 unless `act` is overridden."""
+    actions: int | tuple[Quantity, ...] = ()
+    """How many numbers an action has, or what they are; empty: one for each actuator.
+
+    Without actuators it is three for each mocap body. `act` makes controls of any other number.
+    """
     ends: tuple[str, str] | None = None
     """Names of the states in which rollouts begin and should end; with `reached` and `lost` policies can be chained."""
     ending: ClassVar[str] = "ended"
@@ -242,10 +247,12 @@ class Task:
     # Simulation
 
     def files(self) -> "Mapping[str, Content]":
-        """What decides numbers and is sent with a run, by path: texts, or bytes; the first .xml is the model."""
+        """What decides numbers and is sent with a run, by path: texts, or bytes; the first model is simulated."""
         from farm.sim.model_files import read
 
-        return read(self.xml, self._folder) if self.xml else {}
+        if not self.xml:
+            return {}
+        return read(self.xml, self._folder / self.root if self._folder else None)
 
     @property
     def _folder(self) -> Path | None:
@@ -288,7 +295,9 @@ class Task:
     @property
     def main(self) -> str:
         """Path of the model among `sources`; empty if there is none."""
-        return next((path for path in self.sources if path.endswith(".xml")), "")
+        from farm.sim.model_files import SUFFIXES
+
+        return next((path for path in self.sources if path.lower().endswith(SUFFIXES)), "")
 
     def mjcf(self) -> str:
         """The model's MJCF text, from `sources`."""
@@ -331,6 +340,8 @@ class Task:
         goals, jumps. They hold from this control step's first physics step on.
         """
         low, high = self.limits
+        if action.shape[1] != len(low):
+            raise TaskError(f"Task.act got actions of {action.shape[1]} numbers; expected {len(low)}, one per actuator")
         return rescaled(action, low, high)
 
     def reward(self, sim: "Sim", action: FloatArray) -> FloatArray | dict[str, FloatArray]:  # noqa: ARG002
@@ -383,6 +394,13 @@ class Task:
         limited = self.model.actuator_ctrllimited.astype(bool)
         low, high = self.model.actuator_ctrlrange.T
         return np.where(limited, low, -1.0), np.where(limited, high, 1.0)
+
+    @property
+    def action_size(self) -> int:
+        """Length A of the action; 0 if nothing says it."""
+        if isinstance(self.actions, int):
+            return self.actions
+        return len(self.actions) or self.model.nu or 3 * self.model.nmocap
 
     @property
     def period(self) -> float:

@@ -26,6 +26,10 @@ _LIMIT: Final = 100_000  # numbers of an observation
 _DIMENSIONS: Final = 2  # of a box of numbers; one of more is a picture
 _SEEDS: Final = 2**32  # of numpy's old generator, which dm_control uses
 _ROWS: Final = 16  # environments that are stepped in turn
+_INSTEAD: Final = (
+    "not an environment of MuJoCo, and only those can be learnt; take one (gym:Walker2d-v5), or write its model as "
+    "a task (farm new-task), which farm run learns, and farm.Farm evaluates for a search of your own"
+)
 _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -44,6 +48,7 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
     except ImportError:
         raise ConfigError(f"task gym:{name} needs gymnasium: pip install 'gymnasium[mujoco]'") from None
     quiet()
+    _check_physics(name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # mostly about newer versions
@@ -53,11 +58,12 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
                 env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
     except Exception as error:  # an environment may raise anything
         reason = " ".join(str(error).split()) or _place(error)
-        raise ConfigError(f"task gym:{name}: {reason}") from None
+        only = " (before you do: only environments that MuJoCo simulates can be learnt)" if "nstall" in reason else ""
+        raise ConfigError(f"task gym:{name}: {reason}{only}") from None
     space, actions, box = env.observation_space, env.action_space, gymnasium.spaces.Box
     parts = *simulated(env), getattr(env.unwrapped, "dt", None)
     if not all(map(isinstance, parts, (mujoco.MjModel, mujoco.MjData, float))):
-        raise ConfigError(f"task gym:{name}: not an environment of MuJoCo")
+        raise ConfigError(f"task gym:{name}: {_INSTEAD}")
     for where, part in leaves(space):
         if not isinstance(part, box) or len(part.shape) > _DIMENSIONS or part.dtype.kind == "u":
             picture = ", a picture" if isinstance(part, box) else ""
@@ -70,6 +76,24 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
     if not isinstance(actions, box) or len(actions.shape) != 1 or not actions.is_bounded():
         raise ConfigError(f"task gym:{name}: actions are {actions}; expected a bounded box of one dimension")
     return env
+
+
+def _check_physics(name: str) -> None:
+    """Check that Gymnasium's own environment is one of MuJoCo, before what it needs is missing.
+
+    Raises:
+      ConfigError: it is not; what can be done instead.
+    """
+    import gymnasium
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            module = str(gymnasium.spec(name).entry_point).partition(":")[0]
+    except Exception:  # what is wrong with the name is reported when it is made
+        return
+    if module.startswith("gymnasium.envs.") and not module.startswith("gymnasium.envs.mujoco"):
+        raise ConfigError(f"task gym:{name}: {_INSTEAD}")
 
 
 def simulated(env: "gymnasium.Env[Any, Any]") -> tuple[mujoco.MjModel, mujoco.MjData]:

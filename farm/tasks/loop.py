@@ -420,7 +420,7 @@ def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) 
         if history.shape[1]:
             history[batch.rows, sim.t] = single(x)
         action = acting.act(x, batch.active)
-        columns = np.shape(action)[1:2] or (sim.model.nu,)
+        columns = np.shape(action)[1:2] or (batch.task.action_size,)
         batch.step(shaped("act of the policy", action, (len(batch.active), *columns)))
 
 

@@ -15,6 +15,7 @@ from farm.sim.channels import Camera, Channel, Measure, Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
+from farm.tasks import actions
 from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
 
@@ -33,6 +34,8 @@ def specification(task: Task) -> TaskSpec:
       ConfigError: the class cannot be a task.
       TaskError: it returns invalid arrays.
     """
+    for what in ("observations", "actions"):
+        _check_quantities(task, what)
     spec = task.spec() or _found(task)
     measures: object = task.measures
     if not isinstance(measures, tuple | list) or not all(isinstance(each, Measure) for each in measures):
@@ -41,20 +44,29 @@ def specification(task: Task) -> TaskSpec:
     if len(set(names)) < len(names):
         raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
-        _check_quantities(task, what, count)
+        _check_count(task, what, count)
     several = (_models(task),) if len(task.simulated) > 1 else ()
     return replace(spec, measures=tuple(task.measures), channels=(*spec.channels, *several))
 
 
-def _check_quantities(task: Task, what: str, count: int) -> None:
-    """Check the quantities that a task names in an attribute, if it names any."""
+def _check_quantities(task: Task, what: str) -> None:
+    """Check that an attribute names quantities, if it names any, or says how many numbers an action has."""
     quantities: object = getattr(task, what)
+    if what == "actions" and actions.is_size(quantities):
+        return
     if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
+        number = f"a number from 1 to {actions.LIMIT} or " if what == "actions" else ""
         raise ConfigError(
-            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected a tuple of farm.Quantity"
+            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of farm.Quantity"
         )
-    if quantities and len(quantities) != count:
-        raise ConfigError(f"task {type(task).__name__}: {what} names {len(quantities)} numbers; there are {count}")
+
+
+def _check_count(task: Task, what: str, count: int) -> None:
+    """Check that an attribute names as many numbers as there are, if it names any."""
+    quantities = getattr(task, what)
+    size = quantities if isinstance(quantities, int) else len(quantities)
+    if size and size != count:
+        raise ConfigError(f"task {type(task).__name__}: {what} names {size} numbers; there are {count}")
 
 
 def _models(task: Task) -> Channel:
@@ -89,14 +101,14 @@ def _found(task: Task) -> TaskSpec:
         batch = Batch(task, sim, [None])
         x = batch.observe()
         with np.errstate(all="ignore"):
-            batch.step(np.zeros((1, task.model.nu)))
+            batch.step(np.zeros((1, task.action_size)))
             _check_channels(task, batch.frames)
         return x.shape[1], batch.names
 
     size, names = tried(task, 1, look)
     success = None if scores(task) else type(task).success is not Task.success
     return TaskSpec(
-        observation=size, action=task.model.nu, steps=task.steps, period=task.period, terms=names or ("reward",),
+        observation=size, action=task.action_size, steps=task.steps, period=task.period, terms=names or ("reward",),
         success=bool(success), channels=task.channels,
     )  # fmt: skip
 
@@ -120,8 +132,7 @@ def _check_class(task: Task) -> None:
     for geom in (geom for channel in task.channels for geom in channel.geoms):
         if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
             raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
-    if not task.model.nu:
-        raise ConfigError(f"task {name}: its model has no actuator, so that there is nothing to learn")
+    actions.check(task)
     for method in _METHODS:
         signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
         try:

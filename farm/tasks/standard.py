@@ -30,7 +30,7 @@ def nominal(task: Task) -> FloatArray:
       ConfigError: the task cannot start.
       TaskError: the observation is not finite.
     """
-    return _observed(task, np.empty((0, len(task.limits[0]))))[0]
+    return _observed(task, np.empty((0, task.action_size)))[0]
 
 
 def standard(task: Task, action: float) -> dict[str, FloatArray]:
@@ -45,7 +45,7 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
       ConfigError: the task cannot start.
       TaskError: an observation is not finite.
     """
-    x = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, len(task.limits[0]))))
+    x = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, task.action_size)))
     low, high = np.quantile(x, (0.25, 0.75), axis=0)
     spread, parts = (high - low) / _QUARTILES, task.parts or (x.shape[1],)
     if sum(parts) != len(spread):
@@ -66,7 +66,7 @@ def observed(task: Task, count: int) -> FloatArray:
       TaskError: an observation is not finite.
     """
     rollouts = max(_FEW, -(-count // task.steps))
-    return _observed(task, np.random.default_rng(0).normal(0.0, 0.5, (rollouts, len(task.limits[0]))))
+    return _observed(task, np.random.default_rng(0).normal(0.0, 0.5, (rollouts, task.action_size)))
 
 
 def _observed(task: Task, actions: FloatArray) -> FloatArray:

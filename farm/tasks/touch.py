@@ -49,7 +49,8 @@ class Touch:
     """What pads of a robot feel: numbers of the model's sensors, as a picture for each pad.
 
     A number is the force on a site (sensor `touch`, [N]), the sum of the normal forces of a `contact` sensor with
-    `data="found force"` ([N]), or how deep something is in a vertex of a mesh (`tactile`, [m]).
+    `data="found force"` ([N]), the normal force in a part of the field of MuJoCo's plug-in `mujoco.sensor.touch_grid`
+    ([N]), or how deep something is in a vertex of a mesh (`tactile`, [m]).
 
     Example:
       ```python
@@ -108,7 +109,7 @@ class Touch:
           pads: names of the sensors of each pad; their numbers fill its picture row by row.
           config: noise, delay and interval.
           steps: control steps of a rollout.
-          shape: height and width of a picture; by default one row.
+          shape: height and width of a picture; by default those of the grid, if each pad has one, or one row.
           top: number that is drawn in the brightest colour.
           name: of the channel, and of what is kept in `sim.own`.
 
@@ -118,7 +119,9 @@ class Touch:
         self._config, self._steps, self._name = config, steps, name
         by_pad = [[_sensor(model, sensor) for sensor in sensors] for sensors in pads.values()]
         counts = [sum(len(each.at) for each in pad) for pad in by_pad]
-        height, width = shape or (1, counts[0] if counts else 0)
+        grids = {pad[0].shape if len(pad) == 1 else None for pad in by_pad}
+        grid = grids.pop() if len(grids) == 1 else None
+        height, width = shape or grid or (1, counts[0] if counts else 0)
         if not counts or set(counts) != {height * width}:
             raise ConfigError(
                 f"touch: the pads' sensors give {', '.join(map(str, counts)) or 'no'} numbers; expected "
@@ -176,6 +179,8 @@ class _Sensor:
     body: int
     places: FloatArray
     """Where the numbers are felt in the body's frame [m], (n, 3)"""
+    shape: tuple[int, int] | None = None
+    """Height and width of the numbers' grid, if they have one."""
 
 
 def _sensor(model: mujoco.MjModel, name: str) -> _Sensor:
@@ -200,14 +205,67 @@ def _sensor(model: mujoco.MjModel, name: str) -> _Sensor:
         geom = of if model.sensor_objtype[i] == mujoco.mjtObj.mjOBJ_GEOM else -1
         place = np.zeros((1, 3)) if geom < 0 else model.geom_pos[geom][None].copy()
         return _Sensor(slots + 1, slots, "N", int(model.geom_bodyid[geom]) if geom >= 0 else 0, place)
-    raise ConfigError(f"touch: sensor {name!r} is of kind {what}; expected touch, contact or tactile")
+    if what == "plugin" and (grid := _grid(model, i)) is not None:
+        at = first + np.arange(grid.count)[:, None]  # normal forces come first, then other forces and torques
+        places = model.site_pos[of] + grid.directions() @ _matrix(model.site_quat[of]).T * model.site_size[of, 0]
+        return _Sensor(at, at, "N", int(model.site_bodyid[of]), places, (grid.height, grid.width))
+    raise ConfigError(f"touch: sensor {name!r} is of kind {what}; expected touch, contact, tactile or touch_grid")
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The field of a touch_grid: a part of it for each number, row by row from the lowest y."""
+
+    width: int
+    height: int
+    field: tuple[float, float]
+    """Largest angles from its middle along x and y [deg]."""
+    fovea: float
+    """0: all parts see equal angles; up to 1: those in the middle see smaller ones."""
+
+    @property
+    def count(self) -> int:
+        """Number of its parts."""
+        return self.width * self.height
+
+    def directions(self) -> FloatArray:
+        """Unit vectors to the parts' middles in the frame of the site, which looks along -z, (count, 3)."""
+        angles = []
+        for parts, most in zip((self.width, self.height), self.field, strict=True):
+            middle = (np.arange(parts) + 0.5) * 2.0 / parts - 1.0
+            angles.append(np.deg2rad(most) * (self.fovea * middle**5 + (1.0 - self.fovea) * middle))
+        y, x = (each.ravel() for each in np.meshgrid(angles[1], angles[0], indexing="ij"))
+        return np.stack([np.cos(y) * np.sin(x), np.sin(y), -np.cos(y) * np.cos(x)], axis=1)
+
+
+def _grid(model: mujoco.MjModel, sensor: int) -> _Grid | None:
+    """The grid of a plug-in's sensor; None if it is another plug-in.
+
+    MjModel has no names of plug-ins, but the values of their attributes: here nchannel, size, fov and gamma.
+    """
+    instance = int(model.sensor_plugin[sensor])
+    first, *after = model.plugin_attradr[instance : instance + 2].tolist()
+    text = model.plugin_attr[first : after[0] if after else None].tobytes()
+    try:
+        channels, size, field, fovea, _ = text.decode().split("\0")
+        width, height = map(int, size.split())
+        along_x, along_y = map(float, field.split())
+        grid = _Grid(width, height, (along_x, along_y), float(fovea))
+    except ValueError:
+        return None
+    return grid if grid.count * float(channels or 1) == model.sensor_dim[sensor] else None
+
+
+def _matrix(quaternion: FloatArray) -> FloatArray:
+    """The rotation of a quaternion wxyz, (3, 3)."""
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, quaternion)
+    return turn.reshape(3, 3)
 
 
 def _turned(model: mujoco.MjModel, geom: int, vertices: FloatArray) -> FloatArray:
     """Vertices (V, 3) in a geometry's frame, in that of its body."""
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    return model.geom_pos[geom] + vertices @ turn.reshape(3, 3).T
+    return model.geom_pos[geom] + vertices @ _matrix(model.geom_quat[geom]).T
 
 
 def _places(model: mujoco.MjModel, pad: Sequence[_Sensor]) -> tuple[str, FloatArray] | None:

@@ -81,8 +81,10 @@ def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *
     """
     check(policies)
     first = policies[0]
-    methods = {"act": lambda _, __, action: action, "ended": lambda self, sim: self.lost(sim)}
-    upper: Any = type("Upper", (type(first.problem.task),), methods)
+    attributes = {
+        "actions": (), "act": lambda _, __, action: action, "ended": lambda self, sim: self.lost(sim),
+    }  # fmt: skip
+    upper: Any = type("Upper", (type(first.problem.task),), attributes)
     task: Any = _longer(upper, first, steps)
     sim = Sim(task.engine(BatchEngine))
     again(lambda: task.setup(sim))

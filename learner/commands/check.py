@@ -110,7 +110,8 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
     problem = setup.problem(config)
     spec = problem.spec
     low, high = problem.task.limits
-    yield f"observation {spec.observation}, actions {spec.action}, controls {len(low)} from {low} to {high}"
+    bounds = f" from {low} to {high}" if len(low) else ""
+    yield f"observation {spec.observation}, actions {spec.action}, controls {len(low)}{bounds}"
     yield f"{spec.steps} control steps of {spec.period:g} s; reward of {', '.join(spec.terms)}"
     channels = ", ".join(channel.name for channel in spec.channels)
     yield f"success: {'yes' if spec.success else 'none'}; channels: {channels or 'none'}"

@@ -11,6 +11,7 @@ import numpy as np
 from farm.errors import ConfigError
 from farm.sim import quantities
 from farm.sim.channels import Quantity
+from farm.tasks import actions
 from farm.tasks.base import Task
 from learner.again.replay import LoadedPolicy
 
@@ -25,7 +26,7 @@ def interface(policy: LoadedPolicy) -> dict[str, Any]:
     moved = [quantities.moved(model, i) for i in range(model.nu)]
     return {
         "observations": _rows(task.observations or _observations(task, spec.observation)),
-        "actions": _rows(task.actions or _actions(task, spec.action)),
+        "actions": _rows(actions.described(task, spec.action)),
         "controls": [row | {"moves": name} for row, name in zip(_rows(quantities.controls(model)), moved, strict=True)],
         "joints": quantities.joints(model),
         "normaliser": None
@@ -40,13 +41,6 @@ def _observations(task: Task, count: int) -> tuple[Quantity, ...]:
     if type(task).observe is Task.observe:
         return quantities.states(task.model)
     return tuple(Quantity(f"observation {i}") for i in range(count))
-
-
-def _actions(task: Task, count: int) -> tuple[Quantity, ...]:
-    bounds = (-1.0, 1.0) if type(task).act is Task.act else ()
-    controls = quantities.controls(task.model)
-    names = [each.name for each in controls] if len(controls) == count else [f"action {i}" for i in range(count)]
-    return tuple(Quantity(name, "", *bounds) for name in names)
 
 
 def _rows(quantities: Sequence[Quantity]) -> list[dict[str, Any]]:

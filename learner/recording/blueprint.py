@@ -13,9 +13,7 @@ from farm.sim.channels import Channel
 from farm.sim.framing import View
 from farm.tasks.base import TaskSpec
 from learner.recording.channels import Panel, entities, panels, title
-
-FOLLOWED: Final = "/world/view"
-"""Entity that the eye follows, an invisible point: a body without a geometry of its own cannot be followed."""
+from learner.recording.entities import FOLLOWED
 
 _BACKGROUND: Final = [74, 80, 88, 255]
 _DARK: Final = [24, 25, 28, 255]

@@ -13,6 +13,7 @@ from farm.sim.marks import ARROW_RADIUS, POINT_RADIUS
 from farm.sim.scene import Scene
 from farm.tasks.base import TaskSpec
 from learner.recording.curves import Columns, lighter, lines, pack, palette, ramp, scalars
+from learner.recording.entities import SceneEntities, path
 from learner.recording.solids import rotate
 
 STATES: Final = ("off", "on")
@@ -37,8 +38,10 @@ class Panel(NamedTuple):
 class ChannelDrawing:
     """How one channel is drawn: a subclass for each kind."""
 
-    def __init__(self, channel: Channel, scene: Scene) -> None:
+    def __init__(self, channel: Channel, scene: Scene, within: SceneEntities) -> None:
         self.channel = channel
+        self.on = [within.bodies[scene.index(body)] for body in channel.bodies]
+        """Entities of its bodies."""
         self.entity = path(channel.name)
         self.size = scene.radius
         self.bodies = [scene.index(body) for body in channel.bodies]
@@ -128,9 +131,9 @@ class Flags(ChannelDrawing):
 class Images(ChannelDrawing):
     """Pictures at /NAME/LABEL; with places also points on their bodies, at /world/BODY/NAME."""
 
-    def __init__(self, channel: Channel, scene: Scene) -> None:
-        super().__init__(channel, scene)
-        self._on = [] if channel.places is None else _on_bodies(channel, [scene.bodies[i] for i in self.bodies])
+    def __init__(self, channel: Channel, scene: Scene, within: SceneEntities) -> None:
+        super().__init__(channel, scene, within)
+        self._on = [] if channel.places is None else _on_bodies(channel, self.on)
 
     def static(self) -> Iterator[tuple[str, Any]]:
         """Sizes and colours, and places."""
@@ -219,11 +222,6 @@ def panels(channels: Sequence[Channel], kind: str) -> list[Panel]:
     return [panel for group in each for panel in group if panel.kind == kind]
 
 
-def path(name: str) -> str:
-    """Convert a name that may contain slashes to an entity's path."""
-    return "".join(f"/{rr.escape_entity_path_part(part)}" for part in name.split("/"))
-
-
 def entities(channel: Channel) -> list[str]:
     """Paths of the channel's parts, by their labels."""
     return [f"{path(channel.name)}{path(label)}" for label in channel.names]
@@ -243,7 +241,7 @@ def _on_bodies(channel: Channel, bodies: list[str]) -> list[str]:
     if not bodies:
         return [f"/world{entity}" for entity in entities(channel)]
     labels = ["" if bodies.count(body) == 1 else path(label) for body, label in zip(bodies, channel.names, strict=True)]
-    return [f"/world/{body}{path(channel.name)}{label}" for body, label in zip(bodies, labels, strict=True)]
+    return [f"{body}{path(channel.name)}{label}" for body, label in zip(bodies, labels, strict=True)]
 
 
 def title(channel: Channel) -> str:

@@ -13,18 +13,17 @@ import rerun as rr
 from farm.arrays import FloatArray
 from farm.sim.channels import Camera
 from farm.sim.framing import View
-from farm.sim.scene import MODEL, Geometry, Scene
+from farm.sim.scene import MODEL, Scene
 from farm.sim.trajectory import Trajectory
+from farm.tasks.actions import described
 from farm.tasks.base import TaskSpec
 from farm.tasks.standard import start
-from learner.recording.blueprint import FOLLOWED, Eye
+from learner.recording.blueprint import Eye
 from learner.recording.channels import KINDS
 from learner.recording.curves import Columns, lines, scalars
+from learner.recording.entities import CAPTION, FOLLOWED, SceneEntities
 from learner.recording.solids import solid, xyzw
 from learner.run.setup import Problem
-
-CAPTION: Final = "/world/caption"
-"""Entity of the text in the scene."""
 
 _WHITE: Final = (255, 255, 255)
 _ABOVE: Final = 0.75  # height of the caption above the scene's middle, in radii of the scene
@@ -33,36 +32,47 @@ _ABOVE: Final = 0.75  # height of the caption above the scene's middle, in radii
 class Drawing:
     """How a task's scene and rollouts are drawn."""
 
-    def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None) -> None:
-        """Draw a scene with its task's channels; seen from a camera, or (None) from the side of the moving bodies."""
+    def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None, actions: Sequence[str] = ()) -> None:
+        """Draw a scene with its task's channels.
+
+        Args:
+          scene: the model.
+          spec: of the task.
+          camera: from where it is seen; None: from the side of the moving bodies.
+          actions: names of the action's numbers; empty: they are counted.
+        """
         self.scene, self.spec, self.camera = scene, spec, camera
-        self._channels = {channel.name: KINDS[channel.kind](channel, scene) for channel in spec.channels}
-        self._some = [each for each in scene.geometries() if each.models]  # that not every model has
+        self._actions = actions or [str(i + 1) for i in range(spec.action)]
+        self._entities = SceneEntities(scene, spec.channels)
+        self._channels = {
+            channel.name: KINDS[channel.kind](channel, scene, self._entities) for channel in spec.channels
+        }
 
     @classmethod
     def of(cls, problem: Problem) -> "Drawing":
         """How a run's task is drawn; without a camera of its own it is framed at its start."""
         task, scene = problem.task, problem.scene
+        names = [each.name for each in described(task, problem.spec.action)]
         if task.camera:
-            return cls(scene, problem.spec, task.camera)
+            return cls(scene, problem.spec, task.camera, names)
         qpos, mocap = start(task)
-        return cls(replace(scene, start=qpos, mocap=mocap), problem.spec)
+        return cls(replace(scene, start=qpos, mocap=mocap), problem.spec, actions=names)
 
     def static(self) -> Iterator[tuple[str, Any]]:
         """Entities and archetypes that are logged once."""
         yield "/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
-        for geometry in self.scene.geometries():
-            yield _entity(geometry), solid(geometry)
+        for entity, geometry in self._entities.geometries:
+            yield entity, solid(geometry)
         rest = self.scene.poses(self.scene.model.qpos0[None])[0]
-        for name, pose in zip(self.scene.bodies, rest, strict=True):
+        for name, entity, pose in zip(self.scene.bodies, self._entities.bodies, rest, strict=True):
             if name in self.scene.fixed:
                 turned = rr.Quaternion(xyzw=xyzw(pose[3:]))
-                yield f"/world/{name}", rr.Transform3D(translation=pose[:3], quaternion=turned)
+                yield entity, rr.Transform3D(translation=pose[:3], quaternion=turned)
         yield CAPTION, rr.Points3D.from_fields(colors=[_WHITE], radii=[0.0], show_labels=True)
         if self.camera is None:
             yield FOLLOWED, rr.Points3D.from_fields(radii=[0.0])
         yield "/reward/terms", lines(self.spec.terms)
-        yield "/actions", lines([str(i + 1) for i in range(self.spec.action)])
+        yield "/actions", lines(self._actions)
         for channel in self._channels.values():
             yield from channel.static()
 
@@ -112,13 +122,16 @@ class Drawing:
     def columns(self, rollout: Trajectory) -> Iterator[Columns]:
         """Columns of a rollout's frames, or of those of several that are joined; it is checked first."""
         self.check(rollout)
-        for name, poses in zip(self.scene.bodies, np.moveaxis(rollout.bodies, 1, 0), strict=True):
+        all_poses = np.moveaxis(rollout.bodies, 1, 0)
+        for name, entity, poses in zip(self.scene.bodies, self._entities.bodies, all_poses, strict=True):
             if name not in self.scene.fixed:
                 moved = rr.Transform3D.columns(translation=poses[:, :3], quaternion=xyzw(poses[:, 3:]))
-                yield Columns(f"/world/{name}", moved)
-        for geometry in self._some:  # a scale of 0 hides it
-            visible = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)
-            yield Columns(_entity(geometry), rr.Transform3D.columns(scale=np.repeat(visible[:, None], 3, axis=1)))
+                yield Columns(entity, moved)
+        for entity, geometry in self._entities.geometries:
+            if not geometry.models:  # every model has it
+                continue
+            visible = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)  # a scale of 0 hides it
+            yield Columns(entity, rr.Transform3D.columns(scale=np.repeat(visible[:, None], 3, axis=1)))
         yield Columns("/reward/terms", scalars(rollout.terms))
         yield Columns("/actions", scalars(rollout.actions))
         begins = np.cumsum(rollout.times == 0.0)
@@ -132,10 +145,6 @@ class Drawing:
             widths |= channel.curves()
         for entity, width in widths.items():
             yield Columns(entity, scalars(np.full((count, width), np.nan)))
-
-
-def _entity(geometry: Geometry) -> str:
-    return f"/world/{geometry.body}/{geometry.name}"
 
 
 def _length(metres: float) -> str:

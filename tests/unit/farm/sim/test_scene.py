@@ -45,7 +45,7 @@ def scene():
 
 
 def test_bodies_are_those_that_have_a_shape(scene):
-    assert scene.bodies == ("world", "post", "anchor", "hung_here", "body_4", "arm"), "in the model's order"
+    assert scene.bodies == ("world", "post", "anchor", "hung here", "body_4", "arm"), "in the model's order"
     assert scene.fixed == {"world", "post"}, "a mocap body and what hangs on it can be moved"
     assert scene.left_out == 1, "the hills"
 
@@ -60,7 +60,7 @@ def test_a_body_is_found_by_its_name_in_the_model(scene):
 def test_geometries_are_the_models(scene):
     geometries = scene.geometries()
     assert [g.shape for g in geometries] == ["plane", "cylinder", "box", "ellipsoid", "sphere", "mesh", "capsule"]
-    assert [g.name for g in geometries] == ["floor", "geom_2", "geom_3", "geom_4", "a_b", "geom_6", "geom_8"]
+    assert [g.name for g in geometries] == ["floor", "geom_2", "geom_3", "geom_4", "a/b", "geom_6", "geom_8"]
     for i, geometry in zip(SHOWN, geometries, strict=True):
         geom = scene.model.geom(i)
         np.testing.assert_array_equal(geometry.size, geom.size)

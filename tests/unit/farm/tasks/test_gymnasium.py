@@ -116,7 +116,11 @@ def test_the_spec_is_the_environments():
     [
         ("Swimmr-v5", "Did you mean: `Swimmer`"),
         ("Swimmer-v99", "`v5`"),
-        ("CartPole-v1", "not an environment of MuJoCo"),
+        ("CartPole-v1", "not an environment of MuJoCo, and only those can be learnt; take one"),
+        ("BipedalWalker-v3", "not an environment of MuJoCo, and only those can be learnt; take one"),
+        ("LunarLander-v3", r"or write its model as a task \(farm new-task\), which farm run learns, and farm.Farm"),
+        ("phys2d/CartPole-v1", "not an environment of MuJoCo"),
+        ("ALE/Pong-v5", r"installed the proper package for ALE\? \(before you do: only environments that MuJoCo"),
         ("Pusher-v2", "moved"),
     ],
 )

@@ -156,7 +156,11 @@ def test_channel() -> None:
     ("pads", "shape", "line"),
     [
         ({"p": ("nobody",)}, None, "touch: there is no sensor 'nobody' in the model"),
-        ({"p": ("height",)}, None, "touch: sensor 'height' is of kind jointpos; expected touch, contact or tactile"),
+        (
+            {"p": ("height",)},
+            None,
+            "touch: sensor 'height' is of kind jointpos; expected touch, contact, tactile or touch_grid",
+        ),
         ({"p": ("bare",)}, None, "touch: contact sensor 'bare' needs data=\"found force\""),
         ({"p": ("a", "b"), "q": ("c",)}, None, "touch: the pads' sensors give 2, 1 numbers; expected 1 x 2 for each"),
         ({"p": ("a", "b")}, (2, 2), "touch: the pads' sensors give 2 numbers; expected 2 x 2 for each"),
@@ -193,3 +197,53 @@ def test_a_gripper_learns_to_lift_and_is_recorded_with_its_pads(
     for side in ("left", "right"):
         assert {f"/touch/{side}", f"/touch/{side}/scale", f"/world/{side}/touch"} <= entities
     capsys.readouterr()
+
+
+def grid(size: str, *, channels: int = 1, field: str = "60 45", gamma: float = 0.0, ball: str = "0 0") -> str:
+    """A pad that lies on a ball."""
+    return f"""<mujoco><extension><plugin plugin="mujoco.sensor.touch_grid"/>
+      <plugin plugin="mujoco.pid"/></extension><worldbody><geom size=".01" pos="{ball} .01"/>
+      <body name="pad" pos="0 0 .05"><joint name="z" type="slide" axis="0 0 1" damping="5"/>
+        <geom type="box" size=".05 .05 .01" mass=".2"/><site name="pad" pos="0 0 .02" size="0.03"/></body></worldbody>
+      <actuator><motor joint="z" ctrlrange="-9 9"/></actuator>
+      <sensor><jointpos joint="z"/><plugin name="grid" plugin="mujoco.sensor.touch_grid" objtype="site" objname="pad">
+        <config key="size" value="{size}"/><config key="fov" value="{field}"/><config key="gamma" value="{gamma}"/>
+        <config key="nchannel" value="{channels}"/></plugin></sensor></mujoco>"""
+
+
+@pytest.mark.parametrize("channels", [1, 3, 6])
+@pytest.mark.parametrize(("ball", "row", "column"), [("0 0", 1, 2), (".02 0", 1, 3), ("-.02 0", 1, 0), ("0 .02", 2, 2)])
+def test_a_grid_is_a_picture_of_normal_forces(channels: int, ball: str, row: int, column: int) -> None:
+    ball = ball.replace("0 0", "0.001 0") if ball == "0 0" else ball.replace("0 .02", "0.001 .02")
+    attributes = {"xml": grid("4 3", channels=channels, ball=ball), "pads": {"pad": ("grid",)}, "steps": 100}
+    task = type("Own", (Press,), attributes)()
+    assert task.touch.channel.shape == (1, 3, 4)
+    assert (task.touch.channel.unit, task.touch.channel.bodies) == ("N", ("pad",))
+    sim = Sim(BatchEngine(task.model, 1))
+
+    def felt() -> FloatArray:
+        batch = Batch(task, sim, [None])
+        for _ in range(100):
+            batch.observe()
+            batch.step(np.full((1, 1), -0.1))
+        return task.touch.true(sim)[0, 0]
+
+    values = again(felt)
+    expected = np.zeros((3, 4))
+    expected[row, column] = 0.2 * 9.81 + 0.9
+    np.testing.assert_allclose(values, expected, rtol=0.02)
+    assert task.touch.channel.places is not None
+    place = task.touch.channel.places[0].reshape(3, 4, 3)[row, column] - [0.0, 0.0, 0.02]
+    felt_at = np.array([*map(float, ball.split()), -0.03])
+    assert np.linalg.norm(place) == pytest.approx(0.03)
+    cosine = place @ felt_at / np.linalg.norm(place) / np.linalg.norm(felt_at)
+    assert cosine > np.cos(np.deg2rad(20.0)), "it is drawn where it is felt"
+
+
+def test_several_grids_and_other_shapes() -> None:
+    task = type("Own", (Press,), {"xml": grid("4 3", gamma=0.5), "pads": {"pad": ("grid",)}, "shape": (4, 3)})()
+    assert task.touch.channel.shape == (1, 4, 3)
+    twice = type("Own", (Press,), {"xml": grid("4 3"), "pads": {"pad": ("grid", "grid")}})()
+    assert twice.touch.channel.shape == (1, 1, 24)
+    two = type("Own", (Press,), {"xml": grid("4 3"), "pads": {"left": ("grid",), "right": ("grid",)}})()
+    assert two.touch.channel.shape == (2, 3, 4)

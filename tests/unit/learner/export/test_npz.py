@@ -13,7 +13,6 @@ from robot import robot
 
 from farm.errors import ConfigError
 from farm.policies.normalised import Normalised
-from farm.sim import model_files
 from farm.tasks.finger_gait.observations import STATES
 from learner.again.replay import LoadedPolicy
 from learner.export import npz as export
@@ -138,7 +137,10 @@ def test_a_model_in_files_comes_with_all_of_them(tmp_path: Path) -> None:
         files = {name.removeprefix("file/"): file[name].tobytes() for name in file.files if name.startswith("file/")}
         main, mjcf = file["model"].item(), file["mjcf"].item()
     assert files[main].decode() == mjcf
-    model_files.write(tmp_path / "elsewhere", files)
+    for name, content in files.items():
+        place = tmp_path / "elsewhere" / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(content)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "elsewhere" / main))
     np.testing.assert_array_equal(model.mesh_vert, problem.task.model.mesh_vert)
     assert (model.nhfield, model.ntex) == (1, 1)

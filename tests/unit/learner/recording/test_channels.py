@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made import report, stats
 from rerun.chunk import RrdReader
+from robot import robot
 
 from farm.errors import ConfigError
 from farm.sim.channels import Kind
@@ -20,7 +21,10 @@ from learner.recording.blueprint import Eye
 from learner.recording.channels import KINDS, Arrows, changes, title
 from learner.recording.curves import ramp
 from learner.recording.drawing import Drawing
+from learner.recording.entities import SceneEntities
 from learner.recording.solids import ENDLESS, rotate, solid
+from learner.run.config import configure
+from learner.run.setup import start as begin
 
 
 @pytest.fixture
@@ -113,9 +117,17 @@ def test_arrows_stand_on_their_bodies(written, scene):
             np.testing.assert_allclose(vectors[frame][i], vector, atol=1e-6)
 
 
+def test_the_actions_curves_have_the_tasks_names(tmp_path):
+    task = robot(tmp_path / "mine")
+    problem, _ = begin(configure(f"{task}:Reach", policy="linear"), "r")
+    entities = dict(Drawing.of(problem).static())
+    assert entities["/actions"].names.as_arrow_array().to_pylist() == ["hinge"]
+
+
 def test_long_arrows_are_cut(scene):
     channel = Channel(name="a", kind="arrows", shape=(1, 6), length=2.0, longest=0.5)
-    _, vectors = Arrows(channel, scene).arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
+    drawing = Arrows(channel, scene, SceneEntities(scene, [channel]))
+    _, vectors = drawing.arrows(np.array([[[0, 0, 0, 3.0, 0, 4.0]]]), np.zeros((1, 3, 7)))
     np.testing.assert_allclose(vectors, [[[0.3, 0.0, 0.4]]])
 
 
