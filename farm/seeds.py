@@ -11,7 +11,7 @@ import numpy as np
 SEEDS: Final = 2**32
 """Seeds are below this: one 32-bit word each."""
 
-_FEATURES, _EXPLORATION, _TRAINING, _TRIAL, _START = range(1, 6)
+_FEATURES, _EXPLORATION, _TRAINING, _TRIAL, _START, _PILOT = range(1, 7)
 
 
 def features(seed: int) -> np.random.Generator:
@@ -35,6 +35,16 @@ def training(seed: int, generation: int, start: int) -> tuple[int, ...]:
     `start` is the pair's number, or the episode's.
     """
     return (_TRAINING, seed, generation, start)
+
+
+def pilot(seed: int) -> np.random.Generator:
+    """Generator for the directions that a run's pilot tries."""
+    return np.random.default_rng((_PILOT, seed, 0, 0))
+
+
+def pilot_start(seed: int, start: int) -> tuple[int, ...]:
+    """Seed of the task's perturbation for a start of a run's pilot."""
+    return (_PILOT, seed, 1, start)
 
 
 def trial(seed: int, rollout: int) -> tuple[int, ...]:

@@ -8,7 +8,8 @@ this is the paper's V2-t, otherwise V1-t. Shapes: P parameters, N pairs. Sums ru
 through BLAS.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -37,6 +38,11 @@ class ARS(Mirrored):
         super().__post_init__()
         if self.top is not None and self.top > self.pairs:
             raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")
+
+    def scaled(self, sigma: float) -> Self:
+        """The same search at another scale: with this initial sigma, and steps in proportion."""
+        rate = self.learning_rate_mu * (sigma / self.initial_sigma)
+        return replace(self, initial_sigma=sigma, learning_rate_mu=rate)
 
     def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
         """The next mu; if all used returns are equal, it does not move."""

@@ -10,8 +10,8 @@ make no difference.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -60,6 +60,10 @@ class CMAES(Settings):
     """Smallest and largest number of parameters: an update with a full covariance takes population x P^2 numbers."""
     stored: ClassVar[str] = "_c_1d"
     """The library's attribute that holds C as it is stored here."""
+
+    def scaled(self, sigma: float) -> Self:
+        """The same search at another scale: with this initial sigma; steps follow from it."""
+        return replace(self, initial_sigma=sigma)
 
     def signs(self) -> tuple[int, ...]:
         """Rollouts of a row of eps: mu + eps alone."""

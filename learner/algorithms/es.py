@@ -11,8 +11,8 @@ through BLAS.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 
@@ -62,6 +62,11 @@ class ES(Mirrored):
     def restore(self, values: Mapping[str, StateValue]) -> ESState:
         """Return the state from which `to_dict` made these values."""
         return ESState.from_dict(values)
+
+    def scaled(self, sigma: float) -> Self:
+        """The same search at another scale: with this initial sigma, and steps in proportion."""
+        rate = self.learning_rate_mu * (sigma / self.initial_sigma)
+        return replace(self, initial_sigma=sigma, learning_rate_mu=rate)
 
     def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
         """The next mu and Adam's memory."""

@@ -4,7 +4,8 @@ Shapes: P parameters, N pairs.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -23,6 +24,10 @@ class Mirrored(Settings):
     """First mean of every parameter."""
     initial_sigma: float = setting(1.0, above=0.0)
     """First standard deviation of every parameter."""
+
+    def scaled(self, sigma: float) -> Self:
+        """The same search at another scale: with this initial sigma, and steps in proportion."""
+        return replace(self, initial_sigma=sigma)
 
     def signs(self) -> tuple[int, ...]:
         """Rollouts of a row of eps: mu + eps and mu - eps."""

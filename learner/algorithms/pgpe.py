@@ -6,8 +6,8 @@ ranks with ClipUp (Toklu 2020) or Adam are the modern variant. Shapes: P paramet
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 import numpy as np
 
@@ -92,6 +92,17 @@ class PGPE(Settings):
             raise ConfigError(
                 f"initial-sigma is {self.initial_sigma}; expected {self.sigma_floor} (sigma-floor) or more"
             )
+
+    def scaled(self, sigma: float) -> Self:
+        """The same search at another scale: with this initial sigma, and steps and the floor in proportion.
+
+        Steps of `sgd` are in proportion to sigma themselves; those of `clipup` and `adam` are lengths.
+        """
+        share = sigma / self.initial_sigma
+        same = replace(self, initial_sigma=sigma, sigma_floor=min(self.sigma_floor, self.sigma_floor * share))
+        if self.optimiser == "sgd":
+            return same
+        return replace(same, learning_rate_mu=self.learning_rate_mu * share, max_speed=self.max_speed * share)
 
     def signs(self) -> tuple[int, ...]:
         """Rollouts of a row of eps: mu + eps and mu - eps, or mu + eps alone."""

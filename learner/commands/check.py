@@ -226,7 +226,7 @@ def _still(problem: "Problem", runner: "Runner") -> Iterator[str]:
     """Whether none of the first perturbations that a run draws changes an action of its first mean policy."""
     from farm.policies.fourier import Kernel, Projected
 
-    state, algorithm = problem.begin(), problem.config.algorithm_config
+    state, algorithm = problem.begin(), problem.config.algorithm_of()
     eps = algorithms.ask(algorithm, state, seeds.exploration(problem.config.seed, 0))[:ROWS]
     starts: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(len(eps))]
     mean = runner.rollouts(np.repeat(state.mu[None], len(eps), axis=0), starts).actions

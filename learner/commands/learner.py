@@ -60,6 +60,8 @@ def learn(
     if flags.resume_existing and path.exists():
         resumed, config = RunFolder.open(path), fitted(config)
         base = resumed.read_config()
+        if config.pilot and base.pilot and config.pilot_sigma is None:
+            config = replace(config, pilot_sigma=base.pilot_sigma)  # what its pilot found
     if resumed is not None:
         options.check_resume(base, config, resumed)
     with stop_flag("saving and ending") as stop:

@@ -152,7 +152,15 @@ def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[s
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
     base, resumed = origin(words)
     default = replace(kind(), run=base)  # type: ignore[type-var]
-    return settings.parse(kind, words, program, default), resumed, base
+    command = settings.parse(kind, words, program, default)
+    run = configs.pilot_unless(command.run, given(words))  # type: ignore[attr-defined]  # it has one, see above
+    return replace(command, run=run), resumed, base  # type: ignore[type-var]
+
+
+def given(words: Sequence[str]) -> set[str]:
+    """Names of the settings whose flags are among the words of a command, with underscores."""
+    flags = (word.partition("=")[0].removeprefix("--") for word in words if word.startswith("--"))
+    return {flag.removeprefix("no-").replace("-", "_") for flag in flags}
 
 
 def flag(name: str, value: str) -> str:

@@ -1,7 +1,7 @@
 """The configuration of a run: all settings that its numbers depend on."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -79,6 +79,11 @@ class RunConfig(Settings):
     """With --init-from: take that run's sigma as well, or start with --initial-sigma."""
     start: Literal["printed", "fitted"] = "printed"
     """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies kernel, projected)."""
+    pilot: bool = setting(None)  # filled in below
+    """Measure before the first generation how far the search explores, and scale sigma and steps to it. It is left out
+    if one of them is given."""
+    pilot_sigma: float | None = setting(None, above=0.0)
+    """The initial sigma that the pilot found; steps are in proportion. A run fills it in."""
     traces: Literal["all", "extremes", "none"] = "extremes"
     """Which traces are recorded: those of all rollouts, of the best and worst of each generation, or none."""
 
@@ -91,6 +96,7 @@ class RunConfig(Settings):
             object.__setattr__(self, name, value)
         super().__post_init__()
         self._check_interactions()
+        self._check_pilot()
         if self.episodes > 1 and not self.task_config.perturb:
             raise ConfigError(
                 f"--episodes {self.episodes} and --no-perturb exclude each other: unperturbed rollouts are all alike"
@@ -111,9 +117,15 @@ class RunConfig(Settings):
         if self.most_pairs is not None and least is not None and self.most_pairs < least:
             raise ConfigError(f"most-pairs is {self.most_pairs}; expected at least {least} (pairs)")
 
-    def algorithm_of(self, pairs: int) -> Algorithm[Any]:
-        """The algorithm with this number of pairs; 0: the number in its settings."""
+    def _check_pilot(self) -> None:
+        if (self.pilot or self.pilot_sigma is not None) and not hasattr(self.algorithm_config, "scaled"):
+            raise ConfigError(f"--pilot: algorithm {self.algorithm} has no method scaled(sigma); give --no-pilot")
+
+    def algorithm_of(self, pairs: int = 0) -> Algorithm[Any]:
+        """The algorithm as the search uses it: scaled by the pilot, and with this number of pairs (0: its own)."""
         algorithm: Any = self.algorithm_config
+        if self.pilot_sigma is not None:
+            algorithm = algorithm.scaled(self.pilot_sigma)
         return replace(algorithm, pairs=pairs) if pairs else algorithm
 
     def pairs_after(self, pairs: int, steps: int) -> int:
@@ -137,7 +149,7 @@ def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
 def _filled(config: RunConfig) -> dict[str, Any]:
     """Fill in omitted settings from the task's first preset."""
     parts = (config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)
-    if all(parts) and config.generations is not None:
+    if all(parts) and config.generations is not None and config.pilot is not None:
         return {}
     table = presets(config.task)
     preset: dict[str, Any] = dict(next(iter(table.values()), {}))
@@ -148,7 +160,26 @@ def _filled(config: RunConfig) -> dict[str, Any]:
         name = getattr(config, part) or preset.get(part) or _GENERAL[part]
         options = getattr(config, f"{part}_config")
         out |= {part: name, f"{part}_config": options or _part(kind, name, preset)}
+    if config.pilot is None:
+        out["pilot"] = bool(preset.get("pilot")) and not all(parts) and hasattr(out["algorithm_config"], "scaled")
     return out
+
+
+SCALE: Final = frozenset({"initial_sigma", "learning_rate_mu", "max_speed"})
+"""Settings of which each, given by the user, leaves out the pilot."""
+
+
+def pilot_unless(config: RunConfig, names: Collection[str]) -> RunConfig:
+    """Without a pilot, if these settings, which the user has given, say how far the search explores or steps.
+
+    Args:
+      config: with the settings.
+      names: theirs, with underscores. With `pilot` among them the pilot is as the user says.
+    """
+    scaled = hasattr(config.algorithm_config, "scaled")
+    if "pilot" in names or not config.pilot or (scaled and not SCALE.intersection(names)):
+        return config
+    return replace(config, pilot=False)
 
 
 _GENERATIONS: Final = 150
@@ -163,13 +194,13 @@ _PGPE: Final[Mapping[str, Any]] = {
 }  # fmt: skip
 
 _GENERAL: Final[Mapping[str, Any]] = {
-    **_PGPE, "policy": "direct", "features": 50, "bandwidth": 1.0,
+    **_PGPE, "policy": "direct", "features": 50, "bandwidth": 1.0, "pilot": True,
     "initial_sigma": 1.0, "learning_rate_mu": 0.5, "max_speed": 1.0,
 }  # fmt: skip
 """The settings that runs start from, if the task has no presets and observes few numbers."""
 
 _MANY: Final[Mapping[str, Any]] = {
-    **_PGPE, "policy": "linear", "normalise": True,
+    **_PGPE, "policy": "linear", "normalise": True, "pilot": True,
     "initial_sigma": 0.3, "learning_rate_mu": 0.15, "max_speed": 0.3,
 }  # fmt: skip
 """If it observes more."""
@@ -253,7 +284,10 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
         choice = changed.get(part, default)
         others = set(_fields(settings_class(kind, choice))) if part == "policy" or choice == default else set()
         values = {k: v for k, v in values.items() if k in others or k not in _fields(settings_class(kind, default))}
-    return changed_by(general, {**values, **changed}, fresh=True)
+    algorithm = changed.get("algorithm", values.get("algorithm", general.algorithm))
+    if not hasattr(settings_class("algorithms", algorithm), "scaled"):
+        values.pop("pilot", None)
+    return pilot_unless(changed_by(general, {**values, **changed}, fresh=True), changed)
 
 
 def changed_by(config: RunConfig, values: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
@@ -270,6 +304,8 @@ def changed_by(config: RunConfig, values: Mapping[str, Any], *, fresh: bool = Fa
         names |= set(_fields(settings_class(kind, name)))
         parts |= {part: name, f"{part}_config": _part(kind, name, {**before, **values})}
     run = {k: v for k, v in values.items() if k in _fields(config) and k not in names}
+    if config.pilot and not hasattr(parts["algorithm_config"], "scaled"):
+        run.setdefault("pilot", False)
     if unknown := [k for k in values if k not in names and k not in run]:
         raise ConfigError(f"unknown setting {', '.join(unknown)}")
     return replace(config, **parts, **run)
@@ -277,7 +313,9 @@ def changed_by(config: RunConfig, values: Mapping[str, Any], *, fresh: bool = Fa
 
 AT_THE_END: Final = ("generations", "average")
 """Settings that say where a run ends and with what policy: a resumed run may change them."""
-_APART: Final = {"task", "seed", "generations", "traces", "stop-when-solved", "stop-after-steps"}
+_APART: Final = frozenset(
+    ("task", "seed", "generations", "traces", "stop-when-solved", "stop-after-steps", "pilot-sigma")
+)
 
 
 def preset_of(config: RunConfig) -> str:

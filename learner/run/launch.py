@@ -39,6 +39,7 @@ from learner.run.evaluation import Evaluation
 from learner.run.folder import RunFolder
 from learner.run.judge import LocalJudge
 from learner.run.learner import Learner
+from learner.run.pilot import piloted
 from learner.run.setup import Problem, fitted, resumed, start
 from learner.run.states import RolledBack
 from learner.scheduler.dispatcher import Dispatcher, Stopped
@@ -217,7 +218,7 @@ def open_run(
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())
-        config = config if resume else fitted(config)
+        config = config if resume else piloted(fitted(config), stopped)
         if resume:
             problem, at = _resumed(folder, config, place)
         else:

@@ -142,7 +142,7 @@ class Learner:
         start = time.monotonic() - self._at.seconds
         if self.over:
             return
-        diagnosis = Diagnosis(self.config.algorithm_config)
+        diagnosis = Diagnosis(self.config.algorithm_of())
         for earlier in self.folder.progress():
             diagnosis.after(earlier, one_step=self._one_step)
         eps, all_failed = self._explore(dispatcher), 0

@@ -84,7 +84,7 @@ class Problem:
         check_vector(f"start of {self._plugins['policy'].wire}", mu, size)
         if mu is not None and self.policy.scale is not None:
             mu = mu / self.policy.scale
-        return algorithms.begin(self.config.algorithm_config, size, mu)
+        return algorithms.begin(self.config.algorithm_of(), size, mu)
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -282,7 +282,7 @@ def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> l
     entries: dict[str, Entry] = {}
     for name, values in portfolio.items():
         with described(name):
-            entry = entry_of(name, configs.changed_by(base, values))
+            entry = entry_of(name, configs.pilot_unless(configs.changed_by(base, values), values))
         entries.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
     return list(entries.values())
 
