@@ -4,16 +4,23 @@ No size of the first perturbations fits all robots: one that barely moves an arm
 sigma of a ladder, K pairs mu +- sigma e_k, e_k ~ N(0, I), are simulated from the same S starts. Their differences
 d_ks = r(mu + sigma e_k, s) - r(mu - sigma e_k, s) give
 
-    signal = std over k of mean over s of d_ks,      noise = mean over k of std over s of d_ks / sqrt(S),
+    signal = std over k of mean over s of d_ks,      noise = mean over k of std over s of d_ks / sqrt(S).
 
-and the sigma with the largest signal * signal / noise is taken: returns differ most between directions, compared with
-how much that depends on the start. The directions e_k are the same for each sigma.
+The sigma of the largest worth is taken,
+
+    worth = signal * signal^2 / (signal^2 + noise^2) * exp(-max(r_0 - r, 0) / (2 signal)),
+
+where r is the mean return at this sigma and r_0 that at the smallest one: returns differ much between directions,
+reliably, and exploring does not cost more than it tells. A sigma with which many more rollouts end early or fail than
+with the smallest is not taken: a robot that stands must not learn from its falls. The directions are the same for each
+sigma.
 
 It is simulated by this process, so that its result depends on no worker: a run has it before it exists.
 """
 
 import logging
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -38,6 +45,7 @@ STARTS: Final = 4
 """Starts that all of them share, S."""
 
 _LADDER: Final = tuple(10.0 ** (-step / 2.0) for step in range(5))  # of the largest sigma
+_MORE_LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond those at the smallest sigma
 _LARGEST: Final = 0.3  # at least, whatever the algorithm begins with
 _NORMALISING: Final = 2  # rounds in which the normaliser settles to what exploring at a sigma observes
 
@@ -56,9 +64,17 @@ class Tried:
     noise: float
 
     @property
-    def worth(self) -> float:
-        """By what sigmas are compared."""
-        return self.signal * self.signal / self.noise if self.noise > 0.0 else self.signal
+    def lost(self) -> int:
+        """Rollouts that ended early or failed."""
+        return self.ended + self.failed
+
+    def worth(self, quiet: "Tried") -> float:
+        """By what sigmas are compared; `quiet` is what the smallest one gave."""
+        if self.signal <= 0.0 or self.returned is None:
+            return 0.0
+        square = self.signal * self.signal
+        cost = 0.0 if quiet.returned is None else max(quiet.returned - self.returned, 0.0)
+        return self.signal * square / (square + self.noise * self.noise) * math.exp(-cost / (2.0 * self.signal))
 
     @property
     def line(self) -> str:
@@ -86,12 +102,20 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
             raise Interrupted("the pilot was stopped; nothing has begun")
         log.info("  %s", each.line)
         tried.append(each)
-    best = max(tried, key=lambda each: each.worth)
-    if best.worth == 0.0:
+    sigma = chosen(tried)
+    if sigma is None:
         log.info("  no sigma changes any return: the run begins as configured")
-        best = replace(best, sigma=float(getattr(config.algorithm_config, "initial_sigma")))  # noqa: B009
-    log.info("the search begins with sigma %.3g", best.sigma)
-    return replace(config, pilot_sigma=best.sigma)
+        sigma = float(getattr(config.algorithm_config, "initial_sigma"))  # noqa: B009
+    log.info("the search begins with sigma %.3g", sigma)
+    return replace(config, pilot_sigma=sigma)
+
+
+def chosen(tried: Sequence[Tried]) -> float | None:
+    """The sigma to begin with, of those tried, the largest first; None if none changes any return."""
+    quiet = tried[-1]
+    safe = [each for each in tried if each.lost <= quiet.lost + _MORE_LOST * 2 * PAIRS * STARTS]
+    best = max(safe, key=lambda each: each.worth(quiet))
+    return best.sigma if best.worth(quiet) > 0.0 else None
 
 
 def ladder(config: RunConfig) -> Iterator[Tried]:
