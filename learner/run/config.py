@@ -201,7 +201,7 @@ _GENERAL: Final[Mapping[str, Any]] = {
 
 _MANY: Final[Mapping[str, Any]] = {
     **_PGPE, "policy": "linear", "normalise": True, "pilot": True,
-    "initial_sigma": 0.3, "learning_rate_mu": 0.15, "max_speed": 0.3,
+    "initial_sigma": 0.1, "learning_rate_mu": 0.05, "max_speed": 0.1,
 }  # fmt: skip
 """If it observes more."""
 

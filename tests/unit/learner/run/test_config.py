@@ -116,7 +116,7 @@ def test_what_is_left_out_is_the_tasks_first_preset(pole: str, file: Path) -> No
 
 @pytest.mark.parametrize(
     ("observed", "policy", "normalise", "sigma"),
-    [("np.zeros((len(sim), 5))", "direct", False, 1.0), ("np.zeros((len(sim), 6))", "linear", True, 0.3),
+    [("np.zeros((len(sim), 5))", "direct", False, 1.0), ("np.zeros((len(sim), 6))", "linear", True, 0.1),
      ("1 / 0", "direct", False, 1.0), ("exit(1)", "direct", False, 1.0)],
 )  # fmt: skip
 def test_the_general_policy_depends_on_what_a_task_observes(
