@@ -7,8 +7,8 @@ a third of it, and so on, until exploring costs little:
     r_0 - r <= 3 signal,   signal = std over k of the mean over s of r(mu + sigma e_k, s) - r(mu - sigma e_k, s),
 
 where r_0 is the mean return of mu, and r that of the perturbed policies: exploring does not cost much more than
-it tells about directions. And hardly more rollouts may end early or fail than with mu: a robot that stands must not
-learn from its falls. The directions e_k are the same for each sigma.
+it tells about directions. And if mu mostly lasts, hardly more rollouts may end early or fail than with it: a robot that
+stands must not learn from its falls. The directions e_k are the same for each sigma.
 
 It is simulated by this process, so that its result depends on no worker: a run has it before it exists.
 """
@@ -42,6 +42,8 @@ _STEP: Final = 10.0**-0.5  # from one sigma to the next
 _SIGMAS: Final = 6  # that are tried at most
 _COST: Final = 3.0  # signals that exploring may cost
 _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond those of the mean
+_LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
+_MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts
 _NORMALISING: Final = 2  # rounds in which the normaliser settles to what exploring at a sigma observes
 
 
@@ -59,7 +61,7 @@ class Tried:
 
     def fits(self, mean: "Tried") -> bool:
         """Whether a search may explore so far from a mean."""
-        if self.returned is None or self.lost > mean.lost + _LOST:
+        if self.returned is None or (mean.lost < _LASTS and self.lost > mean.lost + _LOST):
             return False
         return mean.returned is None or mean.returned - self.returned <= _COST * self.signal
 
@@ -99,8 +101,8 @@ def tried(config: RunConfig) -> Iterator[Tried]:
     directions = seeds.pilot(config.seed).standard_normal((PAIRS, mu.size))
     runner = search.runner()
     try:
-        starts = _starts(config)
-        base = _summed(0.0, runner.run(mu, Jobs.mean("none", starts), "none", _normaliser(runner, config)))
+        results = runner.run(mu, Jobs.mean("none", _starts(config, _MEAN)), "none", _normaliser(runner, config))
+        base = replace(_summed(0.0, results), returned=mean(results.returns[:STARTS]))
         yield base
         for step in range(_SIGMAS):
             sigma = float(algorithm.initial_sigma) * _STEP**step
@@ -112,8 +114,8 @@ def tried(config: RunConfig) -> Iterator[Tried]:
         runner.close()
 
 
-def _starts(config: RunConfig) -> list[tuple[int, ...] | None]:
-    return [seeds.pilot_start(config.seed, i) if config.task_config.perturb else None for i in range(STARTS)]
+def _starts(config: RunConfig, count: int = STARTS) -> list[tuple[int, ...] | None]:
+    return [seeds.pilot_start(config.seed, i) if config.task_config.perturb else None for i in range(count)]
 
 
 def _normaliser(runner: Runner, config: RunConfig, seen: FloatArray | None = None) -> FloatArray:

@@ -97,6 +97,7 @@ def test_what_fits() -> None:
     assert not replace(each, returned=1.9).fits(base), "it costs more than it tells"
     assert replace(each, lost=0.35).fits(base)
     assert not replace(each, lost=0.36, signal=99.0).fits(base), "a robot that stands must not fall"
+    assert replace(each, lost=1.0).fits(replace(base, lost=0.5)), "unless it falls anyway"
     assert not replace(each, returned=None).fits(base)
     assert each.fits(replace(base, returned=None))
 
