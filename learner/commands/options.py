@@ -130,7 +130,8 @@ def check_resume(saved: RunConfig, config: RunConfig, folder: RunFolder) -> None
     if changed := list(configs.other(saved, config)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
         raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations and --average may change")
-    done = max((stats.generation for stats in folder.progress()), default=0)
+    last = folder.last_progress()
+    done = last.generation if last else 0
     if config.generations < done:
         raise ConfigError(f"--generations {config.generations}: the run has already done {done}")
 

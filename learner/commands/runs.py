@@ -111,8 +111,7 @@ def _succeeds(row: dict[str, Any]) -> str:
 def _row(folder: RunFolder) -> dict[str, Any]:
     """A run's summary; what it lacks, because the run was cut short or has not ended, is taken from the progress."""
     summary = folder.read_summary()
-    progress = folder.progress()
-    last = progress[-1] if progress else None
+    last = folder.last_progress()
     damaged = summary is None and (folder.path / "summary.json").exists()
     row = {
         "run": folder.name,

@@ -204,6 +204,14 @@ class RunFolder:
         """Every readable line of progress.jsonl, in order of generations."""
         return self._progress.read()
 
+    def progress_after(self, generation: int) -> Iterator[GenerationStats]:
+        """Lines of progress.jsonl of later generations, in order; only they are read."""
+        return self._progress.after(generation)
+
+    def last_progress(self) -> GenerationStats | None:
+        """The last readable line of progress.jsonl, None if there is none; reads the end of the file only."""
+        return self._progress.last()
+
     @property
     def parameters(self) -> ParametersFile:
         """Mu and sigma of the generations."""

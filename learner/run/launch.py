@@ -36,6 +36,7 @@ from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.evaluation import Evaluation
+from learner.run.files import with_rates
 from learner.run.folder import RunFolder
 from learner.run.judge import LocalJudge
 from learner.run.learner import Learner
@@ -386,12 +387,10 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
         path, run=learner.run, config=learner.config, serve=place.serve, drawing=Drawing.of(learner.problem),
         done=learner.state.generation if recorded else 0, folder=learner.folder.path,
     ))  # fmt: skip
-    rollouts, seconds = 0, 0.0
-    for stats in learner.folder.progress():  # the curves of what was not recorded, or was lost when the run was killed
-        rate = (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-9)
+    # The curves of what was not recorded, or was lost when the run was killed.
+    for stats, rate in with_rates(learner.folder.progress_after(recorded - 1)):
         if stats.generation > recorded:
             opened.put(Report(progress=stats, rate=rate))
-        rollouts, seconds = stats.rollouts, stats.seconds
     return opened
 
 
