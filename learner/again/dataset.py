@@ -55,6 +55,8 @@ class DataSet:
     path: Path
     episodes: int
     seed: int
+    files: tuple[Path, ...] = ()
+    """Files that the user named, as of `RunFolder`."""
 
     @property
     def manifest(self) -> Path:
@@ -64,7 +66,7 @@ class DataSet:
     @property
     def run(self) -> RunFolder:
         """Its copy of the run."""
-        return RunFolder(self.path / "run")
+        return RunFolder(self.path / "run", self.files)
 
     def begin(self, run: RunFolder) -> bool:
         """Prepare the folder for a run's data set, or find it there; return whether it is finished.

@@ -89,8 +89,8 @@ class Rewound:
         return self.again([index])[0]
 
 
-def rewind(path: str | Path, generation: int | None = None) -> Rewound:
-    """The exploring rollouts of a generation (None: the last) of the run in a folder.
+def rewind(path: str | Path, generation: int | None = None, *, allow_file: str | Path | None = None) -> Rewound:
+    """The exploring rollouts of a generation (None: the last) of the run in a folder; `allow_file` as in `farm.load`.
 
     If `ask` depends on mu and sigma only, the state before the generation is read from `parameters`. For other
     algorithms, and if that generation is not stored, the run is learnt again up to there.
@@ -107,7 +107,11 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
       assert again.rollout(worst).trajectory.value == again.returns.min()
       ```
     """
-    folder = RunFolder.open(Path(path))
+    return rewound(RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),)), generation)
+
+
+def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
+    """Like `rewind`, of an opened folder."""
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     number = last if generation is None else generation
@@ -119,9 +123,9 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
     policy = LoadedPolicy(seeing(problem, normaliser), number - 1, state.mu)
     jobs = explored(config, state, pairs_of(folder, number))[1]
     theta, seeds = jobs.theta(state.mu), jobs.seeds()
-    rewound = Rewound(policy, normaliser, number, theta, seeds, policy.runner.rollouts(theta, seeds))
-    _compare(folder, rewound)
-    return rewound
+    again = Rewound(policy, normaliser, number, theta, seeds, policy.runner.rollouts(theta, seeds))
+    _compare(folder, again)
+    return again
 
 
 def under(folder: RunFolder, rewound: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401

@@ -98,7 +98,7 @@ def stored(folder: RunFolder) -> Stored:
     """
     at = checkpoints.load(folder.checkpoint)
     last, config = int(at.state["generation"]), folder.read_config()
-    for name, old, new in configs.other(configs.from_dict(at.config, str(folder.checkpoint)), config):
+    for name, old, new in configs.other(folder.config_of(at), config):
         raise Differs(f"{folder.path}: generation 1 differs: --{name} is {new} in config.json, and {old} in checkpoint")
     problem = restored(folder, at)
     if at.code.get("simulation") != problem.code["simulation"]:

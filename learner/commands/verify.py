@@ -27,6 +27,7 @@ from farm.settings import setting
 from learner.again.receipt import continued, digest_of, sealed
 from learner.again.stored import Differs, Stored, stored
 from learner.again.verify import chosen, verify_all, verify_some, workers
+from learner.commands.allowed import AllowedFiles
 from learner.run import checkpoint as checkpoints
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
@@ -35,7 +36,7 @@ from learner.scheduler.dispatcher import Stopped
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyCommand(Link):
+class VerifyCommand(AllowedFiles, Link):
     """Repeats a run, and compares its numbers to the last bit; exit status 1 if one differs.
 
     By default some of its generations, from the stored parameters before them; --all: the whole run.
@@ -78,7 +79,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(VerifyCommand, words, "farm verify")
     logs.set_up("WARNING")
-    folder, bundle = RunFolder.open(command.run), command.bundle
+    folder, bundle = RunFolder.open(command.run, command.allow_file), command.bundle
     if bundle is not None and command.receipt is not None:
         signed(bundle.folder, b"")  # says now what would fail at the end
     receipt: dict[str, Any] = {

@@ -212,7 +212,7 @@ def open_run(
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Run]:
     """Open all parts of a run, in an order that leaves nothing behind if one fails."""
-    folder = RunFolder(path)
+    folder = RunFolder(path, configs.class_files(config))
     keys.checked("run", folder.name)
     if place.record or place.serve:
         check_rerun()
