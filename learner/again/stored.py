@@ -23,11 +23,8 @@ from learner.run.setup import Problem
 
 log = logging.getLogger(__name__)
 
-EVALUATED: Final = (
-    "mean_policy_return", "mean_policy_success", "robust_return", "robust_success_rate", "mean_policy_measures",
-    "robust_measures",
-)  # fmt: skip
-"""Results in summary.json of the evaluation at a run's end."""
+_OF_EVALUATION: Final = ("mean_policy_", "robust_")
+"""How the names of those results in summary.json begin that are of the evaluation at a run's end."""
 
 
 class Differs(RunError):  # noqa: N818  the answer to a question
@@ -79,7 +76,7 @@ class Stored:
     def not_compared(self, *, evaluated: bool) -> list[str]:
         """Fields of summary.json that nothing was compared with; `evaluated`: the run's evaluation was repeated."""
         table = self.summary or {}
-        results = [name for name in EVALUATED if evaluated or table.get(name) is None]
+        results = [name for name in evaluated_in(table) if evaluated or table[name] is None]
         return [name for name in table if name not in self.facts and name not in results]
 
     @property
@@ -87,6 +84,11 @@ class Stored:
         """Of the final parameters, as in summary.json."""
         numbers = b"".join(np.asarray(self.at.state[name]).astype("<f8").tobytes() for name in ("mu", "sigma"))
         return hashlib.sha256(numbers).hexdigest()
+
+
+def evaluated_in(summary: Mapping[str, Any]) -> list[str]:
+    """Names of the results of the evaluation at a run's end."""
+    return [name for name in summary if name.startswith(_OF_EVALUATION)]
 
 
 def stored(folder: RunFolder) -> Stored:

@@ -18,7 +18,7 @@ from farm import fingerprint
 from farm.arrays import FloatArray
 from farm.net.work import Jobs, Simulated
 from learner.again.rewind import LearntAgain, Simulate, from_row, kept, pairs_of
-from learner.again.stored import EVALUATED, Differs, Stored, agree, agree_bits
+from learner.again.stored import Differs, Stored, agree, agree_bits, evaluated_in
 from learner.run import hash_chain
 from learner.run.evaluation import outcome
 from learner.run.launch import Placement, connected, dispatch, open_run
@@ -141,9 +141,9 @@ def verify_all(
 def _agree_results(run: Stored, again: Mapping[str, Any]) -> None:
     """Compare the results of the evaluation; a run that did not reach its end has none."""
     table = run.summary or {}
-    for name in EVALUATED:
-        value = table.get(name)
-        if value != again.get(name) and (value is not None or (name in table and table.get("state") == "finished")):
+    for name in evaluated_in(table):
+        value = table[name]
+        if value != again.get(name) and (value is not None or table.get("state") == "finished"):
             raise Differs(
                 f"{run.folder.path}: {name} is {value!r} in summary.json, and {again.get(name)!r} when it is repeated"
             )
