@@ -20,7 +20,7 @@ from farm.processes import cores
 from farm.seeds import SEEDS
 from farm.settings import setting
 from learner import parquet
-from learner.again.dataset import DataSet, difference, read
+from learner.again.dataset import MOST_EPISODES, DataSet, difference, read
 from learner.commands.allowed import AllowedFiles
 from learner.run.folder import RunFolder
 from learner.run.launch import MOST_WORKERS, Placement
@@ -40,7 +40,7 @@ class DatasetCommand(AllowedFiles, Link):
     """Make the data set of this manifest.json again, and compare the bytes."""
     out: Path | None = None
     """Folder of the data set; needed."""
-    episodes: int | None = setting(None, least=1, most=10_000_000)
+    episodes: int | None = setting(None, least=1, most=MOST_EPISODES)
     """Number of episodes; 1000 by default."""
     seed: int | None = setting(None, least=0, most=SEEDS - 1)
     """Seed of the starts; 1 by default, as farm evaluate has 0."""
