@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from farm import settings as arguments
 from farm.commands.logs import Formatter
 from farm.errors import ConfigError, FarmError, printable
+from farm.processes import default_signals_in_forks, leave_nothing
 from farm.settings import Settings
 from workers.config import WorkerConfig
 from workers.worker import work
@@ -31,9 +32,10 @@ class Process(Settings):
 
 
 def main(words: Sequence[str]) -> int:
-    """Serve until SIGTERM, Ctrl-C, or the end of the parent; exit status."""
+    """Serve until SIGTERM, SIGHUP, Ctrl-C, or the end of the parent; exit status."""
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    default_signals_in_forks()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
     try:
         process = arguments.parse(Process, words, "python -m workers")
@@ -64,4 +66,6 @@ def _watch_parent(stop: threading.Event) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    ended = main(sys.argv[1:])
+    leave_nothing()
+    sys.exit(ended)

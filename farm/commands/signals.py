@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a flag that long work checks."""
+"""Ctrl-C, SIGTERM and SIGHUP as a flag that long work checks."""
 
 import logging
 import signal
@@ -10,17 +10,19 @@ from typing import Final
 log = logging.getLogger(__name__)
 
 INTERRUPTED: Final = 130
-"""Exit status after Ctrl-C or SIGTERM, as of a shell."""
+"""Exit status after Ctrl-C, SIGTERM or SIGHUP, as of a shell after Ctrl-C."""
 
 
 @contextmanager
 def stop_flag(doing: str = "ending", *, at_once: bool = False) -> Iterator[threading.Event]:
-    """Set by the first Ctrl-C or SIGTERM, with a message; a second Ctrl-C ends the program at once.
+    """Set by the first Ctrl-C, SIGTERM or SIGHUP, with a message; a second Ctrl-C ends the program at once.
 
     With `at_once` the first one also raises KeyboardInterrupt: for work in this thread that looks at no flag.
     """
     flag = threading.Event()
-    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+    names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:  # as by nohup
+        del names[signal.SIGHUP]
 
     def handle(number: int, _: object) -> None:
         if flag.is_set() and number == signal.SIGINT:

@@ -24,6 +24,7 @@ from farm.net.rates import Rates
 from farm.net.sockets import raise_descriptors, silence
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LARGEST, RECEIVE, client_settings, router_settings
+from farm.processes import begin_zenoh
 
 log = logging.getLogger(__name__)
 
@@ -308,6 +309,7 @@ def _why(endpoints: tuple[str, ...], bundle: Bundle | None, error: Exception) ->
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:
+    begin_zenoh()
     raise_descriptors()
     config = zenoh.Config()
     for key, value in settings.items():

@@ -286,7 +286,17 @@ def dispatch(
     join = None if place.workers else how_to_join(place, problem)
     spec, judge = problem.specification(name), stack.enter_context(closing(LocalJudge(problem)))
     dispatcher = Dispatcher(
-        link, place.farm, spec, generations, join, tend, admission, problem.shapes(steps=steps), place.scheduler, judge
+        link,
+        place.farm,
+        spec,
+        generations,
+        join,
+        tend,
+        admission,
+        problem.shapes(steps=steps),
+        place.scheduler,
+        judge,
+        tend.end,
     )
     if place.workers:
         flags = [*_worker_flags(place, problem), "--backend", place.backend, "--log-level", "WARNING"]
@@ -300,6 +310,11 @@ class _Tending:
     def __init__(self, stopped: Callable[[], bool]) -> None:
         self._stopped, self._next = stopped, 0.0
         self.pool: LocalWorkers | None = None
+
+    def end(self, worker: str) -> bool:
+        """End the process of a local worker, which is then replaced; false if it is none of them."""
+        digits = worker.rpartition("/")[2].partition("-")[0]  # as `Worker` names itself
+        return self.pool is not None and digits.isdecimal() and self.pool.kill(int(digits))
 
     def __call__(self) -> bool:
         if self.pool and time.monotonic() > self._next:
