@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from farm import plugins
-from farm.errors import RunError
+from farm.net.forks import zenoh_ran
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +27,6 @@ _RESTARTS: Final = 20  # a worker that keeps dying is not restarted forever
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """Environment of a worker: the cores are divided among processes."""
 
-
-_with_zenoh: set[int] = set()  # processes in which Zenoh has run: this one, and those that it was forked from
 
 _QUOTA: Final = Path("/sys/fs/cgroup/cpu.max")
 
@@ -58,27 +56,13 @@ def forks(count: int) -> "Iterator[list[Forked]]":
 
 def _forks(count: int) -> "list[Forked]":
     threads = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0  # noqa: PTH208
-    if not count or threads != 1 or _with_zenoh:
+    if not count or threads != 1 or zenoh_ran():
         return []
     gc.collect()
     with suppress(AttributeError):  # of the GNU C library: what is free now would be copied when forks use it
         ctypes.CDLL(None).malloc_trim(0)
     gc.freeze()  # a collection in a fork would copy what it shares
     return [Forked() for _ in range(count)]
-
-
-def begin_zenoh() -> None:
-    """Note that Zenoh runs in this process from now on.
-
-    Raises:
-      RunError: it ran in a process that this one was forked from: its threads are not here, and it would wait for them.
-    """
-    if _with_zenoh - {os.getpid()}:
-        raise RunError(
-            "this process was forked from one that has used a farm, and a fork lacks its threads: start it as a new "
-            'process (multiprocessing.get_context("spawn"), subprocess), or use the farm in the child only'
-        )
-    _with_zenoh.add(os.getpid())
 
 
 def default_signals_in_forks() -> None:

@@ -20,11 +20,11 @@ import zenoh
 from farm.errors import ConfigError, FarmError, Interrupted
 from farm.net import probe
 from farm.net.events import Event, Events
+from farm.net.forks import begin_zenoh
 from farm.net.rates import Rates
 from farm.net.sockets import raise_descriptors, silence
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LARGEST, RECEIVE, client_settings, router_settings
-from farm.processes import begin_zenoh
 
 log = logging.getLogger(__name__)
 

@@ -107,7 +107,6 @@ with forks(2) as waiting, LocalWorkers(1, NOBODY, waiting) as pool:
 FORKING = """
 child = os.fork()
 if not child:
-    os.setpgid(0, int(os.environ["GROUP"])) if "GROUP" in os.environ else None
     print(*(signal.getsignal(each) == default for each, default in (
         (signal.SIGTERM, signal.SIG_DFL), (signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler),
         (signal.SIGUSR1, signal.SIG_IGN))), flush=True)
@@ -166,7 +165,7 @@ print(pid, child)
 def test_a_program_that_has_used_zenoh_forks_no_workers_and_its_forks_use_none() -> None:
     output = ran("""
 from farm.errors import RunError
-from farm.processes import begin_zenoh
+from farm.net.forks import begin_zenoh
 begin_zenoh()
 with forks(2) as waiting:
     print(waiting, flush=True)
