@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm import __version__
-from farm.errors import ConfigError, FarmError, Interrupted, RunError, printable
+from farm.errors import ConfigError, FarmError, Interrupted, RunError, described, printable, short_of_memory
 from farm.processes import ONE_THREAD, default_signals_in_forks
 
 if TYPE_CHECKING:
@@ -92,9 +92,12 @@ def _ended(error: BaseException) -> int:
         frames = (
             plugins.author_frames(error).format() if plugins else []
         )  # of a task of the user's own, whose lines help
-        if not frames and not isinstance(error, OSError):
+        short = short_of_memory(error)
+        if not frames and not short and not isinstance(error, OSError):
             raise error
-        reason = _system(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        reason = _system(error) if isinstance(error, OSError) else described(error)
+        if short:
+            reason = short if isinstance(error, MemoryError) else f"{reason}; {short}"
         traced = printable("".join(frames), kept="\n")
         text, status = f"{traced}farm: {printable(reason)}\n", 1
     with suppress(OSError):

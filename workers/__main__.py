@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from farm import settings as arguments
 from farm.commands.logs import Formatter
-from farm.errors import ConfigError, FarmError, printable
+from farm.errors import ConfigError, FarmError, described, printable, short_of_memory
 from farm.processes import default_signals_in_forks, leave_nothing
 from farm.settings import Settings
 from workers.config import WorkerConfig
@@ -52,7 +52,10 @@ def main(words: Sequence[str]) -> int:
         if not stop.is_set():
             sys.stderr.write(printable(f"farm worker: {error}") + "\n")
             return 1
-    except Exception:
+    except Exception as error:
+        if short := short_of_memory(error):
+            sys.stderr.write(printable(f"farm worker: {described(error)}; {short}") + "\n")
+            return 1
         logging.exception("this worker failed")
         return BROKEN
     return 0

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm.commands.logs import Formatter
-from farm.errors import ConfigError, NameTakenError, RunError
+from farm.errors import ConfigError, NameTakenError, RunError, check_addresses
 from farm.net import keys, session
 from farm.net.session import Session, free_endpoint
 from farm.net.telemetry import Report, RunEnd
@@ -214,6 +214,7 @@ def open_run(
     """Open all parts of a run, in an order that leaves nothing behind if one fails."""
     folder = RunFolder(path, configs.class_files(config))
     keys.checked("run", folder.name)
+    check_addresses(2 << 30, "learning")
     if place.record or place.serve:
         check_rerun()
     with ExitStack() as stack:
@@ -410,6 +411,7 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
 
 
 def check_rerun() -> None:
-    """Check that rerun-sdk, an extra that workers do not need, is installed; else a ConfigError."""
+    """Check that rerun-sdk, an extra that workers do not need, is installed and can run; else a ConfigError."""
+    check_addresses(4 << 30, "recording", ", and --no-record needs 2 GiB")
     if importlib.util.find_spec("rerun") is None:
         raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or record nothing: --no-record")
