@@ -8,6 +8,7 @@ without an attack, median of turns; the learner's largest memory; whether the ru
 """
 
 import argparse
+import itertools
 import json
 import os
 import secrets
@@ -30,9 +31,10 @@ from farm.commands import certificates
 from farm.net import codec, keys
 from farm.net.messages import WorkRequest
 from farm.net.session import Session, connect, free_endpoint
-from farm.net.tls import find
+from farm.net.tls import Role, find
 
 HERE: Final = Path(__file__).resolve()
+_THREADS: Final = 16
 _HUGE: Final = 60_000_000  # [bytes]
 
 
@@ -89,6 +91,54 @@ def _connections(_: Session, endpoint: str) -> None:
             silent.pop(0).close()
 
 
+def _asking(ask: Callable[[], object]) -> None:
+    """Ask from several threads, each again when it has its answer."""
+    for _ in range(_THREADS - 1):
+        threading.Thread(target=_ask_for_ever, args=(ask,), daemon=True).start()
+    _ask_for_ever(ask)
+
+
+def _ask_for_ever(ask: Callable[[], object]) -> None:
+    """Thread: helper."""
+    while True:
+        ask()
+
+
+def _queries(session: Session, _: str) -> None:
+    """A worker's certificate: queries for the specification, 16 at a time."""
+    _asking(lambda: session.ask(keys.spec("farm", "run"), 1.0))
+
+
+def _histories(session: Session, _: str) -> None:
+    """A viewer's certificate: queries for all reports, 16 at a time."""
+    _asking(lambda: session.ask(f"{keys.history('farm', 'run')}?from=1", 1.0))
+
+
+def _statuses(session: Session, _: str) -> None:
+    """A viewer's certificate: queries for the status, 16 at a time."""
+    _asking(lambda: session.ask(keys.status("farm", "run"), 1.0))
+
+
+def _token_queries(session: Session, _: str) -> None:
+    """A viewer's certificate: queries for liveliness tokens, 16 at a time."""
+    _asking(lambda: session.tokens(keys.learner_token("farm", "*"), 1.0))
+
+
+def _subscriptions(session: Session, _: str) -> None:
+    """A viewer's certificate: as many subscriptions as the link takes."""
+    for number in itertools.count():
+        session.subscribe("report", keys.report("farm", f"run-{number}"))
+
+
+def _tokens(session: Session, _: str) -> None:
+    """A worker's certificate: as many liveliness tokens as the link takes."""
+    for number in itertools.count():
+        session.token(keys.worker_token("farm", f"liar/{number}"))
+
+
+VIEWERS: Final = ("histories", "statuses", "token-queries", "subscriptions")
+"""Attacks with a viewer's certificate."""
+
 ATTACKS: Final[dict[str, Callable[[Session, str], None]]] = {
     "requests": _requests,
     "large-requests": _large_requests,
@@ -97,6 +147,12 @@ ATTACKS: Final[dict[str, Callable[[Session, str], None]]] = {
     "some-results": _some_results,
     "instances": _instances,
     "connections": _connections,
+    "queries": _queries,
+    "histories": _histories,
+    "statuses": _statuses,
+    "token-queries": _token_queries,
+    "subscriptions": _subscriptions,
+    "tokens": _tokens,
 }
 
 
@@ -111,8 +167,11 @@ def _want(worker: str) -> bytes:
 
 def _attack(kind: str, endpoint: str, certs: Path) -> None:
     """Attack until standard input ends."""
+    role: Role = "viewer" if kind in VIEWERS else "worker"
     threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0))).start()
-    with connect((endpoint,), 20.0, lambda: False, find(certs, "worker", "liar")) as session:
+    with connect(
+        (endpoint,), 20.0, lambda: False, find(certs, role, "looker" if role == "viewer" else "liar")
+    ) as session:
         ATTACKS[kind](session, endpoint)
 
 
@@ -156,7 +215,8 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         certs = Path(folder, "certs")
-        certificates.main(["new", str(certs), "--learner", "127.0.0.1", "--worker", "honest", "--worker", "liar"])
+        words = ["--worker", "honest", "--worker", "liar", "--viewer", "looker"]
+        certificates.main(["new", str(certs), "--learner", "127.0.0.1", *words])
         print("| attack | time of a generation | learner MB | same hash |\n|---|---|---|---|")
         for kind in arguments.attacks.split(","):
             turns = [(_run(None, certs, arguments.generations), _run(kind, certs, arguments.generations))

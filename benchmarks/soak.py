@@ -2,9 +2,10 @@
 
     python benchmarks/soak.py [--minutes 60] [--every 3]
 
-While a learner runs, a worker is killed or a new one joins every few seconds (there are always one to four). Then the
-same number of generations is learnt again without disturbance. The hashes must agree, and memory must not have grown,
-except for the rollouts that a learner keeps for recorders that join late. Otherwise the exit status is 1.
+While a learner runs and records, a worker is killed or a new one joins every few seconds (there are always one to
+four). Then the same number of generations is learnt again without disturbance. The hashes must agree, and neither the
+learner's threads nor its memory must have grown, except for the rollouts that it keeps for recorders that join late.
+Otherwise the exit status is 1.
 """
 
 import argparse
@@ -78,40 +79,49 @@ def main() -> None:
     arguments = parser.parse_args()
     config = RunConfig(generations=1_000_000)
     with tempfile.TemporaryDirectory() as folder:
-        soaked, crowd, learner = _soak(config, Path(folder) / "soaked", arguments.minutes * 60, arguments.every)
+        path, seconds = Path(folder) / "soaked", arguments.minutes * 60
+        soaked, crowd, learner, threads = _soak(config, path, seconds, arguments.every)
         calm = replace(config, generations=soaked["generations"])
         place = Placement(workers=2, listen=free_endpoint(), record=False)
         with open_run(calm, Path(folder) / "calm", place) as run:
             for _ in run.learn():
                 pass
-    print("| minutes | generations | rollouts | killed | joined | reissued | learner MB | worker MB | same hash |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("| minutes | generations | rollouts | killed | joined | reissued | learner MB | threads | worker MB | same |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     print(
         f"| {arguments.minutes:g} | {soaked['generations']} | {soaked['rollouts']} | {crowd.killed} | {crowd.joined} "
-        f"| {soaked['reissued']} | {_from_to(learner)} | {_from_to(crowd.megabytes)} "
+        f"| {soaked['reissued']} | {_from_to(learner)} | {_from_to(threads)} | {_from_to(crowd.megabytes)} "
         f"| {'yes' if soaked['parameters_sha256'] == run.summary['parameters_sha256'] else 'NO'} |"
     )
     if soaked["parameters_sha256"] != run.summary["parameters_sha256"]:
         sys.exit("the results differ from those without disturbance")
     if not _flat(learner, history.MEMORY / 1e6) or not _flat(crowd.megabytes):
         sys.exit("memory grows")
+    if not _flat(threads):
+        sys.exit("threads are left behind")
 
 
-def _soak(config: RunConfig, path: Path, seconds: float, every: float) -> tuple[dict[str, Any], Crowd, list[float]]:
-    until, learner = time.monotonic() + seconds, []
-    place = Placement(listen=free_endpoint(), record=False)
+def _soak(
+    config: RunConfig, path: Path, seconds: float, every: float
+) -> tuple[dict[str, Any], Crowd, list[float], list[float]]:
+    """The summary, the workers, and the learner's memory [MB] and threads over time."""
+    until = time.monotonic() + seconds
+    learner: list[float] = []
+    threads: list[float] = []
+    place = Placement(listen=free_endpoint())
     with open_run(config, path, place, stopped=lambda: time.monotonic() > until) as run:
         crowd = Crowd(place.listen, every)
         try:
             for report in run.learn():
                 if (generation := report.progress.generation) % 20 == 0:
                     learner.append(_megabytes(os.getpid()))
+                    threads.append(len([*Path("/proc/self/task").iterdir()]))
                 if generation % 100 == 0:
                     left = (until - time.monotonic()) / 60
                     print(f"generation {generation}, killed {crowd.killed}, {left:.1f} min left", file=sys.stderr)
         finally:
             crowd.close()
-    return run.summary, crowd, learner
+    return run.summary, crowd, learner, threads
 
 
 def _megabytes(pid: int) -> float:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm import __version__
-from farm.errors import ConfigError, FarmError, Interrupted, RunError, printable
-from farm.processes import ONE_THREAD
+from farm.errors import ConfigError, FarmError, Interrupted, RunError, described, printable, short_of_memory
+from farm.processes import ONE_THREAD, default_signals_in_forks
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -27,6 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if standalone:
             _signals(signal.SIG_DFL)  # during imports there is nothing to save or to stop yet
             _streams()
+            default_signals_in_forks()
         status = _run(list(sys.argv[1:] if arguments is None else arguments), standalone=standalone)
         sys.stdout.flush()
     except (KeyboardInterrupt, SystemExit, Exception) as error:
@@ -50,13 +51,13 @@ def _run(words: Sequence[str], *, standalone: bool) -> int:
 
     command = plugins.find("commands", name).target
     if standalone:
-        _signals(signal.default_int_handler)  # unless a command decides otherwise, SIGTERM acts like Ctrl-C
+        _signals(signal.default_int_handler)  # unless a command decides otherwise, SIGTERM and SIGHUP act like Ctrl-C
     return int(command(words[1:]))
 
 
 def _signals(handler: "Callable[[int, FrameType | None], Any] | signal.Handlers") -> None:
-    """Handle Ctrl-C and SIGTERM; signals that this process was told to ignore (as by nohup) stay ignored."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    """Handle Ctrl-C, SIGTERM and SIGHUP; signals that this process was told to ignore (as by nohup) stay ignored."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
 
@@ -91,9 +92,12 @@ def _ended(error: BaseException) -> int:
         frames = (
             plugins.author_frames(error).format() if plugins else []
         )  # of a task of the user's own, whose lines help
-        if not frames and not isinstance(error, OSError):
+        short = short_of_memory(error)
+        if not frames and not short and not isinstance(error, OSError):
             raise error
-        reason = _system(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        reason = _system(error) if isinstance(error, OSError) else described(error)
+        if short:
+            reason = short if isinstance(error, MemoryError) else f"{reason}; {short}"
         traced = printable("".join(frames), kept="\n")
         text, status = f"{traced}farm: {printable(reason)}\n", 1
     with suppress(OSError):

@@ -10,11 +10,13 @@ FarmError                 anything that can be explained in one line
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
 _LINE: Final = 500  # characters
+_ADDRESSES: Final = "ulimit -v unlimited; systemd's MemoryMax or a container limits memory itself"
 
 
 def brief(text: str) -> str:
@@ -32,6 +34,50 @@ def printable(text: str, kept: str = "") -> str:
         letter if letter.isprintable() or letter in kept else letter.encode("unicode_escape").decode()
         for letter in text
     )
+
+
+def described(error: BaseException) -> str:
+    """The type of an error and its text, which may be none, or one that cannot be made."""
+    try:
+        text = str(error)
+    except BaseException as another:
+        text = f"its text cannot be made: {type(another).__name__}"
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def short_of_memory(error: BaseException) -> str:
+    """What to do about an error that a low limit of memory causes; nothing if it is another one."""
+    threads = isinstance(error, RuntimeError) and "can't start new thread" in str(error)
+    library = isinstance(error, ImportError) and "failed to map segment" in str(error)
+    system = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    if not (threads or library or system or isinstance(error, MemoryError)):
+        return ""
+    limit = address_limit()
+    if limit is None:
+        return "there is not enough memory"
+    return f"ulimit -v {limit >> 10} leaves too few addresses: {_ADDRESSES}"
+
+
+def address_limit() -> int | None:
+    """This process's limit of addresses, `ulimit -v` [bytes]; None without one."""
+    try:
+        import resource
+    except ImportError:  # not everywhere
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def check_addresses(least: int, what: str, remedy: str = "") -> None:
+    """Check that this process may use so many addresses [bytes]: some libraries end the program if it may not.
+
+    Raises:
+      ConfigError: it may not.
+    """
+    limit = address_limit()
+    if limit is not None and limit < least:
+        text = f"ulimit -v {limit >> 10} is too low for {what}, which reserves {least >> 30} GiB of addresses"
+        raise ConfigError(f"{text}: {_ADDRESSES}{remedy}")
 
 
 class FarmError(Exception):

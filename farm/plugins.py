@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import importlib.util
 import re
+import signal
 import stat
 import sys
 import traceback
@@ -21,7 +22,7 @@ from itertools import dropwhile
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
-from farm.errors import ConfigError, TaskError, UnservedError
+from farm.errors import ConfigError, TaskError, UnservedError, described
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -179,7 +180,7 @@ def _from_package(kind: str, name: str, variant: str) -> Plugin:
                 target = point.load()
             except Exception as error:  # whatever an import may raise
                 raise ConfigError(
-                    f"{_one(kind)} {name!r} of {_release(point)} cannot be imported: {type(error).__name__}: {error}"
+                    f"{_one(kind)} {name!r} of {_release(point)} cannot be imported: {described(error)}"
                 ) from error
             return Plugin(kind, f"{name}:{variant}" if variant else name, target, variant, _release(point))
     listing = ", ".join(names(kind))
@@ -221,18 +222,30 @@ def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes
 
 
 def no_exit(call: Callable[P, T]) -> Callable[P, T]:
-    """Let a sys.exit in a plug-in's code be an error of this function: it must not end a program of the farm."""
+    """Let what a plug-in's code raises be an error of this function, also sys.exit and others that end programs."""
 
     @wraps(call)
     def guarded(*values: P.args, **keywords: P.kwargs) -> T:
         try:
             return call(*values, **keywords)
-        except SystemExit as error:
+        except BaseException as error:
+            usual = isinstance(error, Exception) and not isinstance(error, StopIteration)  # which generators change
+            if usual or (isinstance(error, KeyboardInterrupt) and _of_signal(error)):
+                raise
             last = author_frames(error)[-1:]
             where = "".join(f" in {Path(each.filename).name}, line {each.lineno}" for each in last)
-            raise TaskError(f"sys.exit({error.code!r}){where}: raise an error instead") from error
+            what = f"sys.exit({error.code!r})" if isinstance(error, SystemExit) else described(error)
+            raise TaskError(f"{what}{where}: raise an error instead") from error
 
     return guarded
+
+
+def _of_signal(error: KeyboardInterrupt) -> bool:
+    """Whether Ctrl-C has raised it, as far as one can know: not if this process has another handler of Ctrl-C."""
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        return True
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and Path(frames[-1].filename).name == "signals.py"
 
 
 def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
@@ -255,8 +268,10 @@ def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
     sys.modules[name] = module  # dataclasses look for their annotations there
     try:
         exec(compile(source, str(path), "exec"), vars(module))
-    except (Exception, SystemExit) as error:  # whatever the file may raise
+    except BaseException as error:  # whatever the file may raise
         del sys.modules[name]
+        if isinstance(error, KeyboardInterrupt) and _of_signal(error):
+            raise
         raise ConfigError(f"{path} cannot be imported: {_where(error, path)}") from error
     return module
 
@@ -266,7 +281,7 @@ def _where(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
     lines = [each.lineno for each in traceback.extract_tb(error.__traceback__) if each.filename == str(path)]
-    return (f"line {lines[-1]}: " if lines else "") + f"{type(error).__name__}: {error}"
+    return (f"line {lines[-1]}: " if lines else "") + described(error)
 
 
 def author_frames(error: BaseException) -> traceback.StackSummary:

@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from farm import plugins
+from farm.net.forks import zenoh_ran
 
 log = logging.getLogger(__name__)
 
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _GRACE: Final = 1.5  # [s] for a worker to leave before it is killed
 _RESTARTS: Final = 20  # a worker that keeps dying is not restarted forever
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
@@ -53,7 +55,8 @@ def forks(count: int) -> "Iterator[list[Forked]]":
 
 
 def _forks(count: int) -> "list[Forked]":
-    if not count or sys.platform != "linux" or len(os.listdir("/proc/self/task")) > 1:  # noqa: PTH208
+    threads = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0  # noqa: PTH208
+    if not count or threads != 1 or zenoh_ran():
         return []
     gc.collect()
     with suppress(AttributeError):  # of the GNU C library: what is free now would be copied when forks use it
@@ -62,18 +65,29 @@ def _forks(count: int) -> "list[Forked]":
     return [Forked() for _ in range(count)]
 
 
+def default_signals_in_forks() -> None:
+    """Let processes that a task forks from this one end at signals as others do, not as this one's handlers do."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_default_signals)
+
+
+def _default_signals() -> None:
+    for number in _SIGNALS:
+        if callable(signal.getsignal(number)):  # those that are ignored, as by nohup, stay so
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
 class Forked:
     """A process forked from this one; the part of `subprocess.Popen` that its owner needs."""
 
     def __init__(self) -> None:
         """Start it, in a session of its own; its standard input closes when this process ends."""
         source, sink = os.pipe()
-        both = (signal.SIGINT, signal.SIGTERM)  # the child must not handle them as this process does
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, both)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # the child must not handle them as this process
         self.pid = os.fork()
         if not self.pid:
             os.dup2(source, 0)
-            for number in both:
+            for number in _SIGNALS:
                 signal.signal(number, signal.SIG_DFL)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             _become_worker()
@@ -131,9 +145,24 @@ def _become_worker() -> NoReturn:
     except BaseException:
         traceback.print_exc()
         status = 1
+    leave_nothing()
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
+
+
+def end_group(leader: int) -> None:
+    """End what is left of the group of a process that has ended or is to end: what its task has started."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(leader, signal.SIGKILL)
+
+
+def leave_nothing() -> None:
+    """Ask the other processes of this one's group to end, if it is the leader: what a task has started in it."""
+    if os.getpgid(0) == os.getpid():
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(0, signal.SIGTERM)
 
 
 def end(processes: "Sequence[subprocess.Popen[Any] | Forked]", grace: float) -> None:
@@ -147,6 +176,7 @@ def end(processes: "Sequence[subprocess.Popen[Any] | Forked]", grace: float) -> 
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+        end_group(process.pid)
 
 
 class LocalWorkers:
@@ -184,6 +214,13 @@ class LocalWorkers:
         """Process ids of the running workers."""
         return [process.pid for process in self._processes if process.poll() is None]
 
+    def kill(self, pid: int) -> bool:
+        """End the worker with this id and what its task has started; false if there is none."""
+        if pid not in self.pids:
+            return False
+        end_group(pid)
+        return True
+
     def tend(self) -> list[int]:
         """Replace workers that died; exit statuses of those that will not be replaced."""
         given_up = []
@@ -191,6 +228,8 @@ class LocalWorkers:
             status = process.poll()
             if status is None:
                 continue
+            if process.pid not in self._missed:
+                end_group(process.pid)
             if status in (0, 1, 2) or self._restarts >= _RESTARTS:
                 given_up.append(status)  # it ended by itself with a message, or keeps dying
                 if process.pid not in self._missed:

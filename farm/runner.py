@@ -9,7 +9,7 @@ import numpy as np
 
 from farm import plugins, settings
 from farm.arrays import AnyArray, FloatArray, IntArray
-from farm.errors import ConfigError, FarmError, UnservedError, brief
+from farm.errors import ConfigError, FarmError, UnservedError, brief, described
 from farm.moments import usable
 from farm.net.messages import Spec
 from farm.net.work import NOT_NORMALISED, Jobs, Simulated, rows_with_trace
@@ -165,7 +165,7 @@ class Runner:
 def told(error: Exception) -> dict[str, Any]:
     """Fields `error` and `traceback` of a message about an error in a task's or a policy's code."""
     lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)
-    text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
+    text = str(error) if isinstance(error, FarmError) else described(error)
     return {"error": brief(text), "traceback": lines}
 
 

@@ -28,6 +28,7 @@ else:
 _NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+(None|'')\)")
 _OR_NONE: Final = re.compile(r"\{None\}\|(\S+)|\{None,(\S+)")
 _FRAME: Final = "│╭╮╰╯─ \n"
+_JSON: Final = 64 << 20  # [bytes] of a file that is read as a whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +196,8 @@ def read_json(path: Path, version: int | None = None, kinds: Mapping[str, type] 
       ConfigError: it cannot be read, is not JSON, of another version, or lacks an entry.
     """
     try:
+        if (size := path.stat().st_size) > _JSON:
+            raise ConfigError(f"{path} has {size >> 20} MiB; at most {_JSON >> 20} are read")
         values = json.loads(path.read_text("utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import __version__, fingerprint, plugins, seeds, settings
+from farm import __version__, archives, fingerprint, plugins, seeds, settings
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, writing
 from farm.runner import build_policy, build_task, draw_constants
@@ -196,9 +196,8 @@ def _write(path: Path, golden: dict[str, AnyArray], origin: dict[str, Any]) -> N
 
 
 def _read(path: Path) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+    arrays = archives.arrays(path, "file of golden rollouts (remove it, and update)")
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
         return arrays, dict(json.loads(str(arrays.pop(_MADE))))
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path} holds no golden rollouts ({type(error).__name__}): remove it, and update") from None

@@ -7,6 +7,7 @@ with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
 """
 
 import logging
+import os
 import secrets
 import threading
 import weakref
@@ -135,6 +136,7 @@ class Farm:
         )  # fmt: skip
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
         self._holder: int | None = None  # the thread of the current call
+        self._process = os.getpid()
         with ExitStack() as stack:
             session = stack.enter_context(connected(self._place, self._problem, self._closed.is_set))
             admission = Admission(numbers or fingerprint.digest())
@@ -143,7 +145,7 @@ class Farm:
                 stack, session, self._place, self._problem, name, admission, 0, self._closed.is_set
             )
             # Also for a program that ends, or drops this object, without closing it.
-            self._finish = weakref.finalize(self, _finish, stack.pop_all(), self._closed)
+            self._finish = weakref.finalize(self, _finish, stack.pop_all(), self._closed, self._process)
 
     @property
     def size(self) -> int:
@@ -250,7 +252,9 @@ class Farm:
         return trajectory
 
     def close(self) -> None:
-        """Stop the local workers; a waiting call raises RunError. Closing twice is allowed."""
+        """Stop the local workers; a waiting call raises RunError. Closing twice is allowed; a fork closes nothing."""
+        if self._process != os.getpid():
+            return
         self._closed.set()
         within_imap = self._holder == threading.get_ident()  # an unfinished imap of this thread
         if not within_imap:
@@ -274,6 +278,8 @@ class Farm:
         Raises:
           RunError: this thread has an unfinished imap, for which it would wait forever; or the pool is closed.
         """
+        if self._process != os.getpid():
+            raise RunError("this farm.Farm was opened before this process was forked: open one in a new process")
         if self._holder == threading.get_ident():
             raise RunError(
                 "an imap of this thread has not ended: take its last pair, or close() it, before another call"
@@ -342,6 +348,7 @@ class Farm:
         return [streams.trial(0, int(word)) for word in words]
 
 
-def _finish(parts: ExitStack, closed: threading.Event) -> None:
+def _finish(parts: ExitStack, closed: threading.Event, process: int) -> None:
     closed.set()
-    parts.close()
+    if process == os.getpid():  # a fork must not end its parent's workers
+        parts.close()

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from farm import settings as arguments
 from farm.commands.logs import Formatter
-from farm.errors import ConfigError, FarmError, printable
+from farm.errors import ConfigError, FarmError, described, printable, short_of_memory
+from farm.processes import default_signals_in_forks, leave_nothing
 from farm.settings import Settings
 from workers.config import WorkerConfig
 from workers.worker import work
@@ -31,9 +32,10 @@ class Process(Settings):
 
 
 def main(words: Sequence[str]) -> int:
-    """Serve until SIGTERM, Ctrl-C, or the end of the parent; exit status."""
+    """Serve until SIGTERM, SIGHUP, Ctrl-C, or the end of the parent; exit status."""
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    default_signals_in_forks()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
     try:
         process = arguments.parse(Process, words, "python -m workers")
@@ -50,7 +52,10 @@ def main(words: Sequence[str]) -> int:
         if not stop.is_set():
             sys.stderr.write(printable(f"farm worker: {error}") + "\n")
             return 1
-    except Exception:
+    except Exception as error:
+        if short := short_of_memory(error):
+            sys.stderr.write(printable(f"farm worker: {described(error)}; {short}") + "\n")
+            return 1
         logging.exception("this worker failed")
         return BROKEN
     return 0
@@ -64,4 +69,6 @@ def _watch_parent(stop: threading.Event) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    ended = main(sys.argv[1:])
+    leave_nothing()
+    sys.exit(ended)

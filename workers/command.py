@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from farm import settings as arguments
 from farm.commands import logs
 from farm.commands.signals import stop_flag
-from farm.errors import ConfigError, FarmError
+from farm.errors import ConfigError, FarmError, check_addresses
 from farm.processes import LocalWorkers, cores, forks
 from farm.settings import Settings, setting
 from workers.config import WorkerConfig
@@ -28,6 +28,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
+    check_addresses(2 << 30, "a worker")
     processes = command.processes or cores()
     may_fork = command.worker.backend == "cpu"  # devices want processes of their own
     with (

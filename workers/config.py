@@ -35,7 +35,8 @@ class WorkerConfig(Joining):
             object.__setattr__(self, "name", bundle.name)
         if not self.name:
             host = socket.gethostname().split(".")[0]
-            object.__setattr__(self, "name", "".join(c if c.isascii() and c.isalnum() else "-" for c in host) or "host")
+            letters = "".join(c if c.isascii() and c.isalnum() else "-" for c in host)
+            object.__setattr__(self, "name", letters.strip("-") or "host")
         keys.checked("worker", self.name)
         make_backend(self.backend)
         if self.accept_code and self.tls is None:

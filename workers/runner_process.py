@@ -17,7 +17,7 @@ from typing import Final
 
 from farm import plugins
 from farm.arrays import FloatArray, array
-from farm.errors import FarmError, MessageError, UnservedError, brief
+from farm.errors import FarmError, MessageError, UnservedError, brief, described
 from farm.net import codec
 from farm.net.codec import M
 from farm.net.messages import Spec
@@ -128,7 +128,7 @@ def serve(link: socket.socket) -> None:
 
 
 def _failed(error: Exception, files: tuple[str, ...], *, built: bool = True) -> Answer:
-    text = str(error) if isinstance(error, FarmError) else f"{type(error).__name__}: {error}"
+    text = str(error) if isinstance(error, FarmError) else described(error)
     if isinstance(plugins.root(error), FileNotFoundError):
         text += "; files beside a class do not travel, but those that its xml names do"
     text, lines = _named((text, plugins.author_traceback(error)), files)

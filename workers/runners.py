@@ -6,7 +6,7 @@ from collections import OrderedDict
 from typing import Final, TypeAlias
 
 from farm import plugins
-from farm.errors import FarmError
+from farm.errors import FarmError, described
 from farm.net import codec, keys
 from farm.net.messages import Spec
 from farm.net.notices import Notices
@@ -55,7 +55,11 @@ class Runners:
                 log.info("serving run %s", header.run)
             except Exception as error:  # says something about this machine, and nothing about the jobs
                 defect = error if is_defect(error) else None
-                self._notices.once(f"cannot serve run {header.run}: {error}", level=logging.ERROR, error=defect)
+                self._notices.once(
+                    f"cannot serve run {header.run}: {error if isinstance(error, FarmError) else described(error)}",
+                    level=logging.ERROR,
+                    error=defect,
+                )
                 self._built[header.spec] = error
             self._let_go()
         self._built.move_to_end(header.spec)

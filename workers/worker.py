@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from farm import __version__, fingerprint
-from farm.errors import MessageError, UnservedError
+from farm.errors import MessageError, UnservedError, described
 from farm.net import codec, keys
 from farm.net.events import Event
 from farm.net.messages import Refusal, WorkRequest
@@ -187,7 +187,7 @@ class Worker:
             self.runners.unserved(header, error)
             self._fail(chunk, None, error)
         except Exception as error:  # other workers may succeed: the learner decides
-            text = f"a chunk of run {chunk.run} failed ({type(error).__name__}: {error}); trying its jobs one by one"
+            text = f"a chunk of run {chunk.run} failed ({described(error)}); trying its jobs one by one"
             if is_defect(error):
                 self._notices.once(text, level=logging.ERROR, error=error)
             else:

@@ -22,17 +22,19 @@ from typing import Final
 
 from farm.errors import ConfigError, MessageError
 
-_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,100}")  # only dots would be a parent folder
+_NAME: Final = re.compile(r"(?!\.+$)(?!-)[A-Za-z0-9_.-]{1,100}")  # only dots: a parent folder; a dash first: a flag
 
 
 def checked(kind: str, name: str) -> str:
     """Return the name if it can be one part of a key.
 
     Raises:
-      ConfigError: it has characters other than letters, digits, `_`, `.` and `-`.
+      ConfigError: it has characters other than letters, digits, `_`, `.` and `-`, or begins with `-`.
     """
     if not _NAME.fullmatch(name):
-        raise ConfigError(f"{kind} {name!r} is not a name; expected 1 to 100 letters, digits, '_', '.' or '-'")
+        raise ConfigError(
+            f"{kind} {name!r} is not a name; expected 1 to 100 letters, digits, '_', '.' or '-', no '-' first"
+        )
     return name
 
 

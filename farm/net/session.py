@@ -20,6 +20,7 @@ import zenoh
 from farm.errors import ConfigError, FarmError, Interrupted
 from farm.net import probe
 from farm.net.events import Event, Events
+from farm.net.forks import begin_zenoh
 from farm.net.rates import Rates
 from farm.net.sockets import raise_descriptors, silence
 from farm.net.tls import Bundle
@@ -308,6 +309,7 @@ def _why(endpoints: tuple[str, ...], bundle: Bundle | None, error: Exception) ->
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:
+    begin_zenoh()
     raise_descriptors()
     config = zenoh.Config()
     for key, value in settings.items():

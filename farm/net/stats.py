@@ -1,7 +1,8 @@
 """Statistics of a finished generation: one line of progress.jsonl. Pure data."""
 
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, Final, cast, get_origin
+from functools import cache
+from typing import Any, Final, get_origin
 
 VERSION: Final = 2
 """Version of a line of progress.jsonl."""
@@ -65,16 +66,25 @@ class GenerationStats:
         version = values.get("version") if isinstance(values, dict) else None
         if type(version) is not int or version != VERSION:
             raise ValueError(f"not a line of progress.jsonl, version {VERSION}: {str(values)[:80]}")
-        present = [f for f in fields(cls) if f.name in values]
-        missing = [f.name for f in fields(cls) if f not in present and f.default_factory is MISSING]
+        types = _types(cls)
+        missing = [name for name, (_, needed) in types.items() if needed and name not in values]
         if missing:
             raise ValueError(f"progress line without {', '.join(missing)}")
-        for f in present:
-            if not isinstance(values[f.name], dict if get_origin(f.type) is dict else cast("type", f.type)):
-                raise ValueError(f"progress line whose {f.name} is {str(values[f.name])[:40]!r}")
-        arguments: dict[str, Any] = {f.name: values[f.name] for f in present}
+        arguments: dict[str, Any] = {name: values[name] for name in types if name in values}
+        for name, value in arguments.items():
+            if not isinstance(value, types[name][0]):
+                raise ValueError(f"progress line whose {name} is {str(value)[:40]!r}")
         stats = cls(**arguments)
         for each in (*stats.measures.values(), *stats.mean_policy_measures.values()):
             if not isinstance(each, int | float | None):
                 raise ValueError(f"progress line with a measure that is {str(each)[:40]!r}")
         return stats
+
+
+@cache
+def _types(kind: type) -> dict[str, tuple[Any, bool]]:
+    """The type of each field, and whether it must be there; cached, as a run has many lines."""
+    return {
+        each.name: (dict if get_origin(each.type) is dict else each.type, each.default_factory is MISSING)
+        for each in fields(kind)
+    }

@@ -1,13 +1,16 @@
 """Messages from learners to observers: a run's state and its reports. Pure data like `farm.net.messages`."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from farm.net.messages import check_assets, check_counts
 from farm.net.stats import GenerationStats
 from farm.sim.trajectory import Trajectory
+
+STATISTICS: Final = 600
+"""Size of a report without rollouts, traces and lines [bytes], approximately."""
 
 
 def _check_plain(values: Any) -> None:  # noqa: ANN401
@@ -107,8 +110,9 @@ class Report:
 
     @property
     def nbytes(self) -> int:
-        """Size of rollouts and traces [bytes]."""
-        return sum(each.nbytes for each in (self.sample, self.replay, *self.traces.values()) if each is not None)
+        """Size [bytes]: of rollouts and traces, and about that of the rest."""
+        parts = (self.sample, self.replay, *self.traces.values())
+        return STATISTICS + sum(each.nbytes for each in parts if each is not None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,6 +46,8 @@ PART: Final = 16 << 20
 _MOST: Final = 1000  # episodes of a part
 _REPEATED: Final = 50  # of so many episodes of other machines this one repeats one
 _VERSION: Final = 1
+MOST_EPISODES: Final = 10_000_000
+"""Of a data set."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class DataSet:
     path: Path
     episodes: int
     seed: int
+    files: tuple[Path, ...] = ()
+    """Files that the user named, as of `RunFolder`."""
 
     @property
     def manifest(self) -> Path:
@@ -64,7 +68,7 @@ class DataSet:
     @property
     def run(self) -> RunFolder:
         """Its copy of the run."""
-        return RunFolder(self.path / "run")
+        return RunFolder(self.path / "run", self.files)
 
     def begin(self, run: RunFolder) -> bool:
         """Prepare the folder for a run's data set, or find it there; return whether it is finished.
@@ -141,7 +145,7 @@ class Work:
         size = int(np.prod(steps_shape(problem.spec))) * 4
         self._each = max(1, min(_MOST, PART // size))
         self.parts = -(-of.episodes // self._each)
-        state = read(self.file) if self.file.exists() else {"done": [], "expelled": {}}
+        state = _unfinished(self.file)
         self.done: list[dict[str, Any]] = state["done"]
         """For each finished part its numbers' digest, its control steps, and the hosts that simulated it"""
         self.expelled: dict[str, str] = state["expelled"]
@@ -238,11 +242,33 @@ def _wire(kind: str, name: str) -> str:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A JSON table in a file; a ConfigError if there is none."""
-    table = read_json(path)
-    if not isinstance(table, dict) or table.get("version", _VERSION) != _VERSION:
-        raise ConfigError(f"{path} is damaged, or of another version: expected what farm dataset writes")
+    """The contents of a manifest.json; a ConfigError if it is none, or an entry is impossible."""
+    table: dict[str, Any] = read_json(path, _VERSION)
+    for name, most in (("episodes", MOST_EPISODES), ("seed", seeds.SEEDS - 1)):
+        value, least = table.get(name), int(name == "episodes")
+        if type(value) is not int or not least <= value <= most:
+            raise ConfigError(f"{path}: {name} is {str(value)[:40]!r}; expected a whole number from {least} to {most}")
+    texts = ("numbers_sha256", "pyarrow") if "files" in table else ("pyarrow",)
+    if damaged := [name for name in texts if type(table.get(name)) is not str]:
+        raise ConfigError(f"{path}: {damaged[0]} is {str(table.get(damaged[0]))[:40]!r}; expected a text")
+    if not isinstance(table.get("files", {}), dict):
+        raise ConfigError(f"{path}: files is {str(table['files'])[:40]!r}; expected a table of digests by path")
     return table
+
+
+def _unfinished(path: Path) -> dict[str, Any]:
+    """The contents of an unfinished.json; a ConfigError if it is none."""
+    if not path.exists():
+        return {"done": [], "expelled": {}}
+    table = read_json(path)
+    kinds = {"numbers": str, "frames": int, "hosts": list}
+    sound = isinstance(table, dict) and type(table.get("done")) is list and type(table.get("expelled")) is dict
+    if not sound or not all(
+        isinstance(part, dict) and all(type(part.get(name)) is kind for name, kind in kinds.items())
+        for part in table["done"]
+    ):
+        raise ConfigError(f"{path} is damaged: choose another --out, or remove the folder")
+    return dict(table)
 
 
 def difference(old: Path, new: Path) -> str:

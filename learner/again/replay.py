@@ -83,8 +83,16 @@ class LoadedPolicy:
         return [Replay(self.runner.trajectory(batch, i), whole(batch, i), batch.at(slice(i, i + 1))) for i in rows]
 
 
-def load(path: str | Path, generation: int | None = None, **changed: Any) -> LoadedPolicy:  # noqa: ANN401
+def load(
+    path: str | Path,
+    generation: int | None = None,
+    *,
+    allow_file: str | Path | None = None,
+    **changed: Any,  # noqa: ANN401
+) -> LoadedPolicy:
     """The mean policy of the run in a folder, after a generation (None: the last), with other settings of its task.
+
+    `allow_file` is a file with the class of a run that somebody else made.
 
     Raises:
       ConfigError: it is not stored, or cannot be simulated like that.
@@ -99,7 +107,7 @@ def load(path: str | Path, generation: int | None = None, **changed: Any) -> Loa
       assert trajectory.bodies.shape[2] == 7  # (F, bodies, 7): position [m] and quaternion
       ```
     """
-    folder = RunFolder.open(Path(path))
+    folder = RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),))
     config = folder.read_config()
     try:
         task = replace(config.task_config, **changed)

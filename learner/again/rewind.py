@@ -6,12 +6,13 @@ again = farm.rewind("runs/first", 12)
 print(again.returns, again.rollout(again.worst(1)[0]).trajectory.success)
 """
 
+import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.moments import merged, normaliser_of
+from farm.net.work import Jobs, Simulated
 from farm.tasks.rollouts import Rollouts, Seed
 from learner import algorithms
 from learner.again.replay import LoadedPolicy, Replay, restored, seeing
@@ -26,9 +28,11 @@ from learner.algorithms import SearchState
 from learner.run import checkpoint as checkpoints
 from learner.run.checkpoint import Checkpoint
 from learner.run.evaluation import statistics
+from learner.run.files import NONE
 from learner.run.folder import RunFolder
 from learner.run.learner import explored, learnt_from
 from learner.run.setup import Problem, start
+from learner.scheduler.round import RoundResults
 
 log = logging.getLogger(__name__)
 
@@ -85,8 +89,8 @@ class Rewound:
         return self.again([index])[0]
 
 
-def rewind(path: str | Path, generation: int | None = None) -> Rewound:
-    """The exploring rollouts of a generation (None: the last) of the run in a folder.
+def rewind(path: str | Path, generation: int | None = None, *, allow_file: str | Path | None = None) -> Rewound:
+    """The exploring rollouts of a generation (None: the last) of the run in a folder; `allow_file` as in `farm.load`.
 
     If `ask` depends on mu and sigma only, the state before the generation is read from `parameters`. For other
     algorithms, and if that generation is not stored, the run is learnt again up to there.
@@ -103,7 +107,11 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
       assert again.rollout(worst).trajectory.value == again.returns.min()
       ```
     """
-    folder = RunFolder.open(Path(path))
+    return rewound(RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),)), generation)
+
+
+def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
+    """Like `rewind`, of an opened folder."""
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     number = last if generation is None else generation
@@ -115,9 +123,9 @@ def rewind(path: str | Path, generation: int | None = None) -> Rewound:
     policy = LoadedPolicy(seeing(problem, normaliser), number - 1, state.mu)
     jobs = explored(config, state, pairs_of(folder, number))[1]
     theta, seeds = jobs.theta(state.mu), jobs.seeds()
-    rewound = Rewound(policy, normaliser, number, theta, seeds, policy.runner.rollouts(theta, seeds))
-    _compare(folder, rewound)
-    return rewound
+    again = Rewound(policy, normaliser, number, theta, seeds, policy.runner.rollouts(theta, seeds))
+    _compare(folder, again)
+    return again
 
 
 def under(folder: RunFolder, rewound: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
@@ -128,18 +136,37 @@ def under(folder: RunFolder, rewound: Rewound, task: Any) -> LoadedPolicy:  # no
 
 def before(folder: RunFolder, at: Checkpoint, problem: Problem, generation: int) -> tuple[SearchState, FloatArray]:
     """The algorithm's state before a generation was drawn, and the normaliser of its observations."""
-    config, done = folder.read_config(), generation - 1
-    algorithm: Any = config.algorithm_config
+    if generation in kept(folder, at, problem):
+        rows = folder.parameters.rows() if generation > 1 else []
+        return from_row(problem, at, next((row for row in rows if row["generation"] == generation - 1), None))
+    again = LearntAgain(folder, problem)
+    if generation > 1:
+        message = "the state of %s before generation %d is not stored: learning the run again up to there"
+        log.warning(message, folder.read_config().algorithm, generation)
+    with closing(problem.runner()) as runner:
+        while again.state.generation < generation - 1:
+            again.step(lambda mu, jobs, normaliser: runner.run(mu, jobs, "none", normaliser))
+    return again.state, again.normaliser
+
+
+def from_row(problem: Problem, at: Checkpoint, row: Any) -> tuple[SearchState, FloatArray]:  # noqa: ANN401
+    """The same after the generation of a row of `parameters`; None is the beginning."""
     fresh = problem.begin()
-    if done == 0 and config.init_from is None:
+    if row is None:
         return fresh, normaliser_of(np.zeros_like(at.moments))
-    if done and _draws_alike(algorithm, fresh, algorithm.restore(at.state)):
-        rows = folder.parameters.rows()
-        if done in rows["generation"]:
-            mu, normaliser = folder.parameters.mean(done)
-            sigma = rows["sigma"][rows["generation"] == done][0]
-            return replace(fresh, mu=mu, sigma=sigma, generation=done), normaliser
-    return _learn_again(folder, problem, done)
+    state = replace(fresh, mu=row["mu"], sigma=row["sigma"], generation=int(row["generation"]))
+    return state, row["normaliser"] if "normaliser" in row.dtype.names else NONE
+
+
+def kept(folder: RunFolder, at: Checkpoint, problem: Problem) -> list[int]:
+    """Generations whose state before them is stored, in order."""
+    config, last = folder.read_config(), int(at.state["generation"])
+    generations = [1] if last and config.init_from is None else []
+    algorithm: Any = config.algorithm_config
+    if last and _draws_alike(algorithm, problem.begin(), algorithm.restore(at.state)):
+        rows = folder.parameters.rows()["generation"] if folder.parameters.path.exists() else np.empty(0, int)
+        generations += (rows[rows < last] + 1).tolist()
+    return generations
 
 
 def pairs_of(folder: RunFolder, generation: int) -> int:
@@ -147,7 +174,8 @@ def pairs_of(folder: RunFolder, generation: int) -> int:
     config = folder.read_config()
     if config.interactions is None:
         return 0
-    rollouts = {line.generation: line.rollouts for line in folder.progress()} | {0: 0}
+    lines = itertools.takewhile(lambda line: line.generation <= generation, folder.progress_after(generation - 2))
+    rollouts = {line.generation: line.rollouts for line in lines} | {0: 0}
     pairs, least = 0, config.algorithm_config.pairs  # type: ignore[attr-defined]
     if {generation - 1, generation} <= rollouts.keys():
         each = config.episodes * len(config.algorithm_config.signs())
@@ -165,25 +193,40 @@ def _draws_alike(algorithm: Any, fresh: SearchState, last: SearchState) -> bool:
     return with_all.tobytes() == without.tobytes()
 
 
-def _learn_again(folder: RunFolder, problem: Problem, until: int) -> tuple[SearchState, FloatArray]:
-    """Learn the run again in this process up to this update: slow, but works for any algorithm, with the same bits."""
-    config = folder.read_config()
-    algorithm: Any = config.algorithm_config
-    first = start(config, folder.name, problem.task.sources)[1]
-    state, moments = algorithm.restore(first.state), first.moments
-    pairs = 0
-    if until:
-        message = "the state of %s before generation %d is not stored: learning the run again up to there"
-        log.warning(message, config.algorithm, until + 1)
-    with closing(problem.runner()) as runner:
-        while state.generation < until:
-            eps, jobs = explored(config, state, pairs)
-            results = runner.run(state.mu, jobs, "none", np.stack([normaliser_of(moments)] * 2))
-            returns = learnt_from(config, problem.task, results.returns, results.steps)
-            state = algorithms.tell(config.algorithm_of(pairs), state, eps, returns)
-            moments = merged(moments, results.moments)
-            pairs = config.pairs_after(pairs, int(results.steps.sum()))
-    return state, normaliser_of(moments)
+Simulate: TypeAlias = Callable[[FloatArray, Jobs, FloatArray], Simulated | RoundResults]
+"""Results of jobs around a mean (P,), with a RoundHeader's normaliser."""
+
+
+class LearntAgain:
+    """A run that is learnt again from its start by generations: slow, but for any algorithm, with the same bits."""
+
+    def __init__(self, folder: RunFolder, problem: Problem) -> None:
+        """Begin before its first generation."""
+        self._problem, self._config = problem, folder.read_config()
+        first = start(self._config, folder.name, problem.task.sources)[1]
+        algorithm: Any = self._config.algorithm_config
+        self.state: SearchState = algorithm.restore(first.state)
+        """The algorithm's state so far."""
+        self._moments, self._pairs = first.moments, 0
+
+    @property
+    def normaliser(self) -> FloatArray:
+        """The normaliser of the next generation's observations, (2, d) or (2, 0)."""
+        return normaliser_of(self._moments)
+
+    def step(self, simulate: Simulate) -> Simulated | RoundResults:
+        """Learn one generation; return the results of its exploring rollouts, and last the mean policy's."""
+        config, state = self._config, self.state
+        eps, exploring = explored(config, state, self._pairs)
+        jobs = Jobs.joined([exploring, Jobs.mean("none", [None])])
+        results = simulate(state.mu, jobs, np.stack([self.normaliser] * 2))
+        rows = slice(len(results.returns) - 1)
+        returns, steps = results.returns[rows], results.steps[rows]
+        learnt = learnt_from(config, self._problem.task, returns, steps)
+        self.state = algorithms.tell(config.algorithm_of(self._pairs), state, eps, learnt)
+        self._moments = merged(self._moments, results.moments[rows])
+        self._pairs = config.pairs_after(self._pairs, int(steps.sum()))
+        return results
 
 
 def _compare(folder: RunFolder, rewound: Rewound) -> None:

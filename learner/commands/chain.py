@@ -17,8 +17,9 @@ from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError
 from farm.seeds import SEEDS
-from farm.settings import Settings, setting
+from farm.settings import setting
 from learner.commands import recordings
+from learner.commands.allowed import AllowedFiles
 from learner.run.folder import RunFolder
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChainCommand(Settings):
+class ChainCommand(AllowedFiles):
     """Runs learnt policies in turn, each from where the previous one ended, and counts their cycles."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -59,7 +60,7 @@ def main(words: Sequence[str]) -> int:
     from learner.again.replay import loaded
 
     logs.set_up("WARNING")
-    policies = [loaded(RunFolder.open(path)) for path in command.runs]
+    policies = [loaded(RunFolder.open(path, command.allow_file)) for path in command.runs]
     check(policies)
     check_lengths(policies, command)
     if command.video is not None:

@@ -12,16 +12,16 @@ from farm.commands.logs import say
 from farm.commands.screen import figure
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
-from farm.settings import Settings
 from learner.again.replay import loaded
 from learner.commands import recordings, view
+from learner.commands.allowed import AllowedFiles
 from learner.run.config import RunConfig, flat, preset_of
 from learner.run.folder import RunFolder
 from learner.run.launch import check_rerun
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareCommand(Settings):
+class CompareCommand(AllowedFiles):
     """Puts several runs into one recording: their curves together, final policies side by side, a table."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -43,7 +43,7 @@ def main(words: Sequence[str]) -> int:
     if not 2 <= len(command.runs) <= len(PALETTE):
         raise ConfigError(f"farm compare takes 2 to {len(PALETTE)} runs, not {len(command.runs)}")
     recordings.target(command.to)
-    folders = [RunFolder.open(path) for path in command.runs]
+    folders = [RunFolder.open(path, command.allow_file) for path in command.runs]
     runs = read(folders)
     sides = []
     for folder, run in zip(folders, runs, strict=True):

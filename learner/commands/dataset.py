@@ -20,14 +20,15 @@ from farm.processes import cores
 from farm.seeds import SEEDS
 from farm.settings import setting
 from learner import parquet
-from learner.again.dataset import DataSet, difference, read
+from learner.again.dataset import MOST_EPISODES, DataSet, difference, read
+from learner.commands.allowed import AllowedFiles
 from learner.run.folder import RunFolder
 from learner.run.launch import MOST_WORKERS, Placement
 from learner.scheduler.dispatcher import Stopped
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetCommand(Link):
+class DatasetCommand(AllowedFiles, Link):
     """Writes episodes of a learnt policy as a data set in LeRobot's format; see docs/files.md.
 
     An interrupted command continues when it is repeated.
@@ -39,7 +40,7 @@ class DatasetCommand(Link):
     """Make the data set of this manifest.json again, and compare the bytes."""
     out: Path | None = None
     """Folder of the data set; needed."""
-    episodes: int | None = setting(None, least=1, most=10_000_000)
+    episodes: int | None = setting(None, least=1, most=MOST_EPISODES)
     """Number of episodes; 1000 by default."""
     seed: int | None = setting(None, least=0, most=SEEDS - 1)
     """Seed of the starts; 1 by default, as farm evaluate has 0."""
@@ -77,12 +78,15 @@ def main(words: Sequence[str]) -> int:
     assert command.out is not None
     if command.manifest is not None:
         of = read(command.manifest)
-        data, run = DataSet(command.out, of["episodes"], of["seed"]), command.manifest.parent / "run"
+        data, run = (
+            DataSet(command.out, of["episodes"], of["seed"], command.allow_file),
+            command.manifest.parent / "run",
+        )
     else:
         assert command.run is not None
         seed = 1 if command.seed is None else command.seed
-        data, run = DataSet(command.out, command.episodes or 1000, seed), command.run
-    if data.begin(RunFolder.open(run)):
+        data, run = DataSet(command.out, command.episodes or 1000, seed, command.allow_file), command.run
+    if data.begin(RunFolder.open(run, data.files)):
         say(f"{command.out} is complete")
     elif not _make(data, command.place):
         return INTERRUPTED

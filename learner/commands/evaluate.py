@@ -17,18 +17,19 @@ from farm.commands.logs import say
 from farm.commands.screen import figure, plain
 from farm.net.work import Simulated
 from farm.seeds import SEEDS, trial
-from farm.settings import Settings, setting
+from farm.settings import setting
 from farm.sim.mixed import names
 from farm.tasks.base import TaskSpec
 from farm.tasks.rollouts import drawn
 from learner.again.replay import loaded
+from learner.commands.allowed import AllowedFiles
 from learner.run.config import MOST_GENERATIONS
 from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs, failures, statistics
 from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateCommand(Settings):
+class EvaluateCommand(AllowedFiles):
     """Tests the learnt mean policy on perturbed starts and conditions drawn by its task."""
 
     run: tyro.conf.Positional[Path]
@@ -46,7 +47,7 @@ class EvaluateCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(EvaluateCommand, words, "farm evaluate")
-    figures = evaluate(RunFolder.open(command.run), command.rollouts, command.seed, command.average)
+    figures = evaluate(RunFolder.open(command.run, command.allow_file), command.rollouts, command.seed, command.average)
     if command.json:
         say(json.dumps(figures, indent=2))
         return 0

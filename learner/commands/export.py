@@ -10,15 +10,16 @@ import tyro
 from farm import settings as arguments
 from farm.commands.logs import say
 from farm.errors import ConfigError, printable
-from farm.settings import Settings, setting
+from farm.settings import setting
 from learner.again.replay import loaded
+from learner.commands.allowed import AllowedFiles
 from learner.export import interface, npz, onnx
 from learner.run.config import MOST_GENERATIONS
 from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportCommand(Settings):
+class ExportCommand(AllowedFiles):
     """Writes a learnt policy to a file, for MuJoCo and numpy or as an ONNX model; see docs/export.md."""
 
     run: tyro.conf.Positional[Path]
@@ -43,17 +44,17 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = arguments.parse(ExportCommand, words, "farm export")
     if command.to is None:
-        for line in listed(command.run, command.generation):
+        for line in listed(command.run, command.generation, command.allow_file):
             say(printable(line))
         return 0
-    policy = loaded(RunFolder.open(command.run), command.generation)
+    policy = loaded(RunFolder.open(command.run, command.allow_file), command.generation)
     (onnx if command.to.suffix == ".onnx" else npz).write(command.to, policy)
     size = command.to.stat().st_size
     say(f"mean policy after generation {policy.generation} written to {command.to}, {size >> 10} KiB")
     return 0
 
 
-def listed(path: Path, generation: int | None = None) -> list[str]:
+def listed(path: Path, generation: int | None = None, files: tuple[Path, ...] = ()) -> list[str]:
     """What an exported file says, or the export of a run would say.
 
     Raises:
@@ -67,5 +68,5 @@ def listed(path: Path, generation: int | None = None) -> list[str]:
             raise ConfigError(f"{path} has one generation: give its run for another")
         of, more = (onnx.listed if path.suffix == ".onnx" else interface.of_npz)(path)
     else:
-        of, more = interface.of_run(loaded(RunFolder.open(path), generation)), []
+        of, more = interface.of_run(loaded(RunFolder.open(path, files), generation)), []
     return [*interface.lines(path, of), *more]

@@ -58,7 +58,7 @@ def learn(
         raise ConfigError("--name is for a new run; a resumed one keeps its name")
     path = flags.out / options.run_name(flags, config) if resumed is None else resumed.path
     if flags.resume_existing and path.exists():
-        resumed, config = RunFolder.open(path), fitted(config)
+        resumed, config = RunFolder.open(path, flags.allow_file), fitted(config)
         base = resumed.read_config()
         if config.pilot and base.pilot and config.pilot_sigma is None:
             config = replace(config, pilot_sigma=base.pilot_sigma)  # what its pilot found

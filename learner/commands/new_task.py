@@ -1,9 +1,11 @@
 """`farm new-task`: writes a task of your own to start from."""
 
+import keyword
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import Final
 
 import tyro
 
@@ -14,6 +16,8 @@ from farm.settings import Settings
 
 TEMPLATE = "task_template.py.txt"
 """The template, in this package; `Pendulum` is replaced by the name."""
+
+_USED: Final = ("Task",)  # of the template
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +31,11 @@ class NewTaskCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     name = settings.parse(NewTaskCommand, words, "farm new-task").name.replace("-", "_")
-    if not (name.isidentifier() and name.isascii()):
-        raise ConfigError(f"{name!r} is no name of a task; expected letters, digits and _, a letter first")
     path, inside = Path(f"{name}.py"), "".join(part.capitalize() for part in name.split("_"))
+    if not (name.isidentifier() and name.isascii()) or not inside.isidentifier():
+        raise ConfigError(f"{name!r} is no name of a task; expected letters, digits and _, a letter first")
+    if keyword.iskeyword(inside) or inside in _USED:
+        raise ConfigError(f"{name!r} is no name of a task: a class cannot be called {inside}")
     text = (files("learner.commands") / TEMPLATE).read_text("utf-8").replace("Pendulum", inside)
     if path.exists():
         raise ConfigError(f"{path} exists and is not overwritten: take another name")

@@ -14,6 +14,7 @@ from farm.link import Listening
 from farm.net import keys
 from farm.net.zenoh_settings import is_port
 from farm.settings import setting
+from learner.commands.allowed import AllowedFiles, allowed, values_of
 from learner.commands.display import Style
 from learner.run import config as configs
 from learner.run.config import RunConfig
@@ -23,7 +24,7 @@ _NUMBERS: Final = re.compile("[0-9a-f]{8,64}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnerOptions(Listening):
+class LearnerOptions(AllowedFiles, Listening):
     """Where a run starts from, where it is saved, and its network addresses."""
 
     preset: str | None = None
@@ -103,26 +104,21 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     names = {part: _value(words, f"--{part}") for part in configs.PARTS}
     parts = {part: plugins.find(configs.PARTS[part], name).name for part, name in names.items() if name is not None}
     flags = [f"--{name}" for name, value in sources.items() if value is not None]
+    files = allowed(words)
     if len(flags) > 1:
         raise ConfigError(f"{' and '.join(flags)} exclude each other: each defines where to start from")
     if sources["resume"] is not None:
-        folder = RunFolder.open(Path(sources["resume"]))
+        folder = RunFolder.open(Path(sources["resume"]), files)
         return folder.read_config(), folder
     if sources["config"] is not None:
-        return configs.changed_by(configs.read(Path(sources["config"])), parts), None
+        return configs.changed_by(configs.read(Path(sources["config"]), files), parts), None
     base = configs.configure(parts.pop("task", RunConfig.task), sources["preset"])
     return configs.changed_by(base, parts), None
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
-    """The last value given for a flag, in either form; a missing one is left to the parser."""
-    value = None
-    for i, word in enumerate(words):
-        if word == flag and i + 1 < len(words):
-            value = words[i + 1]
-        elif word.startswith(flag + "="):
-            value = word.partition("=")[2]
-    return value
+    """The last value given for a flag; a missing one is left to the parser."""
+    return ([None, *values_of(words, flag)])[-1]
 
 
 def check_resume(saved: RunConfig, config: RunConfig, folder: RunFolder) -> None:
@@ -130,7 +126,8 @@ def check_resume(saved: RunConfig, config: RunConfig, folder: RunFolder) -> None
     if changed := list(configs.other(saved, config)):
         what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
         raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations and --average may change")
-    done = max((stats.generation for stats in folder.progress()), default=0)
+    last = folder.last_progress()
+    done = last.generation if last else 0
     if config.generations < done:
         raise ConfigError(f"--generations {config.generations}: the run has already done {done}")
 

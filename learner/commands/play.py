@@ -13,7 +13,7 @@ from farm.commands.logs import say
 from farm.commands.screen import display
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError
-from farm.settings import Settings, setting
+from farm.settings import setting
 from farm.sim.engines import DataEngine
 from farm.sim.scene import Scene
 from farm.sim.sim import Sim
@@ -21,13 +21,14 @@ from farm.tasks.base import TaskConfig
 from farm.tasks.loop import Batch
 from farm.tasks.standard import start
 from learner.again.replay import LoadedPolicy, loaded
+from learner.commands.allowed import AllowedFiles
 from learner.commands.replay import config_of
 from learner.run.config import MOST_GENERATIONS
 from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayCommand(Settings):
+class PlayCommand(AllowedFiles):
     """Plays the learnt policy repeatedly in MuJoCo's interactive viewer; Ctrl+drag pushes objects."""
 
     run: tyro.conf.Positional[Path]
@@ -47,7 +48,7 @@ def main(words: Sequence[str]) -> int:
     config = config_of(words)
     default = PlayCommand(run=tyro.MISSING, task=config.task_config if config else TaskConfig())
     command = settings.parse(PlayCommand, words, "farm play", default)
-    policy = loaded(RunFolder.open(command.run), command.generation, command.task)
+    policy = loaded(RunFolder.open(command.run, command.allow_file), command.generation, command.task)
     if not display():
         raise ConfigError(
             f"no display to open a window on: farm replay {command.run} --video rollout.gif draws without one"

@@ -12,9 +12,10 @@ from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
 from farm.errors import ConfigError, RunError, writing
-from farm.settings import Settings, setting
+from farm.settings import setting
 from farm.tasks.base import Task, TaskConfig
 from learner.commands import recordings
+from learner.commands.allowed import AllowedFiles, allowed
 from learner.run.config import MOST_GENERATIONS, RunConfig
 from learner.run.folder import RunFolder
 
@@ -27,7 +28,7 @@ MOST: Final = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayCommand(Settings):
+class ReplayCommand(AllowedFiles):
     """Simulates any policy or rollout of a run again, at physics rate, also with a changed task."""
 
     run: tyro.conf.Positional[Path]
@@ -67,7 +68,7 @@ def main(words: Sequence[str]) -> int:
     check_rerun()
     if command.video is not None:
         video.check(command.video)
-    folder = RunFolder.open(command.run)
+    folder = RunFolder.open(command.run, command.allow_file)
     path = recordings.target(command.to or folder.path / "rollout.rrd")
     names = [each.name for each in fields(task) if getattr(task, each.name) != getattr(command.task, each.name)]
     changed = ", ".join(f"{name.replace('_', ' ')} {getattr(command.task, name)}" for name in names)
@@ -116,11 +117,12 @@ def _rollouts(
     command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
 ) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show exploring rollouts of a generation: one by itself, several side by side."""
-    from learner.again.rewind import rewind, under
+    from learner.again.rewind import rewound as of_folder
+    from learner.again.rewind import under
     from learner.recording.comparison import Side, record_comparison
     from learner.recording.drawing import Drawing
 
-    rewound = rewind(folder.path, command.generation)
+    rewound = of_folder(folder, command.generation)
     policy = under(folder, rewound, command.task) if changed else rewound.policy  # chosen by the run's own results
     indices = _indices(command, rewound, ending)
     replays = rewound.again(indices, policy)
@@ -170,7 +172,7 @@ def config_of(words: Sequence[str]) -> RunConfig | None:
     """
     for word in words:
         if not word.startswith("-") and (Path(word) / "config.json").is_file():
-            return RunFolder(Path(word)).read_config()
+            return RunFolder(Path(word), allowed(words)).read_config()
     if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
         RunFolder.open(Path(words[0]))  # raises first: otherwise its task's flags would be reported as unknown
     return None

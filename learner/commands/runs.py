@@ -14,9 +14,10 @@ from farm import settings as arguments
 from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import stop_flag
-from farm.errors import ConfigError, Interrupted
+from farm.errors import CheckpointError, ConfigError, Interrupted
 from farm.net.zenoh_settings import is_port
 from farm.settings import Settings
+from learner.run import checkpoint as checkpoints
 from learner.run.folder import RunFolder
 from learner.run.launch import check_rerun
 
@@ -91,14 +92,28 @@ def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:
     from learner.recording.files import parts
     from learner.recording.viewing import catalog
 
-    recordings = [files[0] for folder in folders if (files := parts(folder.path / "run.rrd"))]
+    recordings: dict[str, Path] = {}
+    for folder in folders:
+        if files := parts(folder.path / "run.rrd"):
+            first = recordings.setdefault(_recording(folder), files[0])
+            if first != files[0]:  # a data set has one segment of each id
+                say(f"{folder.path} is left out: it is a copy of {first.parent}, with the same recording's id")
     if not recordings:
         raise ConfigError("none of these runs has a recording: learn without --no-record")
-    with stop_flag("closing the catalog") as stop, catalog(name, recordings, int(port)) as address:
+    with stop_flag("closing the catalog") as stop, catalog(name, [*recordings.values()], int(port)) as address:
         count = "1 recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
         say(f"{count} at {address}: farm view {address}, or rerun.catalog.CatalogClient in Python")
         stop.wait()
     raise Interrupted("the catalog is closed")
+
+
+def _recording(folder: RunFolder) -> str:
+    """The id of a run's recording, which a copy of its folder keeps."""
+    try:
+        at = checkpoints.load(folder.checkpoint)
+    except CheckpointError:
+        return folder.name
+    return f"{at.run}-undone{at.undone}" if at.undone else at.run
 
 
 def _succeeds(row: dict[str, Any]) -> str:
@@ -111,8 +126,7 @@ def _succeeds(row: dict[str, Any]) -> str:
 def _row(folder: RunFolder) -> dict[str, Any]:
     """A run's summary; what it lacks, because the run was cut short or has not ended, is taken from the progress."""
     summary = folder.read_summary()
-    progress = folder.progress()
-    last = progress[-1] if progress else None
+    last = folder.last_progress()
     damaged = summary is None and (folder.path / "summary.json").exists()
     row = {
         "run": folder.name,

@@ -24,7 +24,10 @@ from farm.net.session import free_endpoint
 from farm.net.tls import Bundle
 from farm.processes import cores
 from farm.settings import setting
-from learner.again.verify import Differs, chosen, stored, verify_all, verify_some, workers
+from learner.again.receipt import continued, digest_of, sealed
+from learner.again.stored import Differs, Stored, stored
+from learner.again.verify import chosen, verify_all, verify_some, workers
+from learner.commands.allowed import AllowedFiles
 from learner.run import checkpoint as checkpoints
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
@@ -33,7 +36,7 @@ from learner.scheduler.dispatcher import Stopped
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyCommand(Link):
+class VerifyCommand(AllowedFiles, Link):
     """Repeats a run, and compares its numbers to the last bit; exit status 1 if one differs.
 
     By default some of its generations, from the stored parameters before them; --all: the whole run.
@@ -76,12 +79,13 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(VerifyCommand, words, "farm verify")
     logs.set_up("WARNING")
-    folder, bundle = RunFolder.open(command.run), command.bundle
+    folder, bundle = RunFolder.open(command.run, command.allow_file), command.bundle
     if bundle is not None and command.receipt is not None:
         signed(bundle.folder, b"")  # says now what would fail at the end
     receipt: dict[str, Any] = {
         "run": folder.name, "release": __version__, "numbers": fingerprint.digest(), "all": command.all,
-        "generations": [], "rollouts": 0, "verdict": "interrupted", "difference": None,
+        "generations": [], "rollouts": 0, "verdict": "interrupted", "difference": None, "not_compared": [],
+        "workspace": "",
     }  # fmt: skip
     try:
         return _verify(command, folder, receipt)
@@ -89,7 +93,7 @@ def main(words: Sequence[str]) -> int:
         receipt |= {"verdict": "different", "difference": str(error)}
         raise
     finally:
-        if command.receipt is not None and "code" in receipt:
+        if command.receipt is not None and ("chosen" in receipt or receipt["verdict"] == "different"):
             _write(command.receipt, receipt, bundle)
 
 
@@ -97,7 +101,7 @@ def _write(path: Path, receipt: dict[str, Any], bundle: Bundle | None) -> None:
     """Write a receipt, and its signature if there is a certificate."""
     if bundle is not None:
         receipt["certificate"] = (bundle.folder / "cert.pem").read_text("utf-8")
-    content = json.dumps(receipt, indent=2) + "\n"
+    content = json.dumps(sealed(receipt), indent=2) + "\n"
     with writing(f"to {path}"):
         replace_text(path, content)
         if bundle is not None:
@@ -111,44 +115,67 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
         raise ConfigError(f"the run in {folder.path} has done no generation: there is nothing to verify")
     receipt |= {"chain": run.chain, "parameters_sha256": run.sha256}
     whole, rng = range(1, run.last + 1), np.random.default_rng(secrets.randbits(64))
-    receipt["chosen"] = [*whole] if command.all else chosen(run, command.share, rng)
-    if command.receipt is not None and (progress := _interrupted(command.receipt, receipt)):
-        receipt |= progress
-    generations, done = receipt["chosen"], receipt["generations"]
-    workspace = command.receipt.with_name(command.receipt.name + ".run") if command.receipt is not None else None
-    with stop_flag("ending") as stop, suppress(Stopped), ExitStack() as stack:
-        if command.all:
-            place = command.place
-            assert place is not None
-            repeated = verify_all(run, place, stop.is_set, workspace)
-        else:
-            simulate = stack.enter_context(workers(run, command.place, stop.is_set))
-            repeated = verify_some(run, [each for each in generations if each not in done], simulate)
-        for generation, rollouts in _bar(repeated, len(generations) - len(done)):
-            done.append(generation)
-            receipt["rollouts"] += rollouts
-            if stop.is_set():
-                break
+    earlier, workspace = None, None
+    if command.receipt is not None:
+        earlier = continued(command.receipt, receipt)
+        workspace = command.receipt.with_name(command.receipt.name + ".run") if command.all else None
+    if workspace is not None and not _is_continued(workspace, folder, earlier):
+        earlier = None
+    receipt |= earlier or {"chosen": [*whole] if command.all else chosen(run, command.share, rng)}
+    try:
+        ended = _repeat(command, run, receipt, workspace)
+    finally:
+        if workspace is not None:
+            receipt["workspace"] = digest_of(workspace / folder.name / "checkpoint")
+    done, generations = receipt["generations"], receipt["chosen"]
     extent = f"{len(done)} of {run.last} generations of {folder.path}, {receipt['rollouts']} rollouts"
-    if len(done) < len(generations):
+    if len(done) < len(generations) or (command.all and not ended):
         more = "" if command.receipt is None else "; the same command continues"
         say(f"stopped; no difference in {extent}{more}")
         return INTERRUPTED
     receipt["verdict"] = "the same"
     say(f"verified to the bit: {extent}" + (", and the results" if command.all else "; --all also repeats the updates"))
+    receipt["not_compared"] = run.not_compared(evaluated=command.all)
+    if receipt["not_compared"]:
+        say(f"not compared, of summary.json: {', '.join(receipt['not_compared'])}")
     return 0
 
 
-def _interrupted(path: Path, receipt: dict[str, Any]) -> dict[str, Any] | None:
-    """What an interrupted verification of the same run has done, as its receipt says."""
-    try:
-        old = json.loads(path.read_text("utf-8"))
-        same = all(old[name] == receipt[name] for name in ("chain", "code", "numbers", "all", "release", "verdict"))
-        of_run = {*receipt["chosen"]} if receipt["all"] else {*old["chosen"]}
-        sound = same and {*old["generations"]} <= of_run and type(old["rollouts"]) is int
-        return {name: old[name] for name in ("chosen", "generations", "rollouts")} if sound else None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+def _is_continued(workspace: Path, folder: RunFolder, earlier: dict[str, Any] | None) -> bool:
+    """Whether there is a repetition to be continued.
+
+    Raises:
+      ConfigError: there is one that this user's receipt does not speak of: it may have come with the run.
+    """
+    if not workspace.exists():
+        return False
+    if earlier is None or digest_of(workspace / folder.name / "checkpoint") != earlier["workspace"]:
+        raise ConfigError(
+            f"{workspace} is not of an interrupted verification of this run by you: remove it, or take another "
+            "--receipt"
+        )
+    return True
+
+
+def _repeat(command: VerifyCommand, run: Stored, receipt: dict[str, Any], workspace: Path | None) -> bool:
+    """Repeat what the receipt does not have yet, and note it there; return whether it was not stopped."""
+    done: list[int] = receipt["generations"]
+    left = [each for each in receipt["chosen"] if each not in {*done}]
+    place = command.place
+    with stop_flag("ending", at_once=place is None) as stop, suppress(Stopped), ExitStack() as stack:
+        if place is None:
+            stack.enter_context(suppress(KeyboardInterrupt))
+        if command.all:
+            assert place is not None
+            repeated = verify_all(run, place, stop.is_set, workspace)
+        else:
+            repeated = verify_some(run, left, stack.enter_context(workers(run, place, stop.is_set)))
+        for generation, rollouts in _bar(repeated, len(left)):
+            done.append(generation)
+            receipt["rollouts"] += rollouts
+            if stop.is_set():
+                break
+    return not stop.is_set()
 
 
 def _bar(repeated: Iterator[tuple[int, int]], count: int) -> Iterable[tuple[int, int]]:

@@ -6,9 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
-from farm.errors import ConfigError
+from farm import archives
+from farm.errors import ConfigError, brief
 from farm.sim import quantities
 from farm.sim.channels import Quantity
 from farm.tasks import actions
@@ -52,7 +51,7 @@ def _rows(quantities: Sequence[Quantity]) -> list[dict[str, Any]]:
     ]
 
 
-def lines(path: Path, of: Mapping[str, Any]) -> Iterator[str]:
+def lines(path: Path, of: Mapping[str, Any]) -> list[str]:
     """What an exported policy says of itself, for people.
 
     Args:
@@ -60,10 +59,18 @@ def lines(path: Path, of: Mapping[str, Any]) -> Iterator[str]:
       of: texts and numbers by name, with the interface as JSON.
 
     Raises:
-      ConfigError: it says nothing of its interface.
+      ConfigError: it says nothing of its interface, or it is damaged.
     """
     if not all(name in of for name in (*_NAMES, "interface")):
         raise ConfigError(f"{path} does not name its numbers: it is no file of this release's farm export")
+    try:
+        return list(_lines(of))
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
+        reason = brief(f"{type(error).__name__}: {error}")
+        raise ConfigError(f"{path} is damaged: it does not name its numbers as farm export does ({reason})") from None
+
+
+def _lines(of: Mapping[str, Any]) -> Iterator[str]:
     data = json.loads(str(of["interface"]))
     period = f"{float(of['control_period']):g} s"
     yield f"{of['policy']} for {of['task']} after generation {of['generation']}; a control step takes {period}"
@@ -101,10 +108,6 @@ def of_npz(path: Path) -> tuple[dict[str, Any], list[str]]:
     Raises:
       ConfigError: it cannot be read.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            each = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise ConfigError(f"{path} is no .npz of farm export: {error}") from None
-    arrays = ", ".join(f"{name} {array.shape}" for name, array in each.items() if array.ndim)
-    return {name: array.item() for name, array in each.items() if not array.ndim}, [f"arrays: {arrays}"]
+    what = ".npz of farm export"
+    found = {name: header.shape for name, header in archives.headers(path, what).items() if header.shape}
+    return archives.scalars(path, what), [f"arrays: {', '.join(f'{name} {shape}' for name, shape in found.items())}"]

@@ -120,14 +120,14 @@ def listed(path: Path) -> tuple[dict[str, Any], list[str]]:
     """
     onnx = library()
     try:
-        model = onnx.load(path)
+        model = onnx.load(path, load_external_data=False)  # which may be any file
+        ends = {"takes": model.graph.input, "gives": model.graph.output}
+        sizes = {
+            word: [f"{each.name} (N, {each.type.tensor_type.shape.dim[1].dim_value})" for each in ends[word]]
+            for word in ends
+        }
     except Exception as error:  # protobuf's errors have no common class
-        raise ConfigError(f"{path} is no ONNX model: {brief(str(error))}") from None
-    ends = {"takes": model.graph.input, "gives": model.graph.output}
-    sizes = {
-        word: [f"{each.name} (N, {each.type.tensor_type.shape.dim[1].dim_value})" for each in ends[word]]
-        for word in ends
-    }
+        raise ConfigError(f"{path} is no ONNX model of farm export: {brief(str(error))}") from None
     properties = {each.key: each.value for each in model.metadata_props}
     return properties, [f"{word} {', '.join(each)}" for word, each in sizes.items()]
 

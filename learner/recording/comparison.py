@@ -27,7 +27,7 @@ from learner.recording.blueprint import Eye
 from learner.recording.channels import entities
 from learner.recording.curves import Colour, band, lines, numbers, palette
 from learner.recording.drawing import Drawing
-from learner.recording.rows import begin, flush, log_static, markdown, times
+from learner.recording.rows import log_static, markdown, recording, times
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a separate layout, which is never used for a run
 _BESIDE: Final = "rolloutfarm rollouts"
@@ -55,25 +55,23 @@ def record_comparison(path: Path, runs: Sequence[Side], table: str, *, rollouts_
       OSError: the file cannot be written.
     """
     learning = not rollouts_of
-    recording, above = ("comparison", "/runs") if learning else (f"{rollouts_of}-replay", "/rollouts")
+    name, above = ("comparison", "/runs") if learning else (f"{rollouts_of}-replay", "/rollouts")
     path.touch()  # fails with an errno; Rerun's own error has none
     roots = [f"{above}/{rr.escape_entity_path_part(run.name)}" for run in runs]
     step, eye = _arrangement(runs)
     compared = _compared(runs)
     success = any(run.drawing.spec.success for run in runs)
     layout = blueprint.comparison(roots, eye, compared, success=success, learning=learning)
-    stream = begin(recording, [rr.FileSink(path)], layout, _APPLICATION if learning else _BESIDE)
-    stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log("/table", markdown(table), static=True)
-    for number, (root, run, colour) in enumerate(zip(roots, runs, palette(len(runs)), strict=True)):
-        world = [(root + entity, value) for entity, value in run.drawing.static() if entity.startswith("/world/")]
-        names = [(root + entity, value) for entity, value in _names(run, colour, compared, learning=learning)]
-        log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
-        if learning:
-            _send_curves(stream, root, run.progress, run.rollout.returned)
-        _send_rollout(stream, root, run, compared)
-    flush(stream)
-    stream.disconnect()
+    with recording(name, [rr.FileSink(path)], layout, _APPLICATION if learning else _BESIDE) as stream:
+        stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.log("/table", markdown(table), static=True)
+        for number, (root, run, colour) in enumerate(zip(roots, runs, palette(len(runs)), strict=True)):
+            world = [(root + entity, value) for entity, value in run.drawing.static() if entity.startswith("/world/")]
+            names = [(root + entity, value) for entity, value in _names(run, colour, compared, learning=learning)]
+            log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
+            if learning:
+                _send_curves(stream, root, run.progress, run.rollout.returned)
+            _send_rollout(stream, root, run, compared)
 
 
 def _arrangement(runs: Sequence[Side]) -> tuple[FloatArray, Eye]:

@@ -1,7 +1,7 @@
 """The files of a recording: parts that a run left behind, merged, repaired and compacted.
 
 Rerun overwrites the file it is given, and a file truncated by a crash cannot be read until `rerun rrd optimize` has
-repaired it. So a run that continues repairs its existing files and starts a new part.
+repaired it. So a run that continues repairs existing files that cannot be read, and starts a new part.
 """
 
 import json
@@ -72,10 +72,13 @@ def last_generation(path: Path) -> int:
 def _last_generation(path: Path) -> int:
     from rerun.chunk import RrdReader
 
-    chunks = (chunk for part in parts(path) for chunk in RrdReader(part).stream())
-    batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == _EACH_GENERATION]
-    columns = [batch.column("generation") for batch in batches if "generation" in batch.schema.names]
-    return max((number for column in columns for number in column.cast("int64").to_pylist()), default=0)
+    for part in reversed(parts(path)):  # later generations are in later parts
+        chunks = (chunk for chunk in RrdReader(part).stream() if chunk.entity_path == _EACH_GENERATION)
+        batches = [chunk.to_record_batch() for chunk in chunks]
+        columns = [batch.column("generation") for batch in batches if "generation" in batch.schema.names]
+        if last := max((number for column in columns for number in column.cast("int64").to_pylist()), default=0):
+            return last
+    return 0
 
 
 def program() -> str:
@@ -152,12 +155,11 @@ def _left_behind(path: Path) -> tuple[Path, Path]:
 
 
 def next_part(path: Path) -> Path:
-    """The file in which a run continues to record; existing parts are merged first, if possible."""
+    """The file in which a run continues to record; merging is left to its end, as it may take minutes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     tidy(path)
     if not parts(path):
         return path
-    compact(path)
     last = max(_number(path, parts(path)[-1]), 1)
     return path.with_name(f"{path.stem}.part{last + 1}{path.suffix}")
 

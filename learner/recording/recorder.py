@@ -19,6 +19,7 @@ import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,14 +44,17 @@ from learner.recording.replay import record_replay
 from learner.recording.rows import (
     APPLICATION,
     begin,
+    end,
     file_sink,
     flush,
     log_static,
     markdown,
     markdowns,
+    release,
     row,
     send,
     send_gaps,
+    send_layout,
     send_properties,
     times,
 )
@@ -122,11 +126,20 @@ class Recorder:
             sinks.append(file_sink(path))
         self._eye = Eye.of(drawing.view())
         self._stream = begin(run, sinks, blueprint.learning(spec, self._eye))
-        send_properties(self._stream, "run", properties or {})
+        try:
+            self._send_static(markdown(config), properties or {})
+        except BaseException:
+            with suppress(OSError):
+                end(self._stream)
+            raise
+
+    def _send_static(self, config: rr.TextDocument, properties: Mapping[str, object]) -> None:
+        spec = self._drawing.spec
+        send_properties(self._stream, "run", properties)
         static = [
             *self._drawing.static(),
             *curves.static(success=spec.success, measures=spec.measures),
-            ("/config", markdown(config)),
+            ("/config", config),
         ]
         if spec.trace_channels:
             static += [each for entity in ("/traces/best", "/traces/worst") for each in axes(entity, spec)]
@@ -183,7 +196,7 @@ class Recorder:
         shown = Eye.of(self._drawing.view([rollout]))
         eye = replace(self._eye, away=shown.away) if shown.tracked else shown
         self._finished = blueprint.finished(self._drawing.spec, eye)
-        self._stream.send_blueprint(self._finished)
+        send_layout(self._stream, self._finished)
         self.settle()
 
     def log(self, text: str, level: str = "INFO") -> None:
@@ -202,11 +215,14 @@ class Recorder:
         """
         if self._broken:
             return
-        self._draw()
-        self._flush()
-        self._stream.disconnect()
+        try:
+            self._draw()
+        finally:
+            self._flush()
+            end(self._stream)
         if self._path is not None and merge and compact(self._path) and self._finished is not None:
             with_layout(self._path, partial(self._finished.save, APPLICATION))
+            release()  # of the layout's file
 
     def _draw(self) -> None:
         """Send what is held back, all rows of an entity together."""

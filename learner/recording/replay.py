@@ -12,7 +12,7 @@ from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.drawing import Drawing
 from learner.recording.files import compact
-from learner.recording.rows import begin, file_sink, flush, log_static, markdown, row, send, send_gaps, times
+from learner.recording.rows import file_sink, log_static, markdown, recording, row, send, send_gaps, times
 
 PAUSE: Final = 0.1
 """Pause between two rollouts of a replay [s]."""
@@ -34,20 +34,18 @@ def record_replay(
     aside.unlink(missing_ok=True)
     view = drawing.view([rollout for _, rollout in rollouts])
     layout = blueprint.replay(drawing.spec, Eye.of(view), longest)
-    stream = begin(f"{run}-replay", [file_sink(aside)], layout)
-    log_static(stream, [*drawing.static(), ("/config", markdown(config))])
-    start = 0.0
-    for number, (name, rollout) in enumerate(rollouts, 1):
-        at = times("rollout", np.array([number]), np.array([start]))
-        stream.send_columns("/rollout", at, row(_caption(name, rollout)))
-        numbers = np.full(len(rollout.times), number)
-        columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)], view)]
-        send(stream, columns, "rollout", numbers, start + rollout.times)
-        start += float(rollout.times[-1]) + PAUSE
-        if number < len(rollouts):
-            send_gaps(stream, drawing.gaps(1), np.array([start - 0.5 * PAUSE]))
-    flush(stream)
-    stream.disconnect()
+    with recording(f"{run}-replay", [file_sink(aside)], layout) as stream:
+        log_static(stream, [*drawing.static(), ("/config", markdown(config))])
+        start = 0.0
+        for number, (name, rollout) in enumerate(rollouts, 1):
+            at = times("rollout", np.array([number]), np.array([start]))
+            stream.send_columns("/rollout", at, row(_caption(name, rollout)))
+            numbers = np.full(len(rollout.times), number)
+            columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)], view)]
+            send(stream, columns, "rollout", numbers, start + rollout.times)
+            start += float(rollout.times[-1]) + PAUSE
+            if number < len(rollouts):
+                send_gaps(stream, drawing.gaps(1), np.array([start - 0.5 * PAUSE]))
     compact(aside)
     aside.replace(path)
 

@@ -1,12 +1,14 @@
 """Opens Rerun recordings and writes rows to them: several at once, on our own timelines."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun import bindings
 
 from farm.arrays import FloatArray, IntArray
 from learner.recording.curves import Columns
@@ -18,16 +20,87 @@ APPLICATION: Final = "rolloutfarm"
 _MARKDOWN: Final = "text/markdown"
 
 
-def begin(
-    recording: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION
-) -> rr.RecordingStream:
+@contextmanager
+def recording(
+    name: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION
+) -> Iterator[rr.RecordingStream]:
+    """A recording from `begin`, which is ended however the block ends.
+
+    Raises:
+      OSError: the files cannot be written.
+    """
+    stream = begin(name, sinks, layout, application)
+    try:
+        yield stream
+    except BaseException:
+        with suppress(OSError):  # the first reason counts
+            end(stream)
+        raise
+    end(stream)
+
+
+def begin(name: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION) -> rr.RecordingStream:
     """Open a recording with that id for these sinks, layout first; the viewer keeps one layout per application."""
     rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
-    stream = rr.RecordingStream(application, recording_id=recording)
-    stream.set_sinks(*sinks)
-    stream.send_blueprint(layout)
-    stream.send_recording_name(recording)
+    stream = rr.RecordingStream(application, recording_id=name)
+    try:
+        stream.set_sinks(*sinks)
+        send_layout(stream, layout)
+        stream.send_recording_name(name)
+    except BaseException:
+        with suppress(OSError):
+            end(stream)
+        raise
     return stream
+
+
+def end(stream: rr.RecordingStream) -> None:
+    """Write every row, and close: none of the recording's threads, files and memory is left.
+
+    Raises:
+      OSError: the files cannot be written.
+    """
+    if isinstance(stream.inner, _Released):
+        return
+    flush(stream)
+    stream.disconnect()
+    stream.inner = _Released()  # type: ignore[assignment]
+    release()
+
+
+def release() -> None:
+    """Free the native part of recordings that nothing refers to: Rerun itself keeps them until the program ends."""
+    with suppress(RuntimeError):  # of one that cannot be written: its own `flush` has said so
+        bindings.flush_and_cleanup_orphaned_recordings()
+
+
+def send_layout(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+    """Send a layout to the viewers of a recording."""
+    sent = _SentLayout(layout)
+    stream.send_blueprint(sent)  # type: ignore[arg-type]
+    sent.close()
+
+
+class _SentLayout:
+    """A layout whose stream can be closed: Rerun's copy of it in memory would keep itself and its threads alive."""
+
+    def __init__(self, layout: rrb.Blueprint) -> None:
+        self._layout = layout
+        self._streams: list[rr.RecordingStream] = []
+
+    def to_blueprint(self) -> "_SentLayout":
+        """Return itself; called by Rerun."""
+        return self
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        """Write the layout; called by Rerun."""
+        self._streams.append(stream)
+        self._layout._log_to_stream(stream)
+
+    def close(self) -> None:
+        """Close the stream that Rerun opened for it."""
+        while self._streams:
+            self._streams.pop().disconnect()
 
 
 def file_sink(path: Path) -> rr.FileSink:
@@ -48,12 +121,17 @@ def flush(stream: rr.RecordingStream) -> None:
     except RuntimeError as error:
         # Rerun would wait for this file forever, at the latest when the process ends.
         rr.unregister_shutdown()
-        stream.inner = _Abandoned()  # type: ignore[assignment]
+        _BROKEN.append(stream.inner)
+        stream.inner = _Released()  # type: ignore[assignment]
         raise OSError(f"Rerun has stopped writing: {error}") from error
 
 
-class _Abandoned:
-    """Replaces a native recording that must not be waited for."""
+_BROKEN: Final[list[object]] = []
+"""Native recordings that cannot be written. Rerun waits for those that nothing refers to, whenever another one ends."""
+
+
+class _Released:
+    """Replaces a native recording that is closed, or must not be waited for."""
 
     def is_forked_child(self) -> bool:
         """Return true: Rerun releases those without waiting."""

@@ -81,7 +81,7 @@ class RunRecording(logging.Handler):
             return
         self.done = message.generation
         best, stats = message.replay, message.progress
-        if self._queue.qsize() >= self._waiting and message.nbytes:
+        if self._queue.qsize() >= self._waiting and (message.sample is not None or message.traces):
             message = replace(message, sample=None, traces={})
             self.dropped += 1
         self._call(partial(self._recorder.generation, message))

@@ -12,10 +12,12 @@ import numpy as np
 from farm.arrays import FloatArray, array
 from farm.errors import CheckpointError, MessageError
 from farm.net import codec
+from farm.net.messages import check_assets
 
 log = logging.getLogger(__name__)
 
 _MAGIC: Final = b"rolloutfarm checkpoint 2\n"
+_MOST_GENERATIONS: Final = 10_000_000
 _DIGEST: Final = hashlib.sha256().digest_size
 SCHEMA: Final = 2
 """Version of what follows, whichever one messages have."""
@@ -154,6 +156,29 @@ def _read(path: Path) -> Checkpoint:
     if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
         raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
     try:
-        return codec.decode(body, Checkpoint, SCHEMA, most=len(body))
-    except MessageError as error:
+        checkpoint = codec.decode(body, Checkpoint, SCHEMA, most=len(body))
+        check_assets(checkpoint.assets)
+    except (MessageError, ValueError) as error:
         raise CheckpointError(f"{path}: {error}") from None
+    wrong = _wrong(checkpoint.state)
+    if not all(isinstance(values, np.ndarray) for values in checkpoint.constants.values()):
+        wrong = "a constant of its policy is no array"
+    if wrong:
+        raise CheckpointError(f"{path}: {wrong}")
+    return checkpoint
+
+
+def _wrong(state: dict[str, Any]) -> str:
+    """What is wrong with the values that every algorithm's state has; nothing if they are possible."""
+    generation = state.get("generation")
+    if type(generation) is not int or not 0 <= generation <= _MOST_GENERATIONS:
+        return f"its generation is {str(generation)[:40]!r}; expected 0 to {_MOST_GENERATIONS}"
+    sizes = set()
+    for name in ("mu", "sigma"):
+        values = state.get(name)
+        if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype != np.dtype("<f8") or not values.size:
+            return f"its {name} is no vector of numbers"
+        if not np.isfinite(values).all():
+            return f"its {name} is not finite"
+        sizes.add(values.size)
+    return "" if len(sizes) == 1 else "its mu and sigma have different lengths"

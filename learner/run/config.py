@@ -1,7 +1,7 @@
 """The configuration of a run: all settings that its numbers depend on."""
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -339,12 +339,57 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
     return {"version": VERSION, **parts, **rest}
 
 
-def from_dict(values: object, where: str) -> RunConfig:
+def localised(values: Mapping[str, Any], files: Sequence[Path]) -> dict[str, Any]:
+    """A parsed config.json whose classes come from these files, where one has the name of the class's file."""
+    out = dict(values)
+    for part in PARTS:
+        table = values.get(part)
+        path, _, inside = str(table.get("name") if isinstance(table, dict) else "").rpartition(":")
+        here = [file for file in files if path.endswith(".py") and file.name == Path(path).name]
+        if isinstance(table, dict) and here:
+            out[part] = {**table, "name": f"{here[0].resolve()}:{inside}"}
+    return out
+
+
+def class_files(config: RunConfig) -> tuple[Path, ...]:
+    """The files of its classes."""
+    names = (plugins.named_file(getattr(config, part)) for part in PARTS)
+    return tuple(Path(name) for name in dict.fromkeys(names) if name)
+
+
+def _check_file(where: str, part: str, name: str, folder: Path | None, files: Sequence[Path]) -> None:
+    """Check that a class's file is one that the run itself, or its user, has named: importing it runs its code.
+
+    Raises:
+      ConfigError: its path is relative, it lies in the run's folder, or it is not on this machine.
+    """
+    path = Path(plugins.named_file(name))
+    if not path.name or path in [file.resolve() for file in files]:
+        return
+    remedy = f"--allow-file {path.name} takes the class from a file that you trust"
+    if not path.is_absolute():
+        raise ConfigError(f"{where}: {part} is {name[:200]!r}, and a run writes absolute paths only; {remedy}")
+    if folder is not None and path.resolve().is_relative_to(folder.resolve()):
+        raise ConfigError(
+            f"{where}: {part} is a class in the run's own folder ({path}), whose code would run; {remedy}"
+        )
+    if not path.exists():
+        raise ConfigError(f"{where}: {part} is a class in {path}, and there is no such file here; {remedy}")
+
+
+def from_dict(values: object, where: str, files: Sequence[Path] = (), folder: Path | None = None) -> RunConfig:
     """The configuration in a parsed config.json.
+
+    Args:
+      values: what was parsed.
+      where: its origin, for errors.
+      files: which the user named: classes in files of these names are taken from them.
+      folder: of the run; a class in it is refused unless its file is one of those.
 
     Raises:
       ConfigError: another version, unknown names, wrong types or impossible values; `where` is named.
     """
+    values = localised(values, files) if isinstance(values, dict) else values
     if not isinstance(values, dict) or values.get("version") != VERSION:
         version = values.get("version") if isinstance(values, dict) else None
         raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(version)[:40]!r})")
@@ -355,19 +400,20 @@ def from_dict(values: object, where: str) -> RunConfig:
         table = values.get(part)
         if not isinstance(table, dict) or type(table.get("name")) is not str:
             raise ConfigError(f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name")
+        _check_file(where, part, table["name"], folder, files)
         options = {k: v for k, v in table.items() if k != "name"}
         config = settings.from_dict(settings_class(kind, table["name"]), options, f"{where}: {part}")
         arguments |= {part: table["name"], f"{part}_config": config}
     return settings.from_dict(RunConfig, arguments, where)
 
 
-def read(path: Path) -> RunConfig:
-    """The configuration in a file.
+def read(path: Path, files: Sequence[Path] = (), folder: Path | None = None) -> RunConfig:
+    """The configuration in a file; arguments as in `from_dict`.
 
     Raises:
       ConfigError: it cannot be read or is invalid.
     """
-    return from_dict(settings.read_json(path), str(path))
+    return from_dict(settings.read_json(path), str(path), files, folder)
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:

@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 from bisect import bisect_left
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +28,7 @@ NONE: Final = np.empty((2, 0))
 """The normaliser if observations are not normalised."""
 
 _VERSION: Final = 1  # of parameters
+_END: Final = 64 << 10  # [bytes] of a file's end that are read to find its last line
 _ASIDE: Final = "moved elsewhere, it keeps no run from going on"
 
 
@@ -49,6 +50,42 @@ class ProgressFile:
         except OSError:
             return []
 
+    def last(self) -> GenerationStats | None:
+        """The last readable line, None if there is none; reads the end of the file only."""
+        try:
+            with self.path.open("rb") as file:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - _END))
+                lines = [_parsed(line) for line in file.read().splitlines()]
+        except OSError:
+            return None
+        readable = [stats for stats in lines if stats is not None] or self.read()
+        return readable[_rising([stats.generation for stats in readable])[-1]] if readable else None
+
+    def after(self, generation: int) -> Iterator[GenerationStats]:
+        """Lines of later generations in order, each read when it is taken; only they are read."""
+        try:
+            file = self.path.open("rb")
+        except OSError:
+            return
+        with file:
+            low, high = 0, file.seek(0, os.SEEK_END)
+            while high - low > _END:  # the line after `low` is of an earlier generation, or the first one
+                middle = (low + high) // 2
+                file.seek(middle)
+                file.readline()
+                stats = _parsed(file.readline())
+                if stats is not None and stats.generation <= generation:
+                    low = middle
+                else:
+                    high = middle
+            file.seek(low)
+            if low:
+                file.readline()
+            for stats in map(_parsed, file):
+                if stats is not None and stats.generation > generation:
+                    generation = stats.generation
+                    yield stats
+
     def rewind(self, generation: int) -> None:
         """Remove what is newer than a generation, and damaged lines, of which a copy is kept."""
         path = self.path
@@ -66,7 +103,8 @@ class ProgressFile:
                 "%s: %d damaged line(s) dropped (line %s), %d kept; all of it is in %s",
                 path, len(damaged), which, len(remaining), copy,
             )  # fmt: skip
-        replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in remaining))
+        if damaged or torn or len(remaining) < len(readable) or not path.exists():
+            replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in remaining))
 
     def _lines(self) -> tuple[list[tuple[int, GenerationStats]], list[int], bool]:
         """Readable lines by number; numbers of unreadable ones; whether the last one is incomplete.
@@ -74,10 +112,8 @@ class ProgressFile:
         A damaged line never affects other lines, neither by its contents nor by its generation.
         """
         *lines, end = self.path.read_text("utf-8", "replace").split("\n")
-        readable = []
-        for number, line in enumerate([*lines, end], 1):
-            with suppress(ValueError, RecursionError):
-                readable.append((number, GenerationStats.from_dict(json.loads(line))))
+        parsed = ((number, _parsed(line)) for number, line in enumerate([*lines, end], 1))
+        readable = [(number, stats) for number, stats in parsed if stats is not None]
         readable = [readable[i] for i in _rising([stats.generation for _, stats in readable])]
         numbers = {number for number, _ in readable}
         damaged = [number for number in range(1, len(lines) + 1) if number not in numbers]
@@ -193,6 +229,22 @@ class ParametersFile:
         if size is not None:
             with self.path.open("r+b") as file:
                 file.truncate(size)
+
+
+def _parsed(line: str | bytes) -> GenerationStats | None:
+    """A line of progress.jsonl; None if it is damaged."""
+    try:
+        return GenerationStats.from_dict(json.loads(line))
+    except (ValueError, RecursionError):
+        return None
+
+
+def with_rates(progress: Iterable[GenerationStats]) -> Iterator[tuple[GenerationStats, float]]:
+    """Successive generations, each with its exploring rollouts per second."""
+    rollouts, seconds = 0, 0.0
+    for stats in progress:
+        yield stats, (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-3)  # written to the millisecond
+        rollouts, seconds = stats.rollouts, stats.seconds
 
 
 def every(parameters: int, generations: int, observation: int = 0) -> int:

@@ -59,6 +59,8 @@ class RunFolder:
     """The files of one run."""
 
     path: Path
+    allowed: tuple[Path, ...] = ()
+    """Files that the user named: classes in files of these names are taken from them."""
 
     @property
     def name(self) -> str:
@@ -114,14 +116,17 @@ class RunFolder:
         return folder
 
     @classmethod
-    def open(cls, path: Path) -> "RunFolder":
-        """Open an existing run's folder; a ConfigError if there is none."""
+    def open(cls, path: Path, files: tuple[Path, ...] = ()) -> "RunFolder":
+        """Open an existing run's folder, with files that the user named; a ConfigError if there is none."""
         if not cls(path).there:
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         for each in path.iterdir():
             if each.exists() and not (each.is_file() or each.is_dir()):  # to open a FIFO would wait for ever
                 raise CheckpointError(f"{each} is not a file; expected one that the run wrote: remove it")
-        return cls(path)
+        for each in files:
+            if not each.is_file():
+                raise ConfigError(f"--allow-file {each}: there is no such file")
+        return cls(path, files)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -171,7 +176,11 @@ class RunFolder:
 
     def read_config(self) -> RunConfig:
         """Read config.json."""
-        return configs.read(self.path / "config.json")
+        return configs.read(self.path / "config.json", self.allowed, self.path)
+
+    def config_of(self, at: Checkpoint) -> RunConfig:
+        """The configuration in one of its checkpoints."""
+        return configs.from_dict(at.config, str(self.checkpoint), self.allowed, self.path)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write summary.json."""
@@ -203,6 +212,14 @@ class RunFolder:
     def progress(self) -> list[GenerationStats]:
         """Every readable line of progress.jsonl, in order of generations."""
         return self._progress.read()
+
+    def progress_after(self, generation: int) -> Iterator[GenerationStats]:
+        """Lines of progress.jsonl of later generations, in order; only they are read."""
+        return self._progress.after(generation)
+
+    def last_progress(self) -> GenerationStats | None:
+        """The last readable line of progress.jsonl, None if there is none; reads the end of the file only."""
+        return self._progress.last()
 
     @property
     def parameters(self) -> ParametersFile:

@@ -4,6 +4,7 @@ import logging
 
 from farm import fingerprint
 from farm.arrays import FloatArray
+from farm.errors import described
 from farm.net.work import Jobs, Simulated
 from farm.runner import Runner
 from learner.run.setup import Problem
@@ -35,7 +36,7 @@ class LocalJudge:
             self._runner = self._runner or self._problem.runner()
             first, again = (self._runner.run(mu, job, "none", normaliser, terms=terms) for _ in range(2))
         except Exception as error:  # a task may need what only the workers' machines have
-            log.warning("the learner's machine cannot repeat this job (%s: %s)", type(error).__name__, error)
+            log.warning("the learner's machine cannot repeat this job (%s)", described(error))
             return None
         if bits(first, slice(None)) != bits(again, slice(None)):
             log.warning("the same rollout has other numbers when it is repeated: farm check TASK shows where")

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm.commands.logs import Formatter
-from farm.errors import ConfigError, NameTakenError, RunError
+from farm.errors import ConfigError, NameTakenError, RunError, check_addresses
 from farm.net import keys, session
 from farm.net.session import Session, free_endpoint
 from farm.net.telemetry import Report, RunEnd
@@ -36,6 +36,7 @@ from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.evaluation import Evaluation
+from learner.run.files import with_rates
 from learner.run.folder import RunFolder
 from learner.run.judge import LocalJudge
 from learner.run.learner import Learner
@@ -211,8 +212,9 @@ def open_run(
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Run]:
     """Open all parts of a run, in an order that leaves nothing behind if one fails."""
-    folder = RunFolder(path)
+    folder = RunFolder(path, configs.class_files(config))
     keys.checked("run", folder.name)
+    check_addresses(2 << 30, "learning")
     if place.record or place.serve:
         check_rerun()
     with ExitStack() as stack:
@@ -285,7 +287,17 @@ def dispatch(
     join = None if place.workers else how_to_join(place, problem)
     spec, judge = problem.specification(name), stack.enter_context(closing(LocalJudge(problem)))
     dispatcher = Dispatcher(
-        link, place.farm, spec, generations, join, tend, admission, problem.shapes(steps=steps), place.scheduler, judge
+        link,
+        place.farm,
+        spec,
+        generations,
+        join,
+        tend,
+        admission,
+        problem.shapes(steps=steps),
+        place.scheduler,
+        judge,
+        tend.end,
     )
     if place.workers:
         flags = [*_worker_flags(place, problem), "--backend", place.backend, "--log-level", "WARNING"]
@@ -299,6 +311,11 @@ class _Tending:
     def __init__(self, stopped: Callable[[], bool]) -> None:
         self._stopped, self._next = stopped, 0.0
         self.pool: LocalWorkers | None = None
+
+    def end(self, worker: str) -> bool:
+        """End the process of a local worker, which is then replaced; false if it is none of them."""
+        digits = worker.rpartition("/")[2].partition("-")[0]  # as `Worker` names itself
+        return self.pool is not None and digits.isdecimal() and self.pool.kill(int(digits))
 
     def __call__(self) -> bool:
         if self.pool and time.monotonic() > self._next:
@@ -386,16 +403,15 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
         path, run=learner.run, config=learner.config, serve=place.serve, drawing=Drawing.of(learner.problem),
         done=learner.state.generation if recorded else 0, folder=learner.folder.path,
     ))  # fmt: skip
-    rollouts, seconds = 0, 0.0
-    for stats in learner.folder.progress():  # the curves of what was not recorded, or was lost when the run was killed
-        rate = (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-9)
+    # The curves of what was not recorded, or was lost when the run was killed.
+    for stats, rate in with_rates(learner.folder.progress_after(recorded - 1)):
         if stats.generation > recorded:
             opened.put(Report(progress=stats, rate=rate))
-        rollouts, seconds = stats.rollouts, stats.seconds
     return opened
 
 
 def check_rerun() -> None:
-    """Check that rerun-sdk, an extra that workers do not need, is installed; else a ConfigError."""
+    """Check that rerun-sdk, an extra that workers do not need, is installed and can run; else a ConfigError."""
+    check_addresses(4 << 30, "recording", ", and --no-record needs 2 GiB")
     if importlib.util.find_spec("rerun") is None:
         raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or record nothing: --no-record")

@@ -245,7 +245,7 @@ class Learner:
     def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
         """The results in summary.json."""
         at = self.state.generation
-        rates = [p.success_rate for p in self.folder.progress() if p.generation == at]
+        last = self.folder.last_progress()
         nominal = evaluation.mean if evaluation else None
         numbers = self.state.mu.astype("<f8").tobytes() + self.state.sigma.astype("<f8").tobytes()
         return {
@@ -257,7 +257,7 @@ class Learner:
             "best_return": self.state.best,
             "mean_policy_return": nominal.value if nominal else None,
             "mean_policy_success": nominal.success if nominal else None,
-            "success_rate": rates[-1] if rates else None,
+            "success_rate": last.success_rate if last and last.generation == at else None,
             "robust_success_rate": evaluation.robust_success_rate if evaluation else None,
             "robust_return": evaluation.robust_return if evaluation else None,
             "robust_failed": evaluation.robust_failed if evaluation else None,

@@ -220,7 +220,7 @@ def resumed(
         numbers has changed and `mixed` does not allow it.
     """
     at = folder.states.without(checkpoints.load(folder.checkpoint))
-    for name, old, new in configs.other(configs.from_dict(at.config, str(folder.checkpoint)), config):
+    for name, old, new in configs.other(folder.config_of(at), config):
         raise CheckpointError(
             f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
         )
@@ -241,7 +241,7 @@ def resumed(
 
 def _other(config: RunConfig) -> Checkpoint:
     """The run to start from, if its parameters have the same meaning."""
-    folder = RunFolder.open(Path(str(config.init_from)))
+    folder = RunFolder.open(Path(str(config.init_from)), configs.class_files(config))
     other = folder.read_config()
     for name in ("task", "policy", "policy_config"):
         value, here = getattr(other, name), getattr(config, name)

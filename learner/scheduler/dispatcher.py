@@ -30,6 +30,7 @@ from learner.scheduler.ledger import Ledger
 from learner.scheduler.membership import Admission, Attendance, Members
 from learner.scheduler.round import RoundResults, Shapes
 from learner.scheduler.scheduler import SchedulerConfig
+from learner.scheduler.silence import Silences
 from learner.scheduler.status import StatusAnswer
 
 log = logging.getLogger(__name__)
@@ -60,6 +61,7 @@ class Dispatcher:
         shapes: Shapes,
         scheduler: SchedulerConfig | None = None,
         judge: Judge | None = None,
+        end: Callable[[str], bool] = lambda _: False,
     ) -> None:
         """Show the run on the network: subscriptions first, the liveliness token last.
 
@@ -74,6 +76,7 @@ class Dispatcher:
           shapes: of the results.
           scheduler: how jobs are cut into chunks, and when they are sent again.
           judge: decides between hosts whose answers differ; without one, other hosts do.
+          end: ends the process of a worker of this machine, to be replaced; false if it is none.
         """
         self.run, self.admission = spec.run, admission
         self.notices = Notices(log)  # what was ignored, and why
@@ -93,6 +96,7 @@ class Dispatcher:
         """In how many rollouts MuJoCo warned of something, by kind; also in those that were repeated."""
         self._told = False  # why a rollout failed by an error of its code; once in a run
         self._progress: GenerationStats | None = None
+        self._silences, self._end = Silences(), end
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
         session.rates.most = max(session.rates.most, 4 * config.instances)  # each worker asks once per second
         session.subscribe("want", keys.want(farm, "**"), most=_UNREAD)
@@ -184,6 +188,7 @@ class Dispatcher:
                     f"with the numbers {self.admission.canary[:8]}, which then decides itself"
                 )
             self._end_if_nobody_can_come()
+            self._look_for_silence()
             self._refresh_status()
             if self._stopped():
                 raise Stopped
@@ -251,6 +256,7 @@ class Dispatcher:
             log.info("worker %s joined (release %s)", want.worker, want.version)
         now, idle = time.monotonic(), self.run in want.idle
         self._ledger.scheduler.want(want.worker, want.credits, now, idle=idle)
+        self._heard(want.worker)
         if idle:
             self._ledger.audit.lost(want.worker)
         self._members.asked(want, now)
@@ -270,6 +276,7 @@ class Dispatcher:
             return
         self._attendance.left(worker)
         self._members.left(worker)
+        self._silences.left(worker)
         if worker in self._ledger.scheduler.workers:
             again = self._ledger.lost(worker)
             log.info("worker %s left%s", worker, f"; {again} of its jobs are sent again" if again else "")
@@ -310,10 +317,35 @@ class Dispatcher:
             self.notices.ignore("foreign", f"of {message.worker} on {event.key}")
         elif (message.incarnation, message.round) != (self.incarnation, self._header.round):
             self.notices.ignored["stale"] += 1
+            self._heard(sender)
         elif isinstance(message, Failure):
             self._failed(message)
+            self._heard(sender)
         else:
             self._count(message)
+            self._heard(sender)
+
+    def _heard(self, worker: str) -> None:
+        self._silences.heard(worker, time.monotonic(), waiting=self._ledger.scheduler.holds(worker))
+
+    def _look_for_silence(self) -> None:
+        """Say which workers have not answered for long; end and replace those of this machine.
+
+        Raises:
+          RunError: that happens again and again.
+        """
+        for worker, silence, over in self._silences.long(time.monotonic(), self._ledger.scheduler.patience):
+            seconds = time.monotonic() - silence.since
+            what = f"job {silence.job} of generation {silence.generation}"
+            if not over:
+                log.warning("worker %s has not answered for %.0f s, at %s: does its task hang?", worker, seconds, what)
+            elif self._end(worker):
+                log.warning("worker %s has not answered for %.0f s, at %s: it is replaced", worker, seconds, what)
+                if self._silences.end(self._header.round):
+                    raise RunError(
+                        f"{self._silences.ended} workers had to be replaced because they did not answer, the last "
+                        f"after {seconds:.0f} s at {what}: the task hangs"
+                    )
 
     def _count(self, message: Results) -> None:
         now = time.monotonic()
@@ -375,6 +407,7 @@ class Dispatcher:
         # Without block: a frozen host must not delay the others; deadlines cover lost messages.
         head = {"run": self.run, "incarnation": self.incarnation, "round": self._header.round}
         for worker, indices in jobs:
+            self._silences.given(worker, indices[0], self._header.generation, time.monotonic())
             for part in self._ledger.round.messages(indices):
                 chunk = Chunk.carrying(self._ledger.round.jobs.take(part), **head)
                 self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)

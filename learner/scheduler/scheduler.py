@@ -166,6 +166,11 @@ class Scheduler:
         """Note that a worker repeats jobs that are done: the verdict on its answers is "doubled"."""
         self._table.lend(worker, indices, self._now)
 
+    def holds(self, worker: str) -> bool:
+        """Whether a worker has jobs of this round that it has not answered."""
+        state = self._table.workers.get(worker)
+        return state is not None and bool(state.held)
+
     @property
     def patience(self) -> float:
         """Time after which an unanswered job is overdue [s]."""

@@ -8,10 +8,10 @@ from typing import Final
 
 from farm.net import codec, keys
 from farm.net.session import Session
-from farm.net.stats import GenerationStats
 from farm.net.telemetry import Line, Report, RunEnd, RunHistory
 from farm.sim.model_files import split
 from learner.run import config as configs
+from learner.run.files import with_rates
 from learner.run.learner import Learner
 from learner.telemetry.report_log import ReportLog
 
@@ -33,7 +33,7 @@ class Publisher(logging.Handler):
     """
 
     def __init__(self, session: Session, farm: str, incarnation: str, learner: Learner) -> None:
-        """Start with the earlier generations in the run's folder."""
+        """Begin; the run's folder has the earlier generations."""
         super().__init__(logging.INFO)
         self._session, self._key = session, keys.history(farm, learner.folder.name)
         texts, assets = split(learner.problem.task.sources)
@@ -42,9 +42,8 @@ class Publisher(logging.Handler):
             config=configs.to_dict(learner.config), files=texts, assets=assets,
             generation=learner.state.generation, reports=(), end=None, undone=learner.undone,
         )  # fmt: skip
-        self._reports, self._lines, self._warned = ReportLog(), list[Line](), False
-        for report in _before(learner.folder.progress(), incarnation):
-            self._reports.add(report)
+        self._folder, self._lines, self._warned = learner.folder, list[Line](), False
+        self._reports = ReportLog(self._earlier)
         self._outlet = session.outlet(keys.report(farm, self._run.run))
         session.answer_asked(self._key, self._page)
         logging.getLogger().addHandler(self)
@@ -56,10 +55,10 @@ class Publisher(logging.Handler):
     def generation(self, report: Report) -> None:
         """Publish a finished generation."""
         message = replace(self._bounded(report), incarnation=self._run.incarnation, lines=self._taken())
-        self._reports.add(message)
+        payload = self._reports.add(message)
         self._run = replace(self._run, generation=message.generation)
         if self._outlet.heard:
-            self._outlet.publish(codec.encode(message))
+            self._outlet.publish(payload)
 
     def end(self, end: RunEnd) -> None:
         """Announce the end of the run."""
@@ -87,6 +86,15 @@ class Publisher(logging.Handler):
         run = self._run  # before the reports, which may grow meanwhile
         return codec.encode(replace(run, reports=self._reports.page(first)))
 
+    def _earlier(self, first: int) -> Iterator[Report]:
+        """Published generations in the folder from this one on, without rollouts. Thread: Zenoh's."""
+        last = self._run.generation
+        for progress, rate in with_rates(self._folder.progress_after(first - 2)):
+            if progress.generation > last:
+                return
+            if progress.generation >= first:
+                yield Report(incarnation=self._run.incarnation, progress=progress, rate=rate)
+
     def _bounded(self, report: Report) -> Report:
         """The report, without the traces of all rollouts if they are too large for a message."""
         if "all" not in report.traces or report.traces["all"].nbytes <= _TRACES:
@@ -96,12 +104,3 @@ class Publisher(logging.Handler):
             log.warning("traces of all rollouts are too large for recorders elsewhere: they get the best and the worst")
         traces = {name: values for name, values in report.traces.items() if name != "all"}
         return replace(report, traces=traces)
-
-
-def _before(progress: list[GenerationStats], incarnation: str) -> Iterator[Report]:
-    """Reports of the generations in the folder, without rollouts."""
-    rollouts, seconds = 0, 0.0
-    for p in progress:
-        rate = (p.rollouts - rollouts) / max(p.seconds - seconds, 1e-3)  # seconds are written to the millisecond
-        rollouts, seconds = p.rollouts, p.seconds
-        yield Report(incarnation=incarnation, progress=p, rate=rate)

@@ -2,10 +2,11 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from farm import plugins
 from farm.errors import ConfigError, Interrupted, MessageError, RunError
 from farm.net import codec, keys
 from farm.net.events import Event
@@ -177,20 +178,23 @@ class Subscriber:
         self._incarnation = page.incarnation
 
     def _read(self, page: RunHistory) -> RunConfig:
-        """The run's configuration; classes in files are those of this machine's files of the same names."""
-        return configs.from_dict(localised(page.config, self._files), f"run {self._run}")
+        """The run's configuration; classes in files are those of this machine's files of the same names.
+
+        Raises:
+          ConfigError: a class is in none of them.
+        """
+        check_allowed(page.config, self._files)
+        return configs.from_dict(page.config, f"run {self._run}", self._files)
 
 
-def localised(config: dict[str, Any], files: tuple[Path, ...]) -> dict[str, Any]:
-    """A configuration whose classes come from these files; a ConfigError if a class is in none of them."""
-    out = dict(config)
-    for part in ("task", "policy", "algorithm"):
+def check_allowed(config: Mapping[str, Any], files: tuple[Path, ...]) -> None:
+    """Check that each class in a file comes from one of these files.
+
+    Raises:
+      ConfigError: one is in none of them.
+    """
+    for part in configs.PARTS:
         table = config.get(part)
-        path, _, inside = str(table.get("name") if isinstance(table, dict) else "").rpartition(":")
-        if isinstance(table, dict) and path.endswith(".py"):
-            here = [file for file in files if file.name == Path(path).name]
-            if not here:
-                name = Path(path).name
-                raise ConfigError(f"the run's {part} is a class in {name}: copy it here, and give --allow-file {name}")
-            out[part] = {**table, "name": f"{here[0].resolve()}:{inside}"}
-    return out
+        name = Path(plugins.named_file(str(table.get("name")) if isinstance(table, dict) else "")).name
+        if name and name not in [file.name for file in files]:
+            raise ConfigError(f"the run's {part} is a class in {name}: copy it here, and give --allow-file {name}")

@@ -1,5 +1,6 @@
 """`farm runs --serve`: recordings of runs in Rerun's catalog."""
 
+import shutil
 import signal
 import socket
 
@@ -18,8 +19,10 @@ def test_each_recorded_run_is_a_segment_of_the_folders_data_set(farm: Farm) -> N
     for name in ("a", "b"):
         farm.call("run", "--name", name, "--workers", "1", "--pairs", "2", "--generations", "3")
     farm.call("run", "--name", "c", "--no-record", "--workers", "1", "--pairs", "2", "--generations", "1")
+    shutil.copytree(farm.folder / "runs/b", farm.folder / "runs/copy")
     process = farm.start("runs", "--serve", free_endpoint().rpartition(":")[2])
     assert process.stdout
+    assert process.stdout.readline() == "runs/copy is left out: it is a copy of runs/b, with the same recording's id\n"
     announcement = process.stdout.readline()
     assert announcement.startswith("2 recordings at rerun+http://127.0.0.1:")
     address = announcement.split()[3].rstrip(":")

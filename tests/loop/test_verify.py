@@ -30,12 +30,29 @@ def test_a_whole_run_is_repeated_on_workers(tmp_path: Path, capsys: pytest.Captu
 
 
 @pytest.mark.slow
+def test_results_that_are_called_interrupted_are_compared_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = farm.configure(f"{pole(tmp_path)}:Pole", generations=3, pairs=3)
+    for _ in farm.learn(config, tmp_path / "r", workers=1):
+        pass
+    path = tmp_path / "r" / "summary.json"
+    summary = json.loads(path.read_text()) | {"state": "interrupted"}
+    path.write_text(json.dumps(summary | {"mean_policy_return": 99.0}))
+    assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 1
+    assert "mean_policy_return is 99.0 in summary.json" in capsys.readouterr().err
+    path.write_text(json.dumps(summary | {"mean_policy_return": None}))
+    assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 0, "a run without an end has no results"
+
+
+@pytest.mark.slow
 def test_an_interrupted_repetition_of_the_whole_run_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = farm.configure(f"{pole(tmp_path)}:Pole", generations=6, pairs=3)
     for _ in farm.learn(config, tmp_path / "r", workers=1):
         pass
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     words, repeated = ["verify", str(tmp_path / "r"), "--all", "--workers", "1"], command.verify_all
     words += ["--receipt", str(tmp_path / "r.json")]
 

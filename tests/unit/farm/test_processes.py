@@ -102,3 +102,81 @@ with forks(2) as waiting, LocalWorkers(1, NOBODY, waiting) as pool:
     words = until(lambda: open(f"/proc/{pool.pids[0]}/cmdline", "rb").read())  # empty while the program is loaded
     print(waiting, b"workers" in words)
 """) == "[] True\n"  # fmt: skip
+
+
+FORKING = """
+child = os.fork()
+if not child:
+    print(*(signal.getsignal(each) == default for each, default in (
+        (signal.SIGTERM, signal.SIG_DFL), (signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler),
+        (signal.SIGUSR1, signal.SIG_IGN))), flush=True)
+    os._exit(0)
+os.waitpid(child, 0)
+"""
+
+
+@pytest.mark.parametrize(
+    "begin", ["default_signals_in_forks()", "import workers.__main__; workers.__main__.main(['-h'])"]
+)
+def test_what_a_task_forks_ends_at_signals(begin: str) -> None:
+    output = ran(f"""
+from farm.processes import default_signals_in_forks
+try:
+    {begin}
+except SystemExit:
+    pass
+for each in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+    signal.signal(each, lambda *_: None)
+signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+""" + FORKING)  # fmt: skip
+    assert output.splitlines()[-1] == "True True True True"
+
+
+STARTS_ANOTHER = """
+import os, subprocess, sys
+child = subprocess.Popen(["sleep", "1000"])
+print(os.getpid(), child.pid, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("how", ["pool.kill(pid)", "os.kill(pid, signal.SIGKILL)"])
+def test_what_a_killed_worker_has_started_ends_with_it(how: str, tmp_path: Path) -> None:
+    (tmp_path / "leader.py").write_text(STARTS_ANOTHER)
+    pid, child = ran(f"""
+import subprocess
+pool = LocalWorkers(0, NOBODY)
+leader = subprocess.Popen([sys.executable, {str(tmp_path / "leader.py")!r}], stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE, text=True, start_new_session=True)
+pool._processes.append(leader)
+pid, child = map(int, leader.stdout.readline().split())
+{how}
+until(lambda: leader.poll() is not None)
+pool._restarts = 1000
+pool.tend()
+print(pid, child)
+""").split()  # fmt: skip
+    limit = time.monotonic() + 20
+    while running(pid) or running(child):
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+
+
+def test_a_program_that_has_used_zenoh_forks_no_workers_and_its_forks_use_none() -> None:
+    output = ran("""
+from farm.errors import RunError
+from farm.net.forks import begin_zenoh
+begin_zenoh()
+with forks(2) as waiting:
+    print(waiting, flush=True)
+child = os.fork()
+if not child:
+    try:
+        begin_zenoh()
+    except RunError as error:
+        print(error, flush=True)
+    os._exit(0)
+os.waitpid(child, 0)
+begin_zenoh()
+""")
+    assert output.startswith("[]\nthis process was forked from one that has used a farm")

@@ -107,7 +107,7 @@ def test_bad_input_is_one_line(tmp_path: Path, pole: str, starts: list[int], pol
 
 def test_a_damaged_file_is_named(tmp_path: Path, pole: str) -> None:
     (tmp_path / "a.npz").write_bytes(b"PK damaged")
-    with pytest.raises(farm.ConfigError, match=r"a\.npz holds no golden rollouts"):
+    with pytest.raises(farm.ConfigError, match=r"a\.npz is no file of golden rollouts"):
         same(pole, "linear", [0], tmp_path / "a.npz")
 
 

@@ -2,14 +2,18 @@
 
 import csv
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from made import stats
+from made import checkpoint, stats
 
 from farm.__main__ import main
+from farm.errors import Interrupted
+from learner.run import checkpoint as checkpoints
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
@@ -99,3 +103,28 @@ def test_a_run_that_was_cut_short_has_not_failed(runs: Path, capsys: pytest.Capt
         damage(runs, json.dumps({**GOOD, "run": name, "mean_policy_success": False, "state": state}))
         words = table(runs, capsys)[0].split()
         assert ("not" in words, "no" in words) == ((True, False) if state == "interrupted" else (False, True))
+
+
+def test_a_copy_of_a_run_is_left_out_of_the_catalog(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    viewing = pytest.importorskip("learner.recording.viewing")
+    served: list[Path] = []
+
+    @contextmanager
+    def catalog(_: str, files: list[Path], __: int) -> Iterator[str]:
+        served.extend(files)
+        raise Interrupted("looked at")
+        yield ""
+
+    monkeypatch.setattr(viewing, "catalog", catalog)
+    for name in ("a", "b", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text("{}")
+        (tmp_path / name / "run.rrd").touch()
+    checkpoints.save(tmp_path / "a" / "checkpoint", checkpoint(run="first"))
+    checkpoints.save(tmp_path / "b" / "checkpoint", checkpoint(run="first"))
+    assert main(["runs", str(tmp_path), "--serve", "51234"]) == 130
+    assert served == [tmp_path / "a" / "run.rrd", tmp_path / "other" / "run.rrd"]
+    said = f"{tmp_path / 'b'} is left out: it is a copy of {tmp_path / 'a'}, with the same recording's id"
+    assert said in capsys.readouterr().out

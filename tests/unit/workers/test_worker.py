@@ -155,7 +155,7 @@ def test_a_task_it_cannot_build(stage: Stage, caplog: pytest.LogCaptureFixture) 
         assert failure.index is None, "it is not the job"
         assert failure.error == "RuntimeError: no such machine"
     assert learner.asked["spec"] == 1
-    assert caplog.messages[0].startswith("cannot serve run r: no such")
+    assert caplog.messages[0].startswith("cannot serve run r: RuntimeError: no such")
     assert caplog.records[0].exc_info is None, "its learner shows the traceback"
 
 

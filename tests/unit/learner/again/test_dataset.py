@@ -1,5 +1,6 @@
 """A data set's parts, without a network: lies are found, and what an expelled host has simulated is made again."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 from alone import POLE, Alone
 
-from farm.errors import RunError
+from farm.__main__ import main
+from farm.errors import ConfigError, RunError
 from farm.net.work import Jobs, Results
 from farm.tasks.rollouts import steps_shape
 from learner.again import dataset
@@ -110,3 +112,60 @@ def test_what_an_expelled_host_has_simulated_is_made_again(make: Callable[..., t
     assert hosts.parts == [0, 1, 2, 3, 1, 2, 3]
     assert [part["numbers"] for part in work.done] == [part["numbers"] for part in honest.done]
     assert work.expelled == {"host-1": "it lied"}
+
+
+MANIFEST = {"version": 1, "episodes": 2, "seed": 1, "files": {}, "numbers_sha256": "x", "pyarrow": "1"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"episodes": None}, "episodes is 'None'; expected a whole number from 1 to 10000000"),
+        ({"episodes": 0}, "episodes is '0'"),
+        ({"episodes": 1.5}, "episodes is '1.5'"),
+        ({"episodes": True}, "episodes is 'True'"),
+        ({"episodes": 10**15}, "episodes is '1000000000000000'"),
+        ({"seed": [1]}, "seed is .*; expected a whole number from 0 to 4294967295"),
+        ({"seed": -5}, "seed is '-5'"),
+        ({"files": []}, r"files is '\[\]'; expected a table of digests by path"),
+        ({"numbers_sha256": 3}, "numbers_sha256 is '3'; expected a text"),
+        ({"pyarrow": None}, "pyarrow is 'None'; expected a text"),
+        ({"version": 2}, "is not of version 1"),
+        ({"version": None}, "is not of version 1"),
+    ],
+)
+def test_made_up_manifests_are_refused_before_anything_is_done(
+    tmp_path: Path, changed: dict[str, object], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps(MANIFEST | changed))
+    with pytest.raises(ConfigError, match=reason):
+        dataset.read(path)
+    assert main(["dataset", "--from", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()
+    assert "manifest.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["[]", "7", "no JSON", "[" * 100_000, "9" * 10_000, ""])
+def test_manifests_that_are_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(ConfigError, match="is not JSON|is not of version 1"):
+        dataset.read(tmp_path / "manifest.json")
+
+
+def test_a_manifest_that_is_very_large_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "manifest.json"
+    with path.open("wb") as file:
+        file.truncate(1 << 30)  # takes no room
+    with pytest.raises(ConfigError, match="has 1024 MiB; at most 64 are read"):
+        dataset.read(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[]", "{}", '{"done": 3, "expelled": {}}', '{"done": [{}], "expelled": {}}', '{"done": [], "expelled": []}'],
+)
+def test_a_made_up_account_of_parts(tmp_path: Path, text: str) -> None:
+    (tmp_path / "unfinished.json").write_text(text)
+    with pytest.raises(ConfigError, match="unfinished.json is damaged"):
+        dataset._unfinished(tmp_path / "unfinished.json")

@@ -12,7 +12,9 @@ import pytest
 from alone import POLE, Alone
 
 from farm.__main__ import main
-from learner.again.verify import Differs, chosen, stored, verify_some, workers
+from learner.again import rewind
+from learner.again.stored import Differs, stored
+from learner.again.verify import chosen, verify_some, workers
 from learner.commands import verify as command
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
@@ -22,6 +24,14 @@ from learner.run.folder import RunFolder
 from learner.run.learner import Learner
 
 GENERATIONS = 6
+
+
+@pytest.fixture(autouse=True)
+def _own_secret(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the secret of receipts out of the home of whoever runs the tests."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+
+
 SETTINGS = (
     {},
     {"policy": "linear", "algorithm": "snes", "normalise": True},
@@ -59,6 +69,7 @@ def forged(folder: RunFolder) -> None:
         before = hash_chain.following(before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state)
         folder.chain.append(generation, hash_chain.ChainEntry(before, state))
     checkpoints.save(folder.checkpoint, replace(at, chain=before, config=configs.to_dict(config)))
+    folder.write_summary((folder.read_summary() or {}) | {"chain": before, "seed": config.seed})
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: each.get("algorithm", "default"))
@@ -130,6 +141,22 @@ def in_the_summary(folder: RunFolder) -> None:
     folder.write_summary(summary | {"parameters_sha256": "0" * 64})
 
 
+def in_a_result_of_the_summary(folder: RunFolder) -> None:
+    summary = folder.read_summary()
+    assert summary is not None
+    folder.write_summary(summary | {"best_return": 99.0})
+
+
+def in_the_rollouts_of_the_summary(folder: RunFolder) -> None:
+    summary = folder.read_summary()
+    assert summary is not None
+    folder.write_summary(summary | {"state": "failed", "rollouts": 10**6})
+
+
+def a_damaged_summary(folder: RunFolder) -> None:
+    (folder.path / "summary.json").write_text('{"state": "finished"')
+
+
 def another_link(folder: RunFolder) -> None:
     """Two digests of the chain, exchanged."""
     lines = (folder.path / "chain").read_text().splitlines()
@@ -161,8 +188,11 @@ ALTERED: dict[Callable[[RunFolder], None], str] = {
     another_count: "generation 6 differs: checkpoint is not the one that chain says",
     in_the_configuration: "generation 1 differs: --seed is 7 in config.json, and 0 in checkpoint",
     another_link: IN_CHAIN.format(2),
+    in_a_result_of_the_summary: r"best_return is 99\.0 in summary.json, and .* by the run's other files",
+    in_the_rollouts_of_the_summary: "rollouts is 1000000 in summary.json, and 48 by the run's other files",
+    a_damaged_summary: "summary.json is damaged",
     a_cut_chain: "generation 3 differs: chain has no line of it",
-    in_the_summary: "summary.json says that the parameters are 0000",
+    in_the_summary: "parameters_sha256 is '0000.*' in summary.json, and .* by the run's other files",
 }
 FORGED: dict[Callable[[RunFolder], None], str] = {
     one_digit: "generation 4 differs: return_max is .* in progress.jsonl, and .* when it is repeated",
@@ -233,9 +263,9 @@ def test_an_interrupted_verification_continues(
     with monkeypatch.context() as patched:
         patched.setattr(command, "verify_some", pressed)
         assert main(words) == 130
-    assert "stopped; no difference in 2 of 6 generations" in capsys.readouterr().out
+    assert "stopped; no difference in 1 of 6 generations" in capsys.readouterr().out
     before = json.loads(Path("r.json").read_text())
-    assert (before["verdict"], len(before["chosen"]), before["generations"]) == ("interrupted", 5, before["chosen"][:2])
+    assert (before["verdict"], len(before["chosen"]), before["generations"]) == ("interrupted", 5, before["chosen"][:1])
     with monkeypatch.context() as patched:
         attempts: list[int] = []
         patched.setattr(
@@ -243,7 +273,7 @@ def test_an_interrupted_verification_continues(
         )
         assert main(words) == 0
     after = json.loads(Path("r.json").read_text())
-    assert attempts == before["chosen"][2:]
+    assert attempts == before["chosen"][1:]
     assert (after["verdict"], after["generations"]) == ("the same", before["chosen"])
 
 
@@ -294,3 +324,149 @@ def test_what_it_cannot_do(
     folder = learnt(tmp_path / "r")
     assert main(["verify", str(folder.path), *words]) == 2
     assert reason in capsys.readouterr().err
+
+
+def thinned(folder: RunFolder, every: int) -> None:
+    """Keep one generation in `every` in parameters, as a long run does."""
+    path = folder.path / "parameters"
+    head, body = path.read_bytes().split(b"\n", 1)
+    size = folder.parameters.rows().dtype.itemsize
+    rows = [body[at : at + size] for at in range(0, len(body), size)]
+    path.write_bytes(
+        json.dumps(json.loads(head) | {"every": every}).encode() + b"\n" + b"".join(rows[every - 1 :: every])
+    )
+
+
+def test_generations_are_chosen_whose_state_is_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = learnt(tmp_path / "r")
+    thinned(folder, 2)
+    run, rng = stored(folder), np.random.default_rng(0)
+    assert {each for _ in range(50) for each in chosen(run, 0.5, rng)} == {1, 3, 5}
+    assert chosen(run, 1.0, rng) == [1, 2, 3, 4, 5, 6]
+    assert verified(folder, [1, 3, 5]) == [1, 3, 5]
+    assert "learning the run again" not in caplog.text
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: each.get("algorithm", "default"))
+def test_generations_whose_state_is_not_kept_are_repeated_in_one_pass(
+    tmp_path: Path, settings: dict[str, object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = learnt(tmp_path / "r", **settings)
+    thinned(folder, 3)
+    steps: list[int] = []
+    before = rewind.LearntAgain.step
+    monkeypatch.setattr(rewind.LearntAgain, "step", lambda again, do: steps.append(1) or before(again, do))
+    assert sorted(verified(folder)) == [1, 2, 3, 4, 5, 6]
+    assert len(steps) == 6, "each generation is learnt once"
+    assert caplog.text.count("learning the run again up to there") == 1
+
+
+def test_learning_again_ends_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    thinned(learnt(tmp_path / "r"), 6)
+    before, steps = rewind.LearntAgain.step, []
+
+    def stopped(again: rewind.LearntAgain, simulate: Any) -> Any:
+        steps.append(again.state.generation)
+        if len(steps) == 2:
+            signal.raise_signal(signal.SIGTERM)
+        return before(again, simulate)
+
+    monkeypatch.setattr(rewind.LearntAgain, "step", stopped)
+    assert main(["verify", str(tmp_path / "r"), "--share", "1.0"]) == 130
+    assert steps == [0, 1]
+    assert "stopped; no difference in" in capsys.readouterr().out
+
+
+def test_what_was_altered_is_found_in_the_one_pass(tmp_path: Path) -> None:
+    folder = learnt(tmp_path / "r")
+    thinned(folder, 6)
+    lines = (folder.path / "progress.jsonl").read_text().splitlines()
+    lines[2] = json.dumps(json.loads(lines[2]) | {"return_mean": 0.5})
+    (folder.path / "progress.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(Differs, match="generation 3 differs: return_mean is 0.5 in progress.jsonl"):
+        verified(folder, [2, 3, 5])
+
+
+def test_another_number_of_rollouts_is_found(tmp_path: Path) -> None:
+    folder = learnt(tmp_path / "r")
+    thinned(folder, 6)
+    lines = (folder.path / "progress.jsonl").read_text().splitlines()
+    lines[2] = json.dumps(json.loads(lines[2]) | {"rollouts": 1000})
+    (folder.path / "progress.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(Differs, match="generation 3 differs: rollouts is 1000 in progress.jsonl, and 24 when"):
+        verified(folder, [3])
+
+
+def without_a_chain(folder: RunFolder) -> None:
+    """As runs of releases that had none."""
+    (folder.path / "chain").unlink()
+    checkpoints.save(folder.checkpoint, replace(checkpoints.load(folder.checkpoint), chain=""))
+    (folder.path / "summary.json").unlink()
+
+
+def test_a_run_of_a_release_without_a_chain_is_said_to_be_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = learnt(tmp_path / "r")
+    without_a_chain(folder)
+    assert verified(folder) == [1, 2, 3, 4, 5, 6]
+    assert "it was learnt by a release without a chain of digests" in caplog.text
+    assert "there is none at all, so that only what is repeated is verified" in caplog.text
+    one_digit(folder)
+    with pytest.raises(Differs, match="generation 4 differs: return_max"):
+        verified(folder)
+
+
+def test_a_run_that_got_its_chain_when_it_was_resumed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = learnt(tmp_path / "r")
+    without_a_chain(folder)
+    config = replace(folder.read_config(), generations=GENERATIONS + 2)
+    problem, at = setup.resumed(folder, config)
+    folder.write_config(config)
+    for _ in Learner(problem, folder, at).learn(Alone(problem)):  # type: ignore[arg-type]
+        pass
+    assert verified(folder, [8]) == [8]
+    assert "there is none before generation 7" in caplog.text
+
+
+def test_only_this_users_receipts_are_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    learnt(tmp_path / "r")
+    assert main(["verify", "r", "--share", "0.01", "--receipt", "r.json"]) == 0
+    honest = json.loads(Path("r.json").read_text())
+    made_up = honest | {"verdict": "interrupted", "chosen": [1, 2], "generations": [1, 2], "rollouts": 60}
+    for receipt in (made_up, {name: value for name, value in made_up.items() if name != "seal"}, made_up | {"seal": 3}):
+        Path("r.json").write_text(json.dumps(receipt))
+        assert main(["verify", "r", "--share", "1.0", "--receipt", "r.json"]) == 2
+        assert "r.json says that a verification was interrupted, but was not written by you" in capsys.readouterr().err
+        assert json.loads(Path("r.json").read_text()) == receipt
+    Path("r.json").write_text(json.dumps(made_up | {"verdict": "the same"}))
+    assert main(["verify", "r", "--share", "1.0", "--receipt", "r.json"]) == 0
+    assert json.loads(Path("r.json").read_text())["generations"] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_folder_that_is_no_interrupted_repetition_is_not_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    learnt(tmp_path / "r")
+    learnt(tmp_path / "r.json.run" / "r")
+    assert main(["verify", "r", "--all", "--workers", "1", "--receipt", "r.json"]) == 2
+    assert "r.json.run is not of an interrupted verification of this run by you" in capsys.readouterr().err
+    assert (tmp_path / "r.json.run" / "r" / "checkpoint").exists()
+    assert not Path("r.json").exists()
+
+
+def test_what_was_not_compared_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = learnt(tmp_path / "r")
+    folder.write_summary((folder.read_summary() or {}) | {"robust_return": 5.0, "prize": "first"})
+    assert main(["verify", "r", "--receipt", "r.json"]) == 0
+    left = json.loads(Path("r.json").read_text())["not_compared"]
+    assert {"state", "seconds", "robust_return", "prize", "checks"} <= {*left}
+    assert not {"rollouts", "best_return", "steps", "chain", "mean_policy_return"} & {*left}
+    assert f"not compared, of summary.json: {', '.join(left)}" in capsys.readouterr().out

@@ -191,3 +191,35 @@ def test_a_run_that_is_over_has_one_file(tmp_path: Path) -> None:
     path.write_bytes(b"")
     with pytest.raises(CheckpointError, match="is not a checkpoint"):
         load(path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"generation": -5}, "its generation is '-5'"),
+        ({"generation": 10**15}, "its generation is '1000000000000000'; expected 0 to 10000000"),
+        ({"generation": "soon"}, "its generation is 'soon'"),
+        ({"mu": 3.0}, "its mu is no vector of numbers"),
+        ({"mu": np.ones((2, 2))}, "its mu is no vector of numbers"),
+        ({"mu": np.array([0.5])}, "its mu and sigma have different lengths"),
+        ({"sigma": None}, "its sigma is no vector of numbers"),
+    ],
+)
+def test_made_up_states(tmp_path: Path, changed: dict[str, object], reason: str) -> None:
+    sound = checkpoint()
+    save(tmp_path / "checkpoint", replace(sound, state=sound.state | changed))
+    with pytest.raises(CheckpointError, match=reason):
+        load(tmp_path / "checkpoint")
+    missing = {name: value for name, value in sound.state.items() if name not in changed}
+    save(tmp_path / "checkpoint", replace(sound, state=missing))
+    with pytest.raises(CheckpointError, match=f"its {next(iter(changed))} is "):
+        load(tmp_path / "checkpoint")
+
+
+def test_made_up_constants_and_files(tmp_path: Path) -> None:
+    save(tmp_path / "checkpoint", checkpoint(constants={"frequencies": 3}))
+    with pytest.raises(CheckpointError, match="a constant of its policy is no array"):
+        load(tmp_path / "checkpoint")
+    save(tmp_path / "checkpoint", checkpoint(assets={"mesh.stl": "../../secret"}))
+    with pytest.raises(CheckpointError, match="a file 'mesh.stl' without a SHA-256"):
+        load(tmp_path / "checkpoint")

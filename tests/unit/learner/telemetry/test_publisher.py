@@ -48,9 +48,9 @@ def link() -> Iterator[tuple[Session, Session]]:
 @pytest.fixture
 def publisher(link: tuple[Session, Session]) -> Iterator[Publisher]:
     """The publisher of a run that has done two generations, in a folder that was then renamed."""
+    folder = SimpleNamespace(name="r", progress_after=lambda _: iter([stats(1), stats(2)]))
     learner = SimpleNamespace(
-        folder=SimpleNamespace(name="r", progress=lambda: [stats(1), stats(2)]), run="first", config=RunConfig(),
-        state=SimpleNamespace(generation=2), undone=0,
+        folder=folder, run="first", config=RunConfig(), state=SimpleNamespace(generation=2), undone=0,
         problem=SimpleNamespace(task=SimpleNamespace(sources={"model.xml": "<mujoco/>"})),
     )  # fmt: skip
     service = Publisher(link[0], "farm", "i", learner)  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from learner.run.config import RunConfig
 from learner.run.states import RolledBack
 from learner.telemetry import subscriber as subscribers
 from learner.telemetry.report_log import ReportLog
-from learner.telemetry.subscriber import Subscriber, find_run, localised
+from learner.telemetry.subscriber import Subscriber, check_allowed, find_run
 
 
 class LearnerSide:
@@ -184,16 +184,18 @@ def test_the_only_run_of_a_farm_is_found(pair: tuple[LearnerSide, Subscriber]) -
 
 def test_classes_in_files_are_those_of_this_machine(tmp_path: Path) -> None:
     config = configs.to_dict(RunConfig())
-    assert localised(config, ()) == config
+    assert configs.localised(config, ()) == config
+    check_allowed(config, ())
     config["task"]["name"] = "/somewhere/else/pole.py:Pole"
     here = tmp_path / "pole.py"
-    local = localised(config, (tmp_path / "other.py", here))
+    check_allowed(config, (tmp_path / "other.py", here))
+    local = configs.localised(config, (tmp_path / "other.py", here))
     assert local["task"] == {**config["task"], "name": f"{here}:Pole"}
     assert config["task"]["name"].startswith("/somewhere"), "the configuration is left alone"
     with pytest.raises(
         ConfigError, match=r"the run's task is a class in pole\.py: copy it here, and give --allow-file"
     ):
-        localised(config, (tmp_path / "other.py",))
+        check_allowed(config, (tmp_path / "other.py",))
 
 
 def test_a_run_that_went_back_is_another_recording(pair: tuple[LearnerSide, Subscriber]) -> None:
