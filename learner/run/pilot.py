@@ -4,7 +4,7 @@ No size of the first perturbations fits all robots: one that barely moves an arm
 mu +- sigma e_k, e_k ~ N(0, I), are simulated from the same S starts as mu itself, with the configured sigma, then with
 a third of it, and so on, until exploring costs little:
 
-    r_0 - r <= 3 signal,   signal = std over k of the mean over s of r(mu + sigma e_k, s) - r(mu - sigma e_k, s),
+    r_0 - r <= 6 signal,   signal = std over k of the mean over s of r(mu + sigma e_k, s) - r(mu - sigma e_k, s),
 
 where r_0 is the mean return of mu, and r that of the perturbed policies: exploring does not cost much more than
 it tells about directions. And if mu mostly lasts, hardly more rollouts may end early or fail than with it: a robot that
@@ -40,7 +40,7 @@ STARTS: Final = 4
 
 _STEP: Final = 10.0**-0.5  # from one sigma to the next
 _SIGMAS: Final = 6  # that are tried at most
-_COST: Final = 3.0  # signals that exploring may cost
+_COST: Final = 6.0  # signals that exploring may cost
 _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond those of the mean
 _LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
 _MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts

@@ -91,10 +91,10 @@ def test_where_no_return_changes_the_run_begins_as_configured(tmp_path: Path) ->
 
 def test_what_fits() -> None:
     base = Tried(sigma=0.0, returned=5.0, lost=0.25)
-    each = Tried(sigma=0.1, returned=2.0, lost=0.25, signal=1.0)
+    each = Tried(sigma=0.1, returned=-1.0, lost=0.25, signal=1.0)
     assert each.fits(base)
     assert replace(each, returned=9.0, signal=0.0).fits(base), "it costs nothing"
-    assert not replace(each, returned=1.9).fits(base), "it costs more than it tells"
+    assert not replace(each, returned=-1.1).fits(base), "it costs more than it tells"
     assert replace(each, lost=0.35).fits(base)
     assert not replace(each, lost=0.36, signal=99.0).fits(base), "a robot that stands must not fall"
     assert replace(each, lost=1.0).fits(replace(base, lost=0.5)), "unless it falls anyway"
