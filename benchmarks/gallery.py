@@ -32,7 +32,7 @@ from learner.run.evaluation import evaluation_jobs
 
 ROOT: Final = Path(__file__).parents[1]
 SECONDS: Final = 5.0  # of a film
-SIZE: Final = (200, 150)  # of a film [pixels]
+SIZE: Final = (320, 240)  # of a film [pixels]
 COLOURS: Final = 32
 _WIDTH: Final = 96  # characters of a line of a command
 TRIES: Final = (50, 5)  # constant actions, starts of each
@@ -67,6 +67,7 @@ PIECES: Final = (
     Piece("cart.py:Cart", "A cart balances a pole of random mass."),
     Piece("arm.py:Arm", "An arm follows a ball; the circle and its speed are random.", "--generations 300"),
     Piece("hopper.py:Hopper", "A planar hopper of random weight hops on random ground."),
+    Piece("quadrotor.py:Quadrotor", "A quadrotor flies to a point and hovers there."),
     Piece("jaco.py:Jaco", "A Kinova arm with its meshes follows a ball.", "--generations 60",
           needs="Meshes: [a robot with meshes](../examples/README.md#a-robot-with-meshes)."),
     Piece(
