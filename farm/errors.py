@@ -6,6 +6,7 @@ FarmError                 anything that can be explained in one line
     UnservedError         a run that this machine's workers do not know, lack something for, or may not serve
   MessageError            bytes from the network that are no valid message
   TaskError               a task, policy, algorithm or engine with invalid results (exit status 1)
+    UnstableError         physics that cannot go on
   RunError                a run that cannot continue (exit status 1)
   Interrupted             the user ended it before there was anything to save (exit status 130)
 """
@@ -124,6 +125,10 @@ class UnservedError(ConfigError):
 
 class TaskError(FarmError):
     """A task, policy, algorithm or engine with invalid results: names the result, its value and what was expected."""
+
+
+class UnstableError(TaskError):
+    """Physics that cannot go on, from its start or by an error of MuJoCo's."""
 
 
 class RunError(FarmError):

@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, shaped
-from farm.errors import TaskError
+from farm.errors import TaskError, UnstableError
 from farm.moments import Moments
 from farm.returns import RETURN_FLOOR
 from farm.sim.complaints import KINDS
@@ -169,8 +169,8 @@ class Batch:
         bad: BoolArray = np.logical_not(np.isfinite(x).all(axis=1))
         where = f"before control step {self.sim.t + 1}"
         if (self.sim.blown_up() >= bad).all():
-            why = complaint(self.sim.engine) or "its start makes no sense: farm check looks for the cause"
-            self._fail(TaskError(f"the physics is unstable {where}: {why}"))
+            why = complaint(self.sim.engine) or "look at what reset writes"
+            self._fail(UnstableError(f"the physics is unstable {where}: {why}"))
         else:
             self._fail(TaskError(f"observe is not finite {where}, though the physics is fine"))
         self._conclude(bad, np.zeros(len(bad), dtype=bool), self.sim.t)
@@ -206,7 +206,7 @@ class Batch:
                 self.frames[name][self.rows, t * self._parts + part] = values
         sim.t += 1
         if words := complaint(sim.engine):
-            self._errors.append(TaskError(f"MuJoCo cannot go on: {words}"))
+            self._errors.append(UnstableError(f"MuJoCo cannot go on: {words}"))
         failed = self._reward(action, t, sim.blown_up())
         ended = task.ended(sim)
         ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)

@@ -23,7 +23,7 @@ from farm import plugins, seeds, settings
 from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
-from farm.errors import ConfigError, RunError, TaskError
+from farm.errors import ConfigError, RunError, TaskError, UnstableError
 from farm.returns import known
 from farm.settings import Settings
 from farm.tasks.base import Task, TaskConfig
@@ -200,15 +200,16 @@ def _failures(
     count, errors = int(rollouts.failed.sum()), runner.trouble.errors
     if not count:
         return
-    if errors:
+    of_code = [error for error in errors if not isinstance(error, UnstableError)]
+    if of_code:
         if count == ROWS:
-            raise errors[0]
-        text = told(errors[0])
+            raise of_code[0]
+        text = told(of_code[0])
         yield f"warning: {count} of {ROWS} rollouts failed, the first with {text['error']}"
         yield from (f"  {line}" for line in text["traceback"])
         return
     yield f"warning: the simulation of {count} of {ROWS} rollouts became unstable:"
-    yield from (f"  {line}" for line in causes(config, theta, starts, rollouts))
+    yield from (f"  {line}" for line in [*map(str, errors[:1]), *causes(config, theta, starts, rollouts)])
     if count == ROWS:
         raise TaskError(f"all {ROWS} rollouts became unstable, so that nothing can be learnt: see above")
 

@@ -366,7 +366,7 @@ class Dispatcher:
             self.warned[kind] += count
         if message.error and not self._told:
             self._told = True
-            text = f"a rollout counts as failed, as its code raised an error: {message.error} (--strict ends the run)"
+            text = f"a rollout failed, and counts as such: {message.error} (--strict ends the run)"
             self.notices.once(text, message.traceback)
 
     def _expel(self, host: str, reason: str) -> None:
