@@ -62,11 +62,12 @@ def test_errors_of_some_rollouts(farm: Farm) -> None:
 
 def test_strict_ends_at_the_first(farm: Farm) -> None:
     text = run(farm, "0.6", "strict", "--strict", status=1)
-    assert "failed wherever it was tried, last with RuntimeError: the solver did not converge" in text
+    assert "RuntimeError: the solver did not converge" in text.splitlines()[-1]
+    assert "in reward" in text
 
 
 def test_a_run_in_which_all_fail_ends(farm: Farm) -> None:
-    text = run(farm, "-1.0 if sim.t > 3 else 9.0", "hopeless", status=1)
+    text = run(farm, "(-1.0 if sim.t > 3 else 9.0)", "hopeless", status=1)
     assert "all rollouts of 3 generations failed, so that nothing is learnt" in text
     text = farm.call("run", "--resume", "runs/hopeless", "--no-record", status=1)
     assert "all rollouts of 3 generations failed" in text
@@ -76,13 +77,11 @@ def test_what_mujoco_warns_of_is_said_once(farm: Farm) -> None:
     balls = "".join(
         f'<body pos="{0.1 * (i % 5)} {0.1 * (i // 5)} 0.1"><freejoint/><geom size=".08"/></body>' for i in range(40)
     )
-    text = TASK.replace("(np.abs(sim.qpos[:, 0]) > MOST).any()", "False").replace(
-        "<mujoco>", '<mujoco><size memory="600K"/>'
-    )
+    text = TASK.replace("(np.abs(sim.qpos[:, 0]) > MOST).any()", "False")
+    text = text.replace("<mujoco>", '<mujoco><size memory="600K"/>')
     text = text.replace("</worldbody>", f'<geom type="plane" size="1 1 .1"/>{balls}</worldbody>')
-    text = text.replace(
-        "    def reward", "    def observe(self, sim):\n        return sim.qpos[:, :1]\n\n    def reward", 1
-    )
+    observe = "    def observe(self, sim):\n        return sim.qpos[:, :1]\n\n"
+    text = text.replace("    def reward", f"{observe}    def reward", 1)
     (farm.folder / "pile.py").write_text(text.replace("sim.qpos[row] = 0.0", "sim.qpos[row, 0] = 0.0"))
     words = ("--task", "pile.py:Pole", "--no-record", "--generations", "2", "--pairs", "3", "--workers", "2")
     said = farm.call("run", *words)
