@@ -1,6 +1,6 @@
 """Statistics of a finished generation: one line of progress.jsonl. Pure data."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from typing import Any, Final, get_origin
 

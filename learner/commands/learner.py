@@ -20,6 +20,7 @@ from learner.run.folder import RunFolder
 from learner.run.launch import Placement, Run, how_to_join, open_run
 from learner.run.setup import fitted
 from learner.run.states import RolledBack
+from learner.run.worth import CONSTANTS
 from learner.scheduler.scheduler import SchedulerConfig
 
 
@@ -146,7 +147,7 @@ def compared(summary: Mapping[str, Any]) -> list[str]:
     policy, nothing, constant = (_in_numbers(each) for each in (ours, others["nothing"], others["constant"]))
     lines = [
         f"the policy returns {policy} from {EVALUATION_ROLLOUTS} starts; doing nothing {nothing}, "
-        f"the best constant action {constant}"
+        f"the best of {CONSTANTS} constant actions {constant}"
     ]
     if still is not None and (value is None or value <= still):
         lines.append("warning: the policy is not better than doing nothing; farm check may say why")

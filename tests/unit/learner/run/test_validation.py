@@ -17,7 +17,8 @@ from farm.net.work import Jobs
 from farm.policies.base import PolicyConfig
 from farm.policies.networks import Constant
 from farm.runner import Runner
-from learner.again.verify import stored, verify_some, workers
+from learner.again.stored import stored
+from learner.again.verify import verify_some, workers
 from learner.commands import learner as command
 from learner.commands.of_run import OfRun
 from learner.run import checkpoint as checkpoints
@@ -197,7 +198,7 @@ SUMMARY: dict[str, Any] = {
 
 def test_the_end_says_what_the_policy_is_worth() -> None:
     assert command.compared(SUMMARY) == [
-        "the policy returns 270.4 from 100 starts; doing nothing 53, the best constant action 61.2"
+        "the policy returns 270.4 from 100 starts; doing nothing 53, the best of 32 constant actions 61.2"
     ]
     assert command.compared({**SUMMARY, "without_learning": None}) == []
     measured = {"score": 53.0, "success_rate": 0.25, "measures": {"speed": 0.5}}
@@ -206,7 +207,7 @@ def test_the_end_says_what_the_policy_is_worth() -> None:
     line, warning = command.compared({**worse, "without_learning": others})
     assert line == (
         "the policy returns 53 (success 50%, speed 1) from 100 starts; doing nothing 53 (success 25%, speed 0.5), "
-        "the best constant action 53 (success 25%, speed -)"
+        "the best of 32 constant actions 53 (success 25%, speed -)"
     )
     assert warning.startswith("warning: the policy is not better than doing nothing")
     assert len(command.compared({**SUMMARY, "robust_score": None})) == 2
