@@ -39,6 +39,7 @@ TRIES: Final = 4
 
 def without_learning(problem: Problem, stopped: Callable[[], bool]) -> dict[str, Any] | None:
     """Figures of doing nothing and of the best constant action, as in summary.json; None if the user stopped it."""
+    log.info("simulating doing nothing and constant actions, for comparison (Ctrl-C leaves it out)")
     try:
         with closing(Runner(problem.task, Constant(PolicyConfig(), problem.spec, {}))) as runner:
             return _simulated(runner, problem.config.seed, stopped)
