@@ -19,7 +19,7 @@ from pathlib import Path
 import msgpack
 import zenoh
 
-SCHEMA = 9
+SCHEMA = 10
 LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}  # array dtype -> format character of struct
 
 

@@ -110,7 +110,7 @@ class Runner:
             done.append((rows, rollouts))
         returns = _placed(done, lambda part: part.returns)
         wanted_traces = traces if self.spec.trace_channels or traces == "steps" else "none"
-        selection = rows_with_trace(wanted_traces, returns, ~np.repeat(jobs.seen, jobs.rollouts))
+        selection = rows_with_trace(wanted_traces, returns, jobs.traced(wanted_traces))
         return Simulated(
             **(told(trouble.errors[0]) if trouble.errors else {}),
             warned=dict(trouble.warned),

@@ -11,7 +11,7 @@ import numpy as np
 SEEDS: Final = 2**32
 """Seeds are below this: one 32-bit word each."""
 
-_FEATURES, _EXPLORATION, _TRAINING, _TRIAL, _START, _PILOT = range(1, 7)
+_FEATURES, _EXPLORATION, _TRAINING, _TRIAL, _START, _PILOT, _VALIDATION, _CONSTANT = range(1, 9)
 
 
 def features(seed: int) -> np.random.Generator:
@@ -45,6 +45,16 @@ def pilot(seed: int) -> np.random.Generator:
 def pilot_start(seed: int, start: int) -> tuple[int, ...]:
     """Seed of the task's perturbation for a start of a run's pilot."""
     return (_PILOT, seed, 1, start)
+
+
+def validation(seed: int, start: int) -> tuple[int, ...]:
+    """Seed of the task's perturbation for a start from which a run's mean policies are validated."""
+    return (_VALIDATION, seed, 0, start)
+
+
+def constant() -> np.random.Generator:
+    """Generator for constant actions that policies are compared with, alike for all runs."""
+    return np.random.default_rng((_CONSTANT, 0, 0, 0))
 
 
 def trial(seed: int, rollout: int) -> tuple[int, ...]:

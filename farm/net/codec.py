@@ -10,7 +10,7 @@ import functools
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping, Sized
+from collections.abc import Callable, Collection, Mapping, Sized
 from typing import Any, Final, TypeVar
 
 import msgpack
@@ -19,7 +19,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 9
+SCHEMA: Final = 10
 """Version of all messages; included in each of them."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -36,9 +36,10 @@ M = TypeVar("M")
 C = TypeVar("C", bound=Sized)
 
 
-def encode(message: object, schema: int | None = None) -> bytes:
-    """The message with its type's name and the schema version."""
-    body = {"schema": SCHEMA if schema is None else schema, "type": type(message).__name__, **_plain(message)}
+def encode(message: object, schema: int | None = None, without: Collection[str] = ()) -> bytes:
+    """The message with its type's name and the schema version; perhaps without some of its fields."""
+    fields = {name: value for name, value in _plain(message).items() if name not in without}
+    body = {"schema": SCHEMA if schema is None else schema, "type": type(message).__name__, **fields}
     return bytes(msgpack.packb(body, default=_pack, use_bin_type=True) or b"")
 
 

@@ -51,10 +51,16 @@ class GenerationStats:
     """Means of the task's measures over the exploring rollouts that did not fail, by name; None if all failed."""
     mean_policy_measures: dict[str, Any] = field(default_factory=dict)
     """The same of the mean policy's rollout."""
+    validation: float | None = None
+    """Mean return of the same mean policy from the starts of validation, failed rollouts penalised; None where it was
+    not measured, or all failed."""
 
     def to_dict(self) -> dict[str, Any]:
-        """As a record of progress.jsonl; measures only where the task has some."""
-        return {"version": VERSION, **{name: value for name, value in vars(self).items() if value != {}}}
+        """As a record of progress.jsonl; measures only where the task has some, validation only where it is known."""
+        values = {name: value for name, value in vars(self).items() if value != {}}
+        if self.validation is None:
+            del values["validation"]
+        return {"version": VERSION, **values}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "GenerationStats":
@@ -85,6 +91,9 @@ class GenerationStats:
 def _types(kind: type) -> dict[str, tuple[Any, bool]]:
     """The type of each field, and whether it must be there; cached, as a run has many lines."""
     return {
-        each.name: (dict if get_origin(each.type) is dict else each.type, each.default_factory is MISSING)
+        each.name: (
+            dict if get_origin(each.type) is dict else each.type,
+            each.default is MISSING and each.default_factory is MISSING,
+        )
         for each in fields(kind)
     }

@@ -131,6 +131,14 @@ class Jobs:
         """Which jobs return a trajectory, (J,)."""
         return self.table[:, _RATE] != RATES.index("none")
 
+    def traced(self, traces: str) -> BoolArray:
+        """Which of the S rollouts may have a trace, of one of TRACES.
+
+        They belong to jobs without a trajectory; unless it is `steps`, to those of them that explore.
+        """
+        jobs = ~self.seen if traces == "steps" else self.explores & ~self.seen
+        return np.repeat(jobs, self.rollouts)
+
     @property
     def physics(self) -> BoolArray:
         """Which jobs return a trajectory at physics rate, (J,)."""
@@ -284,15 +292,15 @@ class Results(Simulated):
         return cls(**head, seconds=seconds, jobs=np.ascontiguousarray(jobs.indices), **vars(simulated))
 
 
-def rows_with_trace(traces: str, returns: FloatArray, exploring: BoolArray) -> IntArray:
+def rows_with_trace(traces: str, returns: FloatArray, traced: BoolArray) -> IntArray:
     """Indices of a message's rollouts that have a trace, ascending (K,).
 
     Args:
       traces: one of TRACES.
       returns: (S,).
-      exploring: which rollouts explore, that is belong to jobs without a trajectory, (S,).
+      traced: which rollouts may have one, from `Jobs.traced`, (S,).
     """
-    among = np.flatnonzero(exploring)
+    among = np.flatnonzero(traced)
     if traces in ("all", "steps"):
         return among
     if traces == "none" or not among.size:

@@ -81,6 +81,7 @@ class Environment(Task):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
             "policy": "linear", "normalise": True, "algorithm": "ars", "initial_sigma": 0.05, "learning_rate_mu": 0.05,
+            "validate": True,
         },
     }  # fmt: skip
 

@@ -23,14 +23,13 @@ import numpy as np
 
 from farm import fingerprint, plugins, seeds
 from farm.errors import ConfigError, RunError, writing
-from farm.moments import normaliser_of
 from farm.net.work import Jobs
 from farm.returns import known
 from farm.settings import read_json
 from farm.tasks.rollouts import steps_shape
 from learner import parquet
 from learner.again.lerobot import Episode, Format
-from learner.again.replay import restored
+from learner.again.replay import policy_of, restored
 from learner.run import checkpoint as checkpoints
 from learner.run.checkpoint import Checkpoint
 from learner.run.files import replace_text
@@ -59,6 +58,8 @@ class DataSet:
     seed: int
     files: tuple[Path, ...] = ()
     """Files that the user named, as of `RunFolder`."""
+    last: bool = False
+    """Whether the policy is the run's last one, though a validated one is better."""
 
     @property
     def manifest(self) -> Path:
@@ -95,9 +96,10 @@ class DataSet:
         """What the manifest says from its beginning."""
         config, at = run.read_config(), checkpoints.load(run.checkpoint)
         return {
+            **({"last": True} if self.last else {}),
             "version": _VERSION, "format": "LeRobot v3.0", "run": at.run,
             "task": _wire("tasks", config.task), "policy": _wire("policies", config.policy),
-            "generation": at.state["generation"], "checkpoint": _digest(run.checkpoint),
+            "generation": policy_of(run, at, last=self.last)[0], "checkpoint": _digest(run.checkpoint),
             "config": _digest(run.path / "config.json"), "code": at.code, "numbers": fingerprint.digest(),
             "episodes": self.episodes, "seed": self.seed, "seeds": "episode i: (4, seed, i, 0)",
             "pyarrow": parquet.release(),
@@ -137,9 +139,9 @@ class Work:
 
     def __init__(self, of: DataSet, problem: Problem, at: Checkpoint, judged: bool) -> None:
         self.problem, self._of, self._judged = problem, of, judged
-        config, last = of.run.read_config(), int(at.state["generation"])
-        self._mu = of.run.parameters.average(last, at.state["mu"], config.average)
-        self._normaliser = np.stack([normaliser_of(at.moments)] * 2)
+        config = of.run.read_config()
+        _, self._mu, normaliser = policy_of(of.run, at, last=of.last)
+        self._normaliser = np.stack([normaliser] * 2)
         self.format = Format(of.path, problem.spec, _wire("tasks", config.task))
         self.file = of.path / "unfinished.json"
         size = int(np.prod(steps_shape(problem.spec))) * 4

@@ -87,10 +87,13 @@ def load(
     path: str | Path,
     generation: int | None = None,
     *,
+    last: bool = False,
     allow_file: str | Path | None = None,
     **changed: Any,  # noqa: ANN401
 ) -> LoadedPolicy:
-    """The mean policy of the run in a folder, after a generation (None: the last), with other settings of its task.
+    """The policy of the run in a folder, or its mean policy after a generation, with other settings of its task.
+
+    With `last` it is the policy after the last generation, though a validated one is better.
 
     `allow_file` is a file with the class of a run that somebody else made.
 
@@ -113,7 +116,7 @@ def load(
         task = replace(config.task_config, **changed)
     except TypeError:
         raise ConfigError(f"no settings of {config.task}: {', '.join(changed)}") from None
-    return loaded(folder, generation, task)
+    return loaded(folder, generation, task, last=last)
 
 
 def loaded(
@@ -121,23 +124,35 @@ def loaded(
     generation: int | None = None,
     task: Any = None,  # noqa: ANN401
     average: int | None = None,
+    *,
+    last: bool = False,
 ) -> LoadedPolicy:
     """Like `load`, with all settings of the task in one object, and the average of this number of last means.
 
-    Without `average`: the run's own setting for its final policy, 1 for an earlier generation.
+    With `average` the means are the last ones, or those up to `generation`, of which without it there is one.
 
     Raises:
       ConfigError: it is not stored, or cannot be simulated like that.
     """
-    config = folder.read_config()
     at = checkpoints.load(folder.checkpoint)
-    last = int(at.state["generation"])
-    number = last if generation is None else generation
-    normaliser = normaliser_of(at.moments)
-    mu, normaliser = (at.state["mu"], normaliser) if number == last else _earlier(folder, at, number, normaliser)
-    default = config.average if generation is None else 1
-    mu = folder.parameters.average(number, mu, default if average is None else average)
+    if generation is None and average is None:
+        number, mu, normaliser = policy_of(folder, at, last=last)
+    else:
+        number, mu, normaliser = _last(at) if generation is None else _after(folder, at, generation)
+        mu = folder.parameters.average(number, mu, average or 1)
     return LoadedPolicy(seeing(restored(folder, at, task), normaliser), number, mu)
+
+
+def policy_of(folder: RunFolder, at: Checkpoint, *, last: bool = False) -> tuple[int, FloatArray, FloatArray]:
+    """A run's policy: its generation, mean (P,) and normaliser (2, d) or (2, 0).
+
+    It is the best validated one, or with `last`, and where no other is better, the last one: the average of as many
+    means as the run says.
+    """
+    if not last and (better := at.better) is not None:
+        return better.generation, better.mu, better.normaliser
+    number, mu, normaliser = _last(at)
+    return number, folder.parameters.average(number, mu, folder.read_config().average), normaliser
 
 
 def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
@@ -171,11 +186,19 @@ def _files(old: RunConfig, new: RunConfig, files: Files) -> dict[str, Content]:
     return {name: files[name] if name in files and text == before.get(name) else text for name, text in after.items()}
 
 
-def _earlier(folder: RunFolder, at: Checkpoint, generation: int, last: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """An earlier mean and its normaliser; those of generation 0 follow from the configuration."""
+def _last(at: Checkpoint) -> tuple[int, FloatArray, FloatArray]:
+    """The last generation, its mean and its normaliser."""
+    return int(at.state["generation"]), at.state["mu"], normaliser_of(at.moments)
+
+
+def _after(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[int, FloatArray, FloatArray]:
+    """A generation, its mean and its normaliser; those of generation 0 follow from the configuration."""
+    if generation == int(at.state["generation"]):
+        return _last(at)
     if generation != 0:
-        return folder.parameters.mean(generation)
+        return generation, *folder.parameters.mean(generation)
     config = folder.read_config()
     if config.init_from is not None:
         raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
-    return setup.start(config, folder.name, folder.files(at))[1].state["mu"], normaliser_of(np.zeros(1 + last.size))
+    first = setup.start(config, folder.name, folder.files(at))[1]
+    return 0, first.state["mu"], normaliser_of(first.moments)

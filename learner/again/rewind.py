@@ -27,7 +27,7 @@ from learner.again.replay import LoadedPolicy, Replay, restored, seeing
 from learner.algorithms import SearchState
 from learner.run import checkpoint as checkpoints
 from learner.run.checkpoint import Checkpoint
-from learner.run.evaluation import statistics
+from learner.run.evaluation import statistics, whole_round
 from learner.run.files import NONE
 from learner.run.folder import RunFolder
 from learner.run.learner import explored, learnt_from
@@ -214,19 +214,19 @@ class LearntAgain:
         """The normaliser of the next generation's observations, (2, d) or (2, 0)."""
         return normaliser_of(self._moments)
 
-    def step(self, simulate: Simulate) -> Simulated | RoundResults:
-        """Learn one generation; return the results of its exploring rollouts, and last the mean policy's."""
+    def step(self, simulate: Simulate) -> tuple[int, Simulated | RoundResults]:
+        """Learn one generation; return its number of exploring rollouts, and the results of `whole_round`."""
         config, state = self._config, self.state
         eps, exploring = explored(config, state, self._pairs)
-        jobs = Jobs.joined([exploring, Jobs.mean("none", [None])])
+        jobs, rollouts = whole_round(config, int(state.generation), exploring), int(exploring.rollouts.sum())
         results = simulate(state.mu, jobs, np.stack([self.normaliser] * 2))
-        rows = slice(len(results.returns) - 1)
+        rows = slice(rollouts)
         returns, steps = results.returns[rows], results.steps[rows]
         learnt = learnt_from(config, self._problem.task, returns, steps)
         self.state = algorithms.tell(config.algorithm_of(self._pairs), state, eps, learnt)
         self._moments = merged(self._moments, results.moments[rows])
         self._pairs = config.pairs_after(self._pairs, int(steps.sum()))
-        return results
+        return rollouts, results
 
 
 def _compare(folder: RunFolder, rewound: Rewound) -> None:

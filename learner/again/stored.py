@@ -23,7 +23,7 @@ from learner.run.setup import Problem
 
 log = logging.getLogger(__name__)
 
-_OF_EVALUATION: Final = ("mean_policy_", "robust_")
+_OF_EVALUATION: Final = ("mean_policy_", "robust_", "policy_generation", "last_validation", "without_learning")
 """How the names of those results in summary.json begin that are of the evaluation at a run's end."""
 
 
@@ -68,6 +68,7 @@ class Stored:
             "rollouts": self.at.rollouts,
             "steps": self.at.steps,
             "best_return": self.at.state.get("best"),
+            "best_validation": self.at.validated.score if self.at.validated else None,
             "success_rate": self.lines[self.last].success_rate if self.last else None,
             "parameters_sha256": self.sha256,
             "chain": self.chain,

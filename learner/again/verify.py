@@ -20,7 +20,7 @@ from farm.net.work import Jobs, Simulated
 from learner.again.rewind import LearntAgain, Simulate, from_row, kept, pairs_of
 from learner.again.stored import Differs, Stored, agree, agree_bits, evaluated_in
 from learner.run import hash_chain
-from learner.run.evaluation import outcome
+from learner.run.evaluation import outcome, validation, whole_round
 from learner.run.launch import Placement, connected, dispatch, open_run
 from learner.run.learner import explored
 from learner.scheduler.membership import Admission
@@ -74,26 +74,28 @@ def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> 
     for generation in (each for each in generations if each in stored):
         state, normaliser = from_row(run.problem, run.at, run.rows[generation - 1] if generation > 1 else None)
         jobs = explored(run.config, state, pairs_of(run.folder, generation))[1]
-        jobs = Jobs.joined([jobs, Jobs.mean("none", [None])])
-        yield generation, _repeated(run, generation, simulate(state.mu, jobs, np.stack([normaliser, normaliser])))
+        exploring = explored(run.config, state, pairs_of(run.folder, generation))[1]
+        jobs = whole_round(run.config, generation - 1, exploring)
+        results = simulate(state.mu, jobs, np.stack([normaliser, normaliser]))
+        yield generation, _repeated(run, generation, int(exploring.rollouts.sum()), results)
     others = {*generations} - stored
     if others:
         message = "%s: the state before generation %d is not stored: learning the run again up to there"
         log.warning(message, run.folder.path, max(others))
     again = LearntAgain(run.folder, run.problem) if others else None
     while again is not None and again.state.generation < max(others):
-        results = again.step(simulate)
+        rollouts, results = again.step(simulate)
         generation = int(again.state.generation)
         if generation in others:
-            yield generation, _repeated(run, generation, results)
+            yield generation, _repeated(run, generation, rollouts, results)
 
 
-def _repeated(run: Stored, generation: int, results: Simulated | RoundResults) -> int:
+def _repeated(run: Stored, generation: int, rollouts: int, results: Simulated | RoundResults) -> int:
     """The number of exploring rollouts in a repeated generation, whose results are those of the run."""
-    rollouts, line = len(results.returns) - 1, run.lines[generation]
-    before = run.lines[generation - 1].rollouts if generation > 1 else 0
+    line, before = run.lines[generation], run.lines[generation - 1].rollouts if generation > 1 else 0
     agree(run.folder, generation, line, outcome(run.problem.spec, results, rollouts), "repeated")
-    agree(run.folder, generation, line, {"rollouts": before + rollouts}, "repeated")
+    value = validation(run.config, generation - 1, rollouts, results.returns)
+    agree(run.folder, generation, line, {"rollouts": before + rollouts, "validation": value}, "repeated")
     return rollouts
 
 

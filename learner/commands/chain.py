@@ -19,7 +19,7 @@ from farm.errors import ConfigError
 from farm.seeds import SEEDS
 from farm.settings import setting
 from learner.commands import recordings
-from learner.commands.allowed import AllowedFiles
+from learner.commands.of_run import OfRun
 from learner.run.folder import RunFolder
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChainCommand(AllowedFiles):
+class ChainCommand(OfRun):
     """Runs learnt policies in turn, each from where the previous one ended, and counts their cycles."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -60,7 +60,7 @@ def main(words: Sequence[str]) -> int:
     from learner.again.replay import loaded
 
     logs.set_up("WARNING")
-    policies = [loaded(RunFolder.open(path, command.allow_file)) for path in command.runs]
+    policies = [loaded(RunFolder.open(path, command.allow_file), last=command.last) for path in command.runs]
     check(policies)
     check_lengths(policies, command)
     if command.video is not None:

@@ -14,14 +14,14 @@ from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
 from learner.again.replay import loaded
 from learner.commands import recordings, view
-from learner.commands.allowed import AllowedFiles
+from learner.commands.of_run import OfRun
 from learner.run.config import RunConfig, flat, preset_of
 from learner.run.folder import RunFolder
 from learner.run.launch import check_rerun
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareCommand(AllowedFiles):
+class CompareCommand(OfRun):
     """Puts several runs into one recording: their curves together, final policies side by side, a table."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -47,7 +47,7 @@ def main(words: Sequence[str]) -> int:
     runs = read(folders)
     sides = []
     for folder, run in zip(folders, runs, strict=True):
-        policy = loaded(folder)
+        policy = loaded(folder, last=command.last)
         sides.append(Side(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
     with writing(command.to):
         record_comparison(command.to, sides, table(runs))

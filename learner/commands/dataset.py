@@ -21,14 +21,14 @@ from farm.seeds import SEEDS
 from farm.settings import setting
 from learner import parquet
 from learner.again.dataset import MOST_EPISODES, DataSet, difference, read
-from learner.commands.allowed import AllowedFiles
+from learner.commands.of_run import OfRun
 from learner.run.folder import RunFolder
 from learner.run.launch import MOST_WORKERS, Placement
 from learner.scheduler.dispatcher import Stopped
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetCommand(AllowedFiles, Link):
+class DatasetCommand(OfRun, Link):
     """Writes episodes of a learnt policy as a data set in LeRobot's format; see docs/files.md.
 
     An interrupted command continues when it is repeated.
@@ -53,8 +53,8 @@ class DatasetCommand(AllowedFiles, Link):
             raise ConfigError("expected the folder of a run, or --from with a manifest.json")
         if self.out is None:
             raise ConfigError("expected --out with the folder of the data set")
-        if self.manifest and (self.episodes or self.seed is not None):
-            raise ConfigError("--from: the manifest says how many episodes, and their seed")
+        if self.manifest and (self.episodes or self.seed is not None or self.last):
+            raise ConfigError("--from: the manifest says how many episodes, their seed and which policy")
         if self.connect and self.workers:
             raise ConfigError("--workers with --connect: a farm has workers of its own")
         if self.tls is not None and not self.connect:
@@ -79,13 +79,14 @@ def main(words: Sequence[str]) -> int:
     if command.manifest is not None:
         of = read(command.manifest)
         data, run = (
-            DataSet(command.out, of["episodes"], of["seed"], command.allow_file),
+            DataSet(command.out, of["episodes"], of["seed"], command.allow_file, of.get("last", False)),
             command.manifest.parent / "run",
         )
     else:
         assert command.run is not None
         seed = 1 if command.seed is None else command.seed
-        data, run = DataSet(command.out, command.episodes or 1000, seed, command.allow_file), command.run
+        data = DataSet(command.out, command.episodes or 1000, seed, command.allow_file, command.last)
+        run = command.run
     if data.begin(RunFolder.open(run, data.files)):
         say(f"{command.out} is complete")
     elif not _make(data, command.place):

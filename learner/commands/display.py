@@ -71,7 +71,8 @@ class PlainDisplay(Display):
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
             f"  return {figure(p.return_mean):>8}{_failed(p)}  mean policy {_mean_policy(p):>8}"
-            f"{success}{_measures(p)}  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
+            f"{_validation(p)}{success}{_measures(p)}"
+            f"  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
         )
 
 
@@ -83,6 +84,11 @@ def _failed(p: GenerationStats) -> str:
 def _mean_policy(p: GenerationStats) -> str:
     """The mean policy's return."""
     return figure(p.mean_policy_return) if p.mean_policy_return is not None else "fails"
+
+
+def _validation(p: GenerationStats) -> str:
+    """What it returns from the starts of validation, where that is measured."""
+    return "" if p.validation is None else f"  validation {figure(p.validation):>8}"
 
 
 def _measures(p: GenerationStats) -> str:
@@ -125,6 +131,7 @@ class LiveDisplay(Display):
         self._handler = RichHandler(console=console, show_path=False, show_level=False)
         self._handler.setFormatter(Formatter("%(message)s"))
         self._returns: list[float] = []
+        self._validation: float | None = None
         self._before: list[logging.Handler] = []
 
     def __enter__(self) -> "LiveDisplay":
@@ -148,6 +155,8 @@ class LiveDisplay(Display):
         """Refresh."""
         if report.progress.mean_policy_return is not None:
             self._returns.append(report.progress.mean_policy_return)
+        if report.progress.validation is not None:
+            self._validation = report.progress.validation
         self._bar.update(self._task, completed=report.progress.generation)
         self._live.update(self._screen(report))
 
@@ -167,6 +176,9 @@ class LiveDisplay(Display):
             width = max(_SPARK_LEAST, min(_SPARK, self._console.width - _BESIDE_SPARK))
             curve = Text.assemble((spark(self._returns, width), "cyan"), f" {now:.3f}")
             table.add_row("  so far", f"{first:.3f}", curve)
+        if self._validation is not None and (best := self._run.learner.at.validated) is not None:
+            which = f"the mean policy's; best {figure(best.score)} after generation {best.generation}"
+            table.add_row("validation", figure(self._validation), which)
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
         else:

@@ -22,15 +22,15 @@ from farm.sim.mixed import names
 from farm.tasks.base import TaskSpec
 from farm.tasks.rollouts import drawn
 from learner.again.replay import loaded
-from learner.commands.allowed import AllowedFiles
+from learner.commands.of_run import OfRun
 from learner.run.config import MOST_GENERATIONS
 from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs, failures, statistics
 from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateCommand(AllowedFiles):
-    """Tests the learnt mean policy on perturbed starts and conditions drawn by its task."""
+class EvaluateCommand(OfRun):
+    """Tests the learnt policy on perturbed starts and conditions drawn by its task."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -39,7 +39,7 @@ class EvaluateCommand(AllowedFiles):
     seed: int = setting(EVALUATION_SEED, least=0, most=SEEDS - 1)
     """Seed of the perturbations."""
     average: int | None = setting(None, least=1, most=MOST_GENERATIONS)
-    """Average the means after this number of last generations; by default the run's own setting."""
+    """Average the means after this number of last generations; by default the run's own policy."""
     json: bool = False
     """Print JSON instead of a table."""
 
@@ -47,7 +47,8 @@ class EvaluateCommand(AllowedFiles):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = settings.parse(EvaluateCommand, words, "farm evaluate")
-    figures = evaluate(RunFolder.open(command.run, command.allow_file), command.rollouts, command.seed, command.average)
+    folder = RunFolder.open(command.run, command.allow_file)
+    figures = evaluate(folder, command.rollouts, command.seed, command.average, last=command.last)
     if command.json:
         say(json.dumps(figures, indent=2))
         return 0
@@ -72,9 +73,11 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def evaluate(folder: RunFolder, rollouts: int, seed: int, average: int | None = None) -> dict[str, Any]:
+def evaluate(
+    folder: RunFolder, rollouts: int, seed: int, average: int | None = None, *, last: bool = False
+) -> dict[str, Any]:
     """The figures in the JSON's form."""
-    policy = loaded(folder, average=average)
+    policy = loaded(folder, average=average, last=last)
     spec = policy.problem.spec
     results = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
     figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}

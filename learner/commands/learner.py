@@ -10,7 +10,7 @@ from typing import Any
 from farm.commands import logs
 from farm.commands.screen import figure
 from farm.commands.signals import INTERRUPTED, stop_flag
-from farm.errors import ConfigError, NameTakenError
+from farm.errors import ConfigError, NameTakenError, printable
 from farm.settings import Settings
 from learner.commands import display, options, recordings
 from learner.commands.options import LearnerOptions, parse
@@ -20,6 +20,7 @@ from learner.run.folder import RunFolder
 from learner.run.launch import Placement, Run, how_to_join, open_run
 from learner.run.setup import fitted
 from learner.run.states import RolledBack
+from learner.run.worth import CONSTANTS
 from learner.scheduler.scheduler import SchedulerConfig
 
 
@@ -122,11 +123,52 @@ def _worth(summary: Mapping[str, Any]) -> str:
     return f"the mean policy {nominal}{others}" + (f", {failed} of {EVALUATION_ROLLOUTS} unstable" if failed else "")
 
 
+def chosen(summary: Mapping[str, Any]) -> list[str]:
+    """Which policy is the run's, if that is not the last one."""
+    generation, best, last = summary["policy_generation"], summary["best_validation"], summary["last_validation"]
+    if generation == summary["generations"]:
+        return []
+    return [
+        f"the run's policy is the mean after generation {generation}: "
+        f"in validation it returned {figure(best)}, the last one {figure(last)}; --last takes that one"
+    ]
+
+
+def compared(summary: Mapping[str, Any]) -> list[str]:
+    """What the run's policy is worth beside none, and a warning if it is worth nothing."""
+    if (others := summary.get("without_learning")) is None:
+        return []
+    value, still = summary["robust_score"], others["nothing"]["score"]
+    ours = {
+        "score": value,
+        "success_rate": summary["robust_success_rate"],
+        "measures": summary.get("robust_measures", {}),
+    }
+    policy, nothing, constant = (_in_numbers(each) for each in (ours, others["nothing"], others["constant"]))
+    lines = [
+        f"the policy returns {policy} from {EVALUATION_ROLLOUTS} starts; doing nothing {nothing}, "
+        f"the best of {CONSTANTS} constant actions {constant}"
+    ]
+    if still is not None and (value is None or value <= still):
+        lines.append("warning: the policy is not better than doing nothing; farm check may say why")
+    return lines
+
+
+def _in_numbers(of: Mapping[str, Any]) -> str:
+    """A return, and in brackets success and measures, where the task has some."""
+    success, measures = of.get("success_rate"), of.get("measures", {})
+    more = [] if success is None else [f"success {success:.0%}"]
+    more += [printable(f"{name} {figure(value, '.3g')}") for name, value in measures.items()]
+    return figure(of["score"], ".4g") + (f" ({', '.join(more)})" if more else "")
+
+
 def _conclusion(run: Run, place: Placement) -> list[str]:
     summary, folder = run.summary, run.learner.folder.path
     lines = []
     if summary["state"] == "finished":
         lines.append(_worth(summary))
+        if run.learner.config.validate:
+            lines += [*chosen(summary), *compared(summary)]
     lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
     if not run.learner.folder.there:
         lines.append(run.learner.folder.gone)

@@ -21,20 +21,20 @@ from farm.tasks.base import TaskConfig
 from farm.tasks.loop import Batch
 from farm.tasks.standard import start
 from learner.again.replay import LoadedPolicy, loaded
-from learner.commands.allowed import AllowedFiles
+from learner.commands.of_run import OfRun
 from learner.commands.replay import config_of
 from learner.run.config import MOST_GENERATIONS
 from learner.run.folder import RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayCommand(AllowedFiles):
+class PlayCommand(OfRun):
     """Plays the learnt policy repeatedly in MuJoCo's interactive viewer; Ctrl+drag pushes objects."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     generation: int | None = setting(None, least=0, most=MOST_GENERATIONS)
-    """Generation whose mean policy is played, 0 for the first; by default the last."""
+    """Generation whose mean policy is played, 0 for the first; by default the run's policy."""
     speed: float = setting(1.0, least=0.01, most=10)
     """Speed: 1 is real time."""
     hold: float = setting(2.0, least=0, most=3600)
@@ -48,7 +48,8 @@ def main(words: Sequence[str]) -> int:
     config = config_of(words)
     default = PlayCommand(run=tyro.MISSING, task=config.task_config if config else TaskConfig())
     command = settings.parse(PlayCommand, words, "farm play", default)
-    policy = loaded(RunFolder.open(command.run, command.allow_file), command.generation, command.task)
+    folder = RunFolder.open(command.run, command.allow_file)
+    policy = loaded(folder, command.generation, command.task, last=command.last)
     if not display():
         raise ConfigError(
             f"no display to open a window on: farm replay {command.run} --video rollout.gif draws without one"

@@ -15,7 +15,8 @@ from farm.errors import ConfigError, RunError, writing
 from farm.settings import setting
 from farm.tasks.base import Task, TaskConfig
 from learner.commands import recordings
-from learner.commands.allowed import AllowedFiles, allowed
+from learner.commands.allowed import allowed
+from learner.commands.of_run import OfRun
 from learner.run.config import MOST_GENERATIONS, RunConfig
 from learner.run.folder import RunFolder
 
@@ -28,7 +29,7 @@ MOST: Final = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayCommand(AllowedFiles):
+class ReplayCommand(OfRun):
     """Simulates any policy or rollout of a run again, at physics rate, also with a changed task."""
 
     run: tyro.conf.Positional[Path]
@@ -36,7 +37,8 @@ class ReplayCommand(AllowedFiles):
     to: Path | None = None
     """Recording to write; by default rollout.rrd in the run's folder."""
     generation: int | None = setting(None, least=0, most=MOST_GENERATIONS)
-    """Generation whose mean policy (0: before learning) or whose rollouts are shown; by default the last."""
+    """Generation whose mean policy (0: before learning) or whose rollouts are shown; by default
+    the run's policy, or the last generation's rollouts."""
     rollout: tuple[int, ...] = ()
     """Show this exploring rollout of the generation, counted from 0; repeatable."""
     best: int | None = setting(None, least=1, most=MOST)
@@ -101,7 +103,7 @@ def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -
     """Show a mean policy."""
     from learner.again.replay import loaded
 
-    policy = loaded(folder, command.generation, command.task)
+    policy = loaded(folder, command.generation, command.task, last=command.last)
     replay = policy.rollout()
     name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
     recordings.record(path, folder.name, policy.problem, name, replay.trajectory)

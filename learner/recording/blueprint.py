@@ -55,11 +55,11 @@ def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
 
 
 def finished(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
-    """Layout of a finished run: its curves over the generations, and the end of its last policy's rollout.
+    """Layout of a finished run: its curves over the generations, and the end of its policy's rollout.
 
     All views are drawn on one timeline, and curves read best over generations; rollouts move on sim_time.
     """
-    scene = "The last policy's rollout: it moves on the timeline sim_time"
+    scene = "The run's policy: it moves on the timeline sim_time"
     panel = rrb.TimePanel(timeline="generation", play_state="following")
     return _blueprint(_run(spec, eye, scene), panel)
 
@@ -173,7 +173,8 @@ def _learning(spec: TaskSpec) -> rrb.Container:
     """Learning curves with legends where curves seldom are: returns rise, sigma falls."""
     bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
     log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
-    returns = ("/learning/return", "/learning/return_std", "/learning/mean_policy/return")
+    policies = [f"/learning/mean_policy/{name}" for name in ("return", "validation")]
+    returns = ("/learning/return", "/learning/return_std", *policies)
     rates = ("/learning/success", "/learning/mean_policy/success")
     measures = [
         _plot(f"{each.name} [{each.unit}]" if each.unit else each.name,

@@ -87,6 +87,7 @@ def pack(colour: Colour) -> int:
 
 _RETURNS: Final = ("mean", "min", "max", "best", "baseline")
 _MEAN_POLICY: Final = lines(("mean policy",), (YELLOW,))
+_VALIDATION: Final = lines(("validation",), (PURPLE,))
 _CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float | None]]]]] = (
     ("/learning/return", lines(_RETURNS, (SKY, VERMILLION, GREEN, ORANGE, GREY), hidden=_RETURNS[:3]),
      lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, s.baseline]),
@@ -105,7 +106,11 @@ _CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, fl
 def static(*, success: bool, measures: Sequence[Measure] = ()) -> list[tuple[str, Any]]:
     """Names and colours of the learning curves; with success if the task defines it, and with its measures."""
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
-    entities: list[tuple[str, Any]] = [("/learning/return_std", band), ("/learning/mean_policy/return", _MEAN_POLICY)]
+    entities: list[tuple[str, Any]] = [
+        ("/learning/return_std", band),
+        ("/learning/mean_policy/return", _MEAN_POLICY),
+        ("/learning/mean_policy/validation", _VALIDATION),
+    ]
     if success:
         entities += [
             ("/learning/success", lines(("exploring",), (SKY,))),
@@ -141,6 +146,7 @@ def numbers(values: Sequence[float | None]) -> FloatArray:
 def mean_policies(stats: Sequence[GenerationStats]) -> Iterator[Columns]:
     """Curves of the mean policies of some generations: returns, measures, and success if the task defines it."""
     yield from _known("/learning/mean_policy/return", [each.mean_policy_return for each in stats])
+    yield from _known("/learning/mean_policy/validation", [each.validation for each in stats])
     yield from _known("/learning/mean_policy/success", [each.mean_policy_success for each in stats])
     yield from _measures("/learning/mean_policy/measures", [each.mean_policy_measures for each in stats])
 

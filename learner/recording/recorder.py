@@ -180,8 +180,8 @@ class Recorder:
             self._draw()
             self._flush()
 
-    def final(self, rollout: Trajectory) -> None:
-        """Record the finished run's mean policy, and make viewers open with the end of its rollout.
+    def final(self, rollout: Trajectory, generation: int) -> None:
+        """Record the finished run's policy, the mean after a generation; viewers open with the end of its rollout.
 
         Raises:
           ValueError: it is a rollout of another scene or task.
@@ -189,9 +189,10 @@ class Recorder:
         """
         self._drawing.check(rollout)
         now = time.time()
-        for part in curves.last_policy(rollout.returned, rollout.success):
-            self._stream.send_columns(part.entity, self._at(now), part.columns)
-        self._hold(rollout, self._generation, now)
+        if generation == self._generation:  # the curves have earlier ones
+            for part in curves.last_policy(rollout.returned, rollout.success):
+                self._stream.send_columns(part.entity, self._at(now), part.columns)
+        self._hold(rollout, self._generation, now, generation)
         # What is followed was recorded by the view of the start; that of this rollout knows how far away to be.
         shown = Eye.of(self._drawing.view([rollout]))
         eye = replace(self._eye, away=shown.away) if shown.tracked else shown
@@ -239,7 +240,7 @@ class Recorder:
         lengths = [len(one.sim) for one in rollouts]
         numbers = np.repeat([one.generation for one in rollouts], lengths)
         sim, wall = np.concatenate([one.sim for one in rollouts]), np.concatenate([one.wall for one in rollouts])
-        captions = self._drawing.captions([(f"generation {one.generation}", one.rollout) for one in rollouts])
+        captions = self._drawing.captions([(f"generation {one.learnt}", one.rollout) for one in rollouts])
         columns = [*self._drawing.columns(joined([one.rollout for one in rollouts])), *captions]
         send(self._stream, columns, "generation", numbers, sim, wall)
         whole = self._horizon - 0.5 * self._drawing.spec.period
@@ -279,12 +280,15 @@ class Recorder:
             text = f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are needed"
             raise OSError(errno.ENOSPC, text)
 
-    def _hold(self, rollout: Trajectory, generation: int, now: float) -> None:
-        """Hold back a mean policy's rollout, to be written together with the next ones."""
+    def _hold(self, rollout: Trajectory, generation: int, now: float, learnt: int | None = None) -> None:
+        """Hold back a mean policy's rollout, to be written together with the next ones.
+
+        It is shown at a generation, and may be of the policy that was `learnt` in an earlier one.
+        """
         start = generation * self._horizon
         wall = now + (rollout.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
         sim = np.minimum(start + rollout.times, start + self._horizon - SEAM)
-        self._held.append(_Held(generation, sim, wall, rollout))
+        self._held.append(_Held(generation, generation if learnt is None else learnt, sim, wall, rollout))
 
     def _at(self, now: float) -> list[rr.TimeColumn]:
         """Start of the generation recorded last; now [s since the epoch]."""
@@ -297,6 +301,8 @@ class _Held:
     """A rollout that is held back."""
 
     generation: int
+    learnt: int
+    """The generation of its policy."""
     sim: FloatArray
     """Its frames' times on sim_time [s], (F,)"""
     wall: FloatArray

@@ -120,11 +120,11 @@ class RunRecording(logging.Handler):
         self.end = end
         rollouts = [] if end.best is None else [(f"best rollout, generation {end.best_generation}", end.best)]
         if end.mean is not None:
-            value = end.mean.returned
+            value, generation = end.mean.returned, end.summary.get("policy_generation", self.done)
             result = {"generations": self.done, "return": value, "success": end.mean.success}
             self._call(partial(self._recorder.result, result))
-            self._call(partial(self._recorder.final, end.mean))
-            rollouts.append((f"mean policy after generation {self.done}", end.mean))
+            self._call(partial(self._recorder.final, end.mean, generation))
+            rollouts.append((f"mean policy after generation {generation}", end.mean))
         if rollouts:
             self._write_replay(rollouts)
 

@@ -36,6 +36,20 @@ class BestRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Validated:
+    """A mean policy with its score from the starts of validation."""
+
+    score: float
+    """As `learner.run.evaluation.score`."""
+    generation: int
+    """Number of updates before it."""
+    mu: FloatArray = array("<f8", 1)
+    """The search's mean, (P,)"""
+    normaliser: FloatArray = array("<f8", 2, np.empty((2, 0)))
+    """Mean and standard deviation that its observations are normalised by, (2, d) or (2, 0)"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Checkpoint:
     """State of a run between two generations."""
 
@@ -82,6 +96,16 @@ class Checkpoint:
     """Generations that were repeated because a host in them was expelled."""
     moments: FloatArray = array("<f8", 1, np.empty(0))
     """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
+    validated: Validated | None = None
+    """The best of the mean policies that generations validated, of equal ones the first; None if there is none."""
+    last_score: float | None = None
+    """Score of the last policy, from the same starts; None until the end of the run."""
+
+    @property
+    def better(self) -> Validated | None:
+        """The validated policy, if the last one is not better than it; None: the last one is the run's policy."""
+        best, last = self.validated, self.last_score
+        return None if best is None or (last is not None and last > best.score) else best
 
 
 def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:

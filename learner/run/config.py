@@ -22,6 +22,11 @@ VERSION: Final = 2
 MOST_GENERATIONS: Final = 10_000_000
 """Of a run."""
 
+VALIDATION_ROLLOUTS: Final = 16
+"""Starts from which a mean policy is validated."""
+
+_LEAST_EXPLORING: Final = 20  # rollouts for each one of validation, which so are at most 5 %
+
 PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
 """Parts of a configuration that are chosen by name and have their own settings, with the kind of plug-in."""
 
@@ -84,6 +89,9 @@ class RunConfig(Settings):
     if one of them is given."""
     pilot_sigma: float | None = setting(None, above=0.0)
     """The initial sigma that the pilot found; steps are in proportion. A run fills it in."""
+    validate: bool = setting(None)  # filled in below
+    """Now and then simulate the mean policy from starts that no learning uses, with at most 5 % more rollouts, and
+    take the best one as the run's policy; say at the end what it is worth beside doing nothing."""
     traces: Literal["all", "extremes", "none"] = "extremes"
     """Which traces are recorded: those of all rollouts, of the best and worst of each generation, or none."""
 
@@ -128,6 +136,10 @@ class RunConfig(Settings):
             algorithm = algorithm.scaled(self.pilot_sigma)
         return replace(algorithm, pairs=pairs) if pairs else algorithm
 
+    def validates(self, generation: int, rollouts: int) -> bool:
+        """Whether a generation with this number of exploring rollouts also validates its mean policy."""
+        return self.validate and generation % -(-_LEAST_EXPLORING * VALIDATION_ROLLOUTS // rollouts) == 0
+
     def pairs_after(self, pairs: int, steps: int) -> int:
         """Pairs of the generation after one with these pairs and control steps; 0: as in the algorithm's settings."""
         if self.interactions is None:
@@ -149,7 +161,7 @@ def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
 def _filled(config: RunConfig) -> dict[str, Any]:
     """Fill in omitted settings from the task's first preset."""
     parts = (config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)
-    if all(parts) and config.generations is not None and config.pilot is not None:
+    if all(parts) and None not in (config.generations, config.pilot, config.validate):
         return {}
     table = presets(config.task)
     preset: dict[str, Any] = dict(next(iter(table.values()), {}))
@@ -162,6 +174,8 @@ def _filled(config: RunConfig) -> dict[str, Any]:
         out |= {part: name, f"{part}_config": options or _part(kind, name, preset)}
     if config.pilot is None:
         out["pilot"] = bool(preset.get("pilot")) and not all(parts) and hasattr(out["algorithm_config"], "scaled")
+    if config.validate is None:
+        out["validate"] = bool(preset.get("validate")) and not all(parts)
     return out
 
 
@@ -194,13 +208,13 @@ _PGPE: Final[Mapping[str, Any]] = {
 }  # fmt: skip
 
 _GENERAL: Final[Mapping[str, Any]] = {
-    **_PGPE, "policy": "direct", "features": 50, "bandwidth": 1.0, "pilot": True,
+    **_PGPE, "policy": "direct", "features": 50, "bandwidth": 1.0, "pilot": True, "validate": True,
     "initial_sigma": 1.0, "learning_rate_mu": 0.5, "max_speed": 1.0,
 }  # fmt: skip
 """The settings that runs start from, if the task has no presets and observes few numbers."""
 
 _MANY: Final[Mapping[str, Any]] = {
-    **_PGPE, "policy": "linear", "normalise": True, "pilot": True,
+    **_PGPE, "policy": "linear", "normalise": True, "pilot": True, "validate": True,
     "initial_sigma": 0.1, "learning_rate_mu": 0.05, "max_speed": 0.1,
 }  # fmt: skip
 """If it observes more."""

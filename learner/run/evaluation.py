@@ -11,6 +11,7 @@ from farm.net.work import Jobs, Simulated
 from farm.returns import known, mean, penalised
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
+from learner.run.config import VALIDATION_ROLLOUTS, RunConfig
 from learner.scheduler.round import RoundResults
 
 EVALUATION_ROLLOUTS: Final = 100
@@ -46,6 +47,8 @@ class Evaluation:
     """Their mean return, with `farm.returns.penalised` for those that failed: what policies are compared by."""
     measures: tuple[dict[str, float | None], dict[str, float | None]]
     """The task's measures by name: of the nominal rollout, and means over the perturbed ones that did not fail."""
+    without_learning: dict[str, Any] | None
+    """From the same starts what doing nothing and the best constant action give; None if it was not measured."""
     replay: Trajectory | None
     """The best rollout of the run at physics rate, if it has not been reported yet."""
 
@@ -54,6 +57,27 @@ def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
     """Jobs of the mean policy on perturbed starts, and last on the nominal one at physics rate."""
     trials = Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
     return Jobs.joined([*([trials] if rollouts else []), Jobs.mean("physics", [None])])
+
+
+def validation_jobs(config: RunConfig, generation: int, rollouts: int) -> list[Jobs]:
+    """Jobs of the mean policy that validate it in a generation with this number of exploring rollouts, if it does."""
+    return [starts_of_validation(config)] if config.validates(generation, rollouts) else []
+
+
+def whole_round(config: RunConfig, generation: int, exploring: Jobs) -> Jobs:
+    """The jobs of a generation that is repeated: those that explore, the mean policy's, and those of validation."""
+    validating = validation_jobs(config, generation, int(exploring.rollouts.sum()))
+    return Jobs.joined([exploring, Jobs.mean("none", [None]), *validating])
+
+
+def starts_of_validation(config: RunConfig) -> Jobs:
+    """Jobs of the mean policy from the starts by which the run's policies are compared."""
+    return Jobs.mean("none", [seeds.validation(config.seed, start) for start in range(VALIDATION_ROLLOUTS)])
+
+
+def validation(config: RunConfig, generation: int, rollouts: int, returns: FloatArray) -> float | None:
+    """The score of the mean policy, from the returns of all jobs of such a generation, of which the last validate."""
+    return score(returns[-VALIDATION_ROLLOUTS:]) if config.validates(generation, rollouts) else None
 
 
 def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:

@@ -50,12 +50,13 @@ def first(config: RunConfig, written: Mapping[str, Any] | None = None) -> str:
 
 
 def state_of(at: Checkpoint) -> str:
-    """Digest of a checkpoint, but for what is of machines, names and code."""
+    """Digest of a checkpoint, but for what is of machines, names, code and the run's end."""
     bare = replace(
         at, run="", config={}, reissued=0, seconds=0.0, canary="", replayed=False, code={}, expelled={}, checks={},
         first={}, undone=0, chain="",
     )  # fmt: skip
-    return hashlib.sha256(codec.encode(bare, SCHEMA)).hexdigest()
+    without = {"last_score"} if at.validated else {"last_score", "validated"}
+    return hashlib.sha256(codec.encode(bare, SCHEMA, without)).hexdigest()
 
 
 def following(

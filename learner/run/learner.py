@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import seeds
+from farm import fingerprint, seeds
 from farm.arrays import FloatArray, IntArray
 from farm.errors import CheckpointError, RunError
 from farm.moments import merged, normaliser_of
@@ -26,7 +26,7 @@ from learner import algorithms
 from learner.algorithms import Algorithm, SearchState
 from learner.run import config as configs
 from learner.run import hash_chain
-from learner.run.checkpoint import BestRollout, Checkpoint
+from learner.run.checkpoint import BestRollout, Checkpoint, Validated
 from learner.run.config import RunConfig
 from learner.run.diagnosis import Diagnosis
 from learner.run.evaluation import (
@@ -39,11 +39,15 @@ from learner.run.evaluation import (
     means_of_measures,
     outcome,
     score,
+    starts_of_validation,
     success_rate,
+    validation,
+    validation_jobs,
 )
 from learner.run.folder import RunFolder
 from learner.run.setup import Problem
 from learner.run.states import RolledBack, goes_back_to
+from learner.run.worth import without_learning
 from learner.scheduler.dispatcher import Dispatcher
 from learner.scheduler.round import RoundResults
 
@@ -75,7 +79,7 @@ class Learner:
         """
         # The best rollout is reported again: the process that ends the run writes a new replay.rrd.
         self.problem, self.config, self.folder = problem, problem.config, folder
-        self._at = replace(at, replayed=at.best is None)
+        self._at = replace(at, replayed=at.best is None, last_score=None)
         try:
             self.state: SearchState = self._algorithm.restore(at.state)
         except ValueError as error:
@@ -148,7 +152,7 @@ class Learner:
         eps, all_failed = self._explore(dispatcher), 0
         while not self.over:
             results, last = self._collected(dispatcher), self._at
-            jobs = len(eps) * self.config.episodes  # the following ones are the mean policy's, and perhaps the best's
+            jobs = len(eps) * self.config.episodes  # then the mean policy's, perhaps the best's and those of validation
             returns = results.returns[: jobs * len(self._signs)]
             before = self.state
             learnt = learnt_from(self.config, self.problem.task, returns, results.steps[: returns.size])
@@ -214,33 +218,48 @@ class Learner:
             raise RolledBack(f"{message}: --resume {self.folder.path} repeats what follows")
 
     def evaluate(self, dispatcher: Dispatcher) -> Evaluation:
-        """The mean policy at the end of the run, averaged over its last generations if the run says so."""
+        """The run's policy at its end: the last mean, averaged if the run says so, or a validated one."""
+        mu = self.folder.parameters.average(self.state.generation, self.state.mu, self.config.average)
+        normalisers = self._normalisers()
+        if self.config.validate:
+            last = self._checked_results(dispatcher, mu, starts_of_validation(self.config), normalisers)
+            self._at = replace(self._at, last_score=score(last.returns))
         jobs = Jobs.joined([evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()])
-        at = self.state.generation
-        mu = self.folder.parameters.average(at, self.state.mu, self.config.average)
-        dispatcher.begin(at, mu, jobs, normaliser=self._normalisers())
-        results, last = self._collected(dispatcher), EVALUATION_ROLLOUTS
+        if (better := self._at.better) is not None:
+            mu, normalisers[0] = better.mu, better.normaliser
+        results, nominal = self._checked_results(dispatcher, mu, jobs, normalisers), EVALUATION_ROLLOUTS
+        self._at = replace(self._at, checks=self._checked(dispatcher))
+        self.folder.save(self._at)
+        alike = self.config.validate and fingerprint.digest().startswith(self.canary)
+        worth = without_learning(self.problem, dispatcher.stopped) if alike else None
+        return Evaluation(
+            mean=Nominal(
+                value=mean(results.returns[nominal : nominal + 1]),
+                success=bool(results.flags[nominal, 0]) if self._judged else None,
+                trajectory=results.trajectory(nominal),
+            ),
+            robust_success_rate=success_rate(self.problem.spec, results.flags[:nominal]),
+            robust_return=mean(results.returns[:nominal]),
+            robust_failed=failures(results.flags[:nominal]),
+            robust_score=score(results.returns[:nominal]),
+            measures=(
+                means_of_measures(self.problem.spec, results, slice(nominal, nominal + 1)),
+                means_of_measures(self.problem.spec, results, slice(nominal)),
+            ),
+            without_learning=worth,
+            replay=results.trajectory(nominal + 1),
+        )
+
+    def _checked_results(
+        self, dispatcher: Dispatcher, mu: FloatArray, jobs: Jobs, normalisers: FloatArray
+    ) -> RoundResults:
+        """Results of jobs around a mean (P,) at the end of the run, after which nobody checks them any more."""
+        dispatcher.begin(self.state.generation, mu, jobs, normaliser=normalisers)
+        results = self._collected(dispatcher)
         while dispatcher.check_the_rest():
             self._expelled(dispatcher)
             results = self._collected(dispatcher)
-        self._at = replace(self._at, checks=self._checked(dispatcher))
-        self.folder.save(self._at)
-        return Evaluation(
-            mean=Nominal(
-                value=mean(results.returns[last : last + 1]),
-                success=bool(results.flags[last, 0]) if self._judged else None,
-                trajectory=results.trajectory(last),
-            ),
-            robust_success_rate=success_rate(self.problem.spec, results.flags[:last]),
-            robust_return=mean(results.returns[:last]),
-            robust_failed=failures(results.flags[:last]),
-            robust_score=score(results.returns[:last]),
-            measures=(
-                means_of_measures(self.problem.spec, results, slice(last, last + 1)),
-                means_of_measures(self.problem.spec, results, slice(last)),
-            ),
-            replay=results.trajectory(last + 1),
-        )
+        return results
 
     def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
         """The results in summary.json."""
@@ -267,6 +286,7 @@ class Learner:
                 if evaluation and self.problem.spec.measures
                 else {}
             ),
+            **(self._validation(evaluation) if self.config.validate else {}),
             "parameters_sha256": hashlib.sha256(numbers).hexdigest(),
             "seconds": round(self._at.seconds, 3),
             "rollouts_per_second": round(self._at.rollouts / self._at.seconds, 1) if self._at.seconds else None,
@@ -276,6 +296,18 @@ class Learner:
             "undone": self._at.undone,
             "chain": self._at.chain,
             "state": state,
+        }
+
+    def _validation(self, evaluation: Evaluation | None) -> dict[str, Any]:
+        """What summary.json says of the run's policy, with validation."""
+        better, best = self._at.better, self._at.validated
+        chosen = better.generation if better else self.state.generation
+        compared = evaluation and evaluation.without_learning
+        return {
+            "policy_generation": chosen if evaluation else None,
+            "best_validation": best.score if best else None,
+            "last_validation": self._at.last_score,
+            **({"without_learning": compared} if compared else {}),
         }
 
     @property
@@ -293,7 +325,8 @@ class Learner:
         state = self.state
         eps, exploring = explored(self.config, state, self._at.pairs)
         replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
-        jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay])
+        validation = validation_jobs(self.config, state.generation, int(exploring.rollouts.sum()))
+        jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay, *validation])
         dispatcher.begin(state.generation, state.mu, jobs, self._keep, self._normalisers())
         return eps
 
@@ -319,7 +352,7 @@ class Learner:
         """Update the checkpoint from the scores (rows, signs) that the algorithm was told, and all returns (S,)."""
         best, generation = self._at.best, self._at.best_generation
         steps = int(results.steps[: returns.size].sum())
-        replayed = self._at.replayed or len(results) > len(scores) * self.config.episodes + 1
+        replayed = self._at.replayed or bool(results.jobs.physics.any())
         if known(scores).any() and (before.best is None or scores.max() > before.best):
             row, column = divmod(int(scores.argmax()), len(self._signs))
             episode = int(returns.reshape(-1, *scores.shape)[:, row, column].argmax())  # the best one of the best
@@ -343,12 +376,23 @@ class Learner:
             best_generation=generation,
             replayed=replayed,
             moments=merged(self._at.moments, results.moments[: returns.size]),
+            validated=self._validated(before, results, returns.size),
+            last_score=None,
         )
+
+    def _validated(self, before: SearchState, results: RoundResults, rollouts: int) -> Validated | None:
+        """The best validated policy after a generation with this number of exploring rollouts."""
+        value, best = validation(self.config, before.generation, rollouts, results.returns), self._at.validated
+        if value is None or (best is not None and value <= best.score):
+            return best
+        normaliser = normaliser_of(self._at.moments)
+        return Validated(score=value, generation=before.generation, mu=before.mu, normaliser=normaliser)
 
     def _progress(self, results: RoundResults, returns: FloatArray, dispatcher: Dispatcher) -> GenerationStats:
         state, figures = self.state, outcome(self.problem.spec, results, returns.size)
         return GenerationStats(
             **figures,
+            validation=validation(self.config, state.generation - 1, returns.size, results.returns),
             generation=state.generation,
             rollouts=self._at.rollouts,
             best=figures["return_max"] if state.best is None else state.best,

@@ -80,7 +80,9 @@ class Dispatcher:
         """
         self.run, self.admission = spec.run, admission
         self.notices = Notices(log)  # what was ignored, and why
-        self._session, self._farm, self._stopped, self._shapes = session, farm, stopped, shapes
+        self.stopped = stopped
+        """Whether the user asked the run to stop; to be called regularly."""
+        self._session, self._farm, self._shapes = session, farm, shapes
         self._how_to_join, self._generations = how_to_join, generations
         config = scheduler or SchedulerConfig()
         self._attendance, self._members = Attendance(config.instances), Members(admission)
@@ -190,7 +192,7 @@ class Dispatcher:
             self._end_if_nobody_can_come()
             self._look_for_silence()
             self._refresh_status()
-            if self._stopped():
+            if self.stopped():
                 raise Stopped
             yield self._ledger.round
         self._judging.ended(self._ledger.audit)

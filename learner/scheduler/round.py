@@ -68,10 +68,12 @@ class RoundResults:
         """
         self.jobs, self._traces, self._trace, self._shapes = jobs, traces, shapes.trace, shapes.frame
         self._rollouts, self._seen = jobs.rollouts, jobs.seen
-        self._exploring = np.repeat(~self._seen, self._rollouts)
+        self._traced = jobs.traced(traces)
+        plain = ~self._seen
+        self._candidates = plain & jobs.explores if jobs.explores.any() else plain
         self._starts = [0, *np.cumsum(self._rollouts).tolist()]  # first row of each job, and the end
         self._trajectories: dict[int, Trajectory] = {}
-        count, measures = len(self._exploring), shapes.measures
+        count, measures = len(self._traced), shapes.measures
         whole = traces in ("all", "steps")  # the two traces of `extremes` are one message's, not a job's
         with_trajectory, plain = (shapes.answer_bytes(trajectory=one, traces=whole) for one in (True, False))
         self._bytes = np.maximum(np.where(self._seen, with_trajectory, plain), jobs.eps.nbytes // max(1, len(jobs.eps)))
@@ -136,8 +138,11 @@ class RoundResults:
         return np.maximum.reduceat(self.returns, self._starts[:-1])
 
     def best(self) -> tuple[int, float]:
-        """The exploring job with the best return, and that return; -inf if no job explores."""
-        returns = np.where(self._seen, -np.inf, self.job_returns())
+        """The job with the best return, and that return, of those without a trajectory; -inf if there is none.
+
+        If some jobs explore, only those count.
+        """
+        returns = np.where(self._candidates, self.job_returns(), -np.inf)
         return int(returns.argmax()), float(returns.max())
 
     def forget(self, jobs: list[int]) -> None:
@@ -168,7 +173,7 @@ class RoundResults:
             return None
         if not ((1 <= results.steps) & (results.steps <= self._trace[0])).all():
             return None
-        with_trace = rows_with_trace(self._traces, results.returns, self._exploring[rows])
+        with_trace = rows_with_trace(self._traces, results.returns, self._traced[rows])
         traces = len(results.traces) == len(with_trace) and (
             not len(with_trace) or results.traces.shape[1:] == self._trace
         )

@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,17 +12,20 @@ from made import stats
 from rich.console import Console
 
 from farm.net.telemetry import Report, WorkerStatus
-from learner.commands.display import LiveDisplay
+from learner.commands.display import LiveDisplay, PlainDisplay
 
 ATTACK = "\x1b[2J\x1b]0;owned\a\u202e\x9b3J [bold]"
 
 
-def screen(workers: list[WorkerStatus], width: int, show: Callable[[], None] = lambda: None) -> str:
+def screen(
+    workers: list[WorkerStatus], width: int, show: Callable[[], None] = lambda: None, validation: float | None = None
+) -> str:
     """The output for one generation on a terminal of this width."""
-    learner = SimpleNamespace(config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0))
+    at = SimpleNamespace(validated=SimpleNamespace(score=7.5, generation=2))
+    learner = SimpleNamespace(config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0), at=at)
     dispatcher = SimpleNamespace(census=lambda: workers)
     run = cast("Any", SimpleNamespace(learner=learner, dispatcher=dispatcher, recording=None, live=None))
-    report = Report(progress=stats(ended=1, failed=1), rate=1.0)
+    report = Report(progress=stats(ended=1, failed=1, validation=validation), rate=1.0)
     file = io.StringIO()
     with LiveDisplay(Console(file=file, force_terminal=True, width=width, color_system=None), run, []) as display:
         show()
@@ -56,3 +60,19 @@ def test_nothing_is_cut_off(width: int) -> None:
     text = screen([worker("lab-machine-3/123456", 1234.0, "lab-machine-3")], width)
     assert "…" not in text
     assert "1 rollouts ended early, 1 failed" in text
+
+
+def test_validation_is_shown_where_it_is_measured() -> None:
+    assert "validation" not in screen([], 80)
+    assert re.search(
+        r"validation +6\.500 +the mean policy's; best 7\.500 after generation 2", screen([], 80, validation=6.5)
+    )
+
+
+def test_the_line_of_a_generation_has_it_where_it_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    run = cast("Any", SimpleNamespace(learner=SimpleNamespace(config=SimpleNamespace(generations=3))))
+    display = PlainDisplay(run, [])
+    for value in (None, 6.5):
+        display.show(Report(progress=stats(validation=value), rate=1.0))
+    plain, validated = capsys.readouterr().out.splitlines()
+    assert validated.replace("  validation    6.500", "") == plain

@@ -75,7 +75,7 @@ def test_of_finished_runs_with_their_layouts(tmp_path, scene, spec, rollout):
     def record(number: int) -> None:
         recorder = Recorder(tmp_path / f"{number}.rrd", run="try", drawing=Drawing(scene, spec), config="")
         recorder.generation(report(stats(1), rollout()))
-        recorder.final(rollout())
+        recorder.final(rollout(), 1)
         recorder.close()
 
     unchanged(record, count=3)

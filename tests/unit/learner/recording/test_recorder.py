@@ -90,11 +90,24 @@ def test_rollouts_follow_each_other_without_gap(start, rollout, rows_of):
     assert rows.times("/learning/return") == [6_000_000_000, 7_500_000_000]
 
 
+def test_an_earlier_policy_of_a_finished_run_is_named_as_such(start, rollout, rows_of):
+    recorder = start()
+    for generation in (1, 2):
+        recorder.generation(report(stats(generation, validation=3.0 - generation)))
+    recorder.final(rollout(31, step=0.05), 1)
+    recorder.close()
+    rows = rows_of()
+    assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0], [-4.0]]
+    assert rows.column("/learning/mean_policy/validation", "scalars") == [[2.0], [1.0]]
+    assert rows.column("/world/caption", "generation") == [2] * 31
+    assert rows.column("/world/caption", "labels")[-1][0].startswith("generation 1\n")
+
+
 def test_a_finished_run_opens_with_its_last_policy_playing(start, rollout, rows_of, tmp_path):
     recorder = start()
     for generation in (1, 2):
         recorder.generation(report(stats(generation), rollout()))
-    recorder.final(rollout(31, step=0.05))
+    recorder.final(rollout(31, step=0.05), 2)
     recorder.close()
     rows, reader = rows_of(), RrdReader(tmp_path / "run.rrd")
     assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0], [-4.0], [-3.25]]

@@ -46,7 +46,7 @@ class Slow:
     def result(self, values: Any) -> None:
         self.results.append(values)
 
-    def final(self, rollout: Trajectory) -> None:
+    def final(self, rollout: Trajectory, generation: int) -> None:
         self.results.append(rollout)
 
     def settle(self) -> None:

@@ -96,6 +96,9 @@ class Alone:
     def check_the_rest(self) -> None:
         pass
 
+    def stopped(self) -> bool:
+        return False
+
     def collect(self) -> RoundResults:
         return self._round
 
