@@ -18,6 +18,7 @@ from learner.run.config import RunConfig
 from learner.run.evaluation import EVALUATION_ROLLOUTS
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, Run, how_to_join, open_run
+from learner.run.pilot import begun
 from learner.run.setup import fitted
 from learner.run.states import RolledBack
 from learner.run.worth import CONSTANTS
@@ -48,7 +49,7 @@ def learn(
     place = replace(
         place, connect=flags.connect, farm=flags.farm, record=flags.record, log=flags.log,
         listen=flags.listen or place.listen, trusted=flags.trust_network, mixed=flags.mixed,
-        numbers=flags.numbers,
+        numbers=flags.numbers, compare=flags.compare,
         scheduler=SchedulerConfig(
             audit=flags.audit, straggler_seconds=flags.patience, instances=flags.instances
         ),
@@ -61,8 +62,7 @@ def learn(
     if flags.resume_existing and path.exists():
         resumed, config = RunFolder.open(path, flags.allow_file), fitted(config)
         base = resumed.read_config()
-        if config.pilot and base.pilot and config.pilot_sigma is None:
-            config = replace(config, pilot_sigma=base.pilot_sigma)  # what its pilot found
+        config = begun(config, resumed)
     if resumed is not None:
         options.check_resume(base, config, resumed)
     with stop_flag("saving and ending") as stop:

@@ -58,6 +58,8 @@ class LearnerOptions(AllowedFiles, Listening):
     """Least time before a job also goes to a second worker [s]; increase it for slow devices."""
     instances: int = setting(500, least=1, most=10_000)
     """Largest number of workers of one host name, that is of one certificate."""
+    compare: bool = True
+    """Compare the result with doing nothing and a constant action, if the run validates its policies."""
     quiet: bool = False
     """Print only warnings and the final result."""
     json: bool = False

@@ -40,7 +40,7 @@ from learner.run.files import with_rates
 from learner.run.folder import RunFolder
 from learner.run.judge import LocalJudge
 from learner.run.learner import Learner
-from learner.run.pilot import piloted
+from learner.run.pilot import begun, piloted
 from learner.run.setup import Problem, fitted, resumed, start
 from learner.run.states import RolledBack
 from learner.scheduler.dispatcher import Dispatcher, Stopped
@@ -88,6 +88,8 @@ class Placement:
     """Stream live at this host and port."""
     log: tuple[str, ...] = ()
     """Loggers, by name."""
+    compare: bool = True
+    """Compare the result of a run that validates with doing nothing and a constant action."""
     scheduler: SchedulerConfig = field(default_factory=SchedulerConfig)
     """How jobs are split into chunks, and when they are reissued."""
 
@@ -103,6 +105,8 @@ class Run:
     pool: LocalWorkers | None
     """The local workers."""
     loggers: Loggers
+    compare: bool = True
+    """Whether the result is compared with doing nothing."""
     summary: dict[str, Any] = field(default_factory=dict)
     """The contents of summary.json after the end."""
     _best: tuple[Trajectory | None, int] = (None, 0)
@@ -134,7 +138,7 @@ class Run:
                     self.recording.put(report)
                 self.loggers.generation(report.progress)
                 yield report
-            evaluation = self.learner.evaluate(self.dispatcher)
+            evaluation = self.learner.evaluate(self.dispatcher, compare=self.compare)
             state = "finished"
         except (Stopped, GeneratorExit):
             state = "interrupted"
@@ -220,7 +224,7 @@ def open_run(
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())
-        config = config if resume else piloted(fitted(config), stopped)
+        config = begun(config, folder) if resume else piloted(fitted(config), stopped)
         if resume:
             problem, at = _resumed(folder, config, place)
         else:
@@ -254,7 +258,7 @@ def open_run(
             stack, link, place, problem, folder.name, admission, config.generations, stopped, forked
         )
         publisher = stack.enter_context(closing(Publisher(link, place.farm, dispatcher.incarnation, learner)))
-        yield Run(learner, dispatcher, publisher, recording, pool, loggers)
+        yield Run(learner, dispatcher, publisher, recording, pool, loggers, place.compare)
 
 
 def _resumed(folder: RunFolder, config: RunConfig, place: Placement) -> tuple[Problem, Checkpoint]:

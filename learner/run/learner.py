@@ -217,8 +217,11 @@ class Learner:
             log.warning("%s; what follows is repeated", message)
             raise RolledBack(f"{message}: --resume {self.folder.path} repeats what follows")
 
-    def evaluate(self, dispatcher: Dispatcher) -> Evaluation:
-        """The run's policy at its end: the last mean, averaged if the run says so, or a validated one."""
+    def evaluate(self, dispatcher: Dispatcher, *, compare: bool = True) -> Evaluation:
+        """The run's policy at its end: the last mean, averaged if the run says so, or a validated one.
+
+        With `compare`, and if the run validates, beside doing nothing and a constant action.
+        """
         mu = self.folder.parameters.average(self.state.generation, self.state.mu, self.config.average)
         normalisers = self._normalisers()
         if self.config.validate:
@@ -230,7 +233,7 @@ class Learner:
         results, nominal = self._checked_results(dispatcher, mu, jobs, normalisers), EVALUATION_ROLLOUTS
         self._at = replace(self._at, checks=self._checked(dispatcher))
         self.folder.save(self._at)
-        alike = self.config.validate and fingerprint.digest().startswith(self.canary)
+        alike = compare and self.config.validate and fingerprint.digest().startswith(self.canary)
         worth = without_learning(self.problem, dispatcher.stopped) if alike else None
         return Evaluation(
             mean=Nominal(

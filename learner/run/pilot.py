@@ -28,6 +28,7 @@ from farm.net.work import NOT_NORMALISED, Jobs, Simulated
 from farm.returns import known, mean, penalised
 from farm.runner import Runner
 from learner.run.config import RunConfig
+from learner.run.folder import RunFolder
 from learner.run.setup import problem
 
 log = logging.getLogger(__name__)
@@ -91,6 +92,13 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
         log.info("  %s", each.line)
         sigma = each.sigma
     return replace(config, pilot_sigma=sigma)
+
+
+def begun(config: RunConfig, folder: RunFolder) -> RunConfig:
+    """The configuration of a run that goes on, with what its pilot found."""
+    if not config.pilot or config.pilot_sigma is not None:
+        return config
+    return replace(config, pilot_sigma=folder.read_config().pilot_sigma)
 
 
 def tried(config: RunConfig) -> Iterator[Tried]:

@@ -200,7 +200,7 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], wat
     plan.write_text(json.dumps(configs.to_dict(config)), "utf-8")
     command = [
         sys.executable, "-P", "-m", "learner.sweep.runs", "--config", str(plan), "--out", str(path.parent),
-        "--name", path.name, "--resume-existing", "--json", "--log-level", "WARNING", *flags,
+        "--name", path.name, "--resume-existing", "--json", "--log-level", "WARNING", "--no-compare", *flags,
     ]  # fmt: skip
     # Standard input is a pipe that is never written to: it closes when this process ends, however it ends.
     # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its learners.
