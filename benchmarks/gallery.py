@@ -46,8 +46,6 @@ class Piece:
     what: str
     flags: str = ""
     """Of `farm run`, beside the task."""
-    view: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
-    """Part of the picture that is shown: left, top, right, bottom."""
     needs: str = ""
     """What else is to be installed."""
 
@@ -77,8 +75,8 @@ PIECES: Final = (
     ),
     Piece(
         "shadow_hand.py:Hold", "A goal environment: the Shadow hand holds a block so that many touch sensors feel it.",
-        "--generations 10", (0.36, 0.06, 0.68, 0.38),
-        "Package: [environments of other packages](gymnasium.md#environments-of-other-packages).",
+        "--generations 10",
+        needs="Package: [environments of other packages](gymnasium.md#environments-of-other-packages).",
     ),
     Piece("grips.py:Grips", "The Allegro hand adds its middle finger to a grip."),
 )  # fmt: skip
@@ -100,7 +98,7 @@ def main() -> None:
         if piece.name in arguments.only.split(","):
             run = arguments.runs / f"{piece.name}-s{arguments.seed}"
             rows[piece.task] = measured(piece, run, arguments.seed)
-            film(run, films / f"{piece.name}.gif", load(run), piece.view)
+            film(run, films / f"{piece.name}.gif", load(run))
             file.write_text("".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows))
     (arguments.docs / "gallery.md").write_text(page(rows), "utf-8")
 
@@ -117,7 +115,7 @@ def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
     return row | {name: round(score, 3) for name, score in scores.items()}
 
 
-def film(run: Path, path: Path, policy: LoadedPolicy, view: tuple[float, ...]) -> None:
+def film(run: Path, path: Path, policy: LoadedPolicy) -> None:
     """The last policy's rollout from the nominal start, in a small file."""
     task = policy.problem.task
     speed = task.steps * task.period / SECONDS
@@ -125,14 +123,11 @@ def film(run: Path, path: Path, policy: LoadedPolicy, view: tuple[float, ...]) -
     frames: list[Image.Image] = []
     durations: list[int] = []  # for how long [ms]; equal frames are one
     with Image.open(path) as large:
-        left, top, right, bottom = (round(share * size) for share, size in zip(view, 2 * large.size, strict=True))
         for at, frame in enumerate(ImageSequence.Iterator(large)):
             if at % 2:
                 durations[-1] += frame.info["duration"]
             else:
-                frames.append(
-                    frame.convert("RGB").crop((left, top, right, bottom)).resize(SIZE, Image.Resampling.LANCZOS)
-                )
+                frames.append(frame.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
                 durations.append(frame.info["duration"])
     palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

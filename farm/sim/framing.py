@@ -21,7 +21,7 @@ SLACK: Final = 0.4
 """How far what is followed may be from the middle before the camera moves, in radii of what moves."""
 
 _TRAVELS: Final = 2.0  # times as large as what moves must the box around its whole way be, for the camera to follow
-_LARGEST: Final = 6.0  # radii of what moves that are in view at most: what falls away for ever is not kept in view
+_LARGEST: Final = 6.0  # radii of what moves, beyond which something has fallen away and is not kept in view
 _POSES: Final = 128  # sampled poses within the joints' ranges
 
 
@@ -52,17 +52,27 @@ class View:
             self._frame(spheres.centres(_reach(scene)), spheres.radii)
             return
         ways = [spheres.centres(poses) for poses in rollouts]
-        largest = max(float(_radius(way, _middle(way, spheres.radii, each=True), spheres.radii).max()) for way in ways)
-        most = _LARGEST * self.mover.radius
-        if self._frame(np.concatenate(ways), spheres.radii) <= min(_TRAVELS * largest, most):
+        reach = self._reach(scene, rollouts, ways, spheres.radii)
+        near = reach <= _LARGEST * self.mover.radius  # the others have fallen away
+        near = near if near.any() else np.ones_like(near)
+        ways, radii = [way[:, near] for way in ways], spheres.radii[near]
+        largest = max(float(_radius(way, _middle(way, radii, each=True), radii).max()) for way in ways)
+        if self._frame(np.concatenate(ways), radii) <= _TRAVELS * largest:
             self.mover = None
             return
+        self.camera = replace(self.camera, lookat=self.mover.centre, distance=AWAY * float(reach[near].max()))
+
+    def _reach(
+        self, scene: Scene, rollouts: Sequence[FloatArray], ways: Sequence[FloatArray], radii: FloatArray
+    ) -> FloatArray:
+        """How far each sphere (G,) is ever from where a camera looks that follows [m]."""
+        assert self.mover is not None
         index = scene.bodies.index(self.mover.body)
-        radius = 0.0
+        reach = np.zeros(len(radii))
         for poses, way in zip(rollouts, ways, strict=True):
             targets = self.mover.centre + self.shifts(poses[:, index, :3])
-            radius = max(radius, float(_radius(way, targets[:, None], spheres.radii).max()))
-        self.camera = replace(self.camera, lookat=self.mover.centre, distance=AWAY * min(radius, most))
+            reach = np.maximum(reach, _radius(way, targets[:, None], radii).max(axis=0))
+        return reach
 
     def _frame(self, way: FloatArray, radii: FloatArray) -> float:
         """Let the camera see spheres (F, G, 3) of these radii (G,); returns the radius of the one around them [m]."""
