@@ -179,7 +179,7 @@ def _filled(config: RunConfig) -> dict[str, Any]:
     return out
 
 
-SCALE: Final = frozenset({"initial_sigma", "learning_rate_mu", "max_speed"})
+SCALE: Final = frozenset({"initial_sigma", "sigma_floor", "learning_rate_mu", "max_speed"})
 """Settings of which each, given by the user, leaves out the pilot."""
 
 

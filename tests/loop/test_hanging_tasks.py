@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import returns, tried
 from made import pole
 
 import farm
@@ -70,22 +71,6 @@ def test_a_task_that_always_hangs_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="4 workers had to be replaced because they did not answer, the last after"):
         learnt(task, tmp_path / "run", 2, paths)
     assert RunFolder.open(tmp_path / "run").progress()[-1].generation >= 2, "what was learnt is saved"
-
-
-def returns() -> list[float]:
-    with farm.Farm("finger-gait", policy="constant", workers=1) as pool:
-        values: list[float] = pool.map(np.zeros((2, pool.size))).tolist()
-        return values
-
-
-def tried(queue: "multiprocessing.Queue[object]", pool: farm.Farm | None) -> None:
-    """Use a pool of one's own, or the given one."""
-    try:
-        queue.put(returns() if pool is None else pool.map(np.zeros((2, pool.size))).tolist())
-    except RunError as error:
-        queue.put(str(error))
-    if pool is not None:
-        pool.close()
 
 
 @pytest.mark.slow

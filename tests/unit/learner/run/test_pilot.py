@@ -118,7 +118,8 @@ def test_the_user_ends_it_before_anything_has_begun(tmp_path: Path) -> None:
     [
         ({}, True),
         ({"algorithm": "snes"}, True),
-        ({"pairs": 3, "sigma_floor": 1e-4}, True),
+        ({"pairs": 3, "sigma_cap": 0.1}, True),
+        ({"sigma_floor": 1e-4}, False),
         ({"initial_sigma": 0.3}, False),
         ({"learning_rate_mu": 0.1}, False),
         ({"max_speed": 0.3}, False),
