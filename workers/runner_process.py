@@ -5,6 +5,7 @@ the results. For what such a process can still access see docs/protocol.md, "Cod
 """
 
 import ctypes
+import os
 import signal
 import socket
 import struct
@@ -27,6 +28,7 @@ from farm.runner import Runner, is_exact, make_backend, served
 _MOST: Final = 4 * codec.MAX_BYTES  # [bytes] of a mean, a chunk, a normaliser and their headers
 _LENGTH: Final = struct.Struct("<Q")
 _PARENT_DIED: Final = 1  # prctl's PR_SET_PDEATHSIG (linux/prctl.h)
+_FILES: Final = 1024  # descriptors that a process may have inherited
 _NO_NEW_PRIVILEGES: Final = 38  # and its PR_SET_NO_NEW_PRIVS
 
 
@@ -157,9 +159,26 @@ def _bound() -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
+def _guard() -> None:
+    """Fork a process that ends all of this process's group when this process ends, however it does (on Linux only).
+
+    The group has what the code forks. A worker that is killed cannot end it, but this process ends with its worker.
+    """
+    guarded = os.getpid()
+    if sys.platform != "linux" or os.getpgrp() != guarded or os.fork():
+        return
+    os.closerange(3, _FILES)  # the socket is not the guard's
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    ctypes.CDLL(None).prctl(_PARENT_DIED, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() == guarded:  # else it has ended already
+        signal.sigwait({signal.SIGTERM})
+    os.killpg(0, signal.SIGKILL)
+
+
 def main() -> None:
     """Drop privileges, then serve on the inherited socket."""
     _bound()
+    _guard()
     with socket.socket(fileno=int(sys.argv[1])) as link:
         link.set_inheritable(False)
         try:
