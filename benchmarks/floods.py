@@ -99,7 +99,7 @@ def _asking(ask: Callable[[], object]) -> None:
 
 
 def _ask_for_ever(ask: Callable[[], object]) -> None:
-    """Thread: helper."""
+    """Ask again and again; runs in a thread."""
     while True:
         ask()
 

@@ -32,7 +32,8 @@ def penalised(returns: FloatArray) -> FloatArray:
         return returns.copy()
     others = returns[mask]
     worst = float(others.min())
-    spread = float(others.std()) or max(abs(worst), 1.0)
+    equal = worst == float(others.max())  # their standard deviation may be a rounding error
+    spread = max(abs(worst), 1.0) if equal else float(others.std())
     return np.where(mask, returns, worst - spread)
 
 

@@ -161,7 +161,6 @@ def _reach(scene: Scene) -> FloatArray:
     start = model.qpos0 if scene.start is None else scene.start
     qpos = np.tile(start, (_POSES, 1))
     shares = np.random.default_rng(0).uniform(size=(_POSES, model.njnt))
-    shares[0] = np.nan  # the start itself
     free = {int(model.body_rootid[body]) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]}
     slides = {int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE]}
     for joint in range(model.njnt):

@@ -35,7 +35,7 @@ class Remedy:
 def remedies(model: mujoco.MjModel) -> list[Remedy]:
     """The changes that fit a model."""
     bare = len(bare_dofs(model))
-    heavy = f'armature="{_ARMATURE:g}" and damping="{_DAMPING:g}" for the {bare} joints that have neither'
+    heavy = f'armature="{_ARMATURE:g}" and damping="{_DAMPING:g}" for each joint that has neither ({bare})'
     step = model.opt.timestep / _FINER
     chosen = [
         Remedy(f"a timestep of {step:g} s", _finer, _FINER),

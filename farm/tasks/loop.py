@@ -283,12 +283,23 @@ class Batch:
         self._steps[:], self._failed[:] = last + 1, True
         for values in self.frames.values():
             values[:, last * self._parts :] = 0.0
+        return self.lost(spec)
+
+    @property
+    def acted(self) -> bool:
+        """Whether some rollout did not fail before its first step."""
+        return self._actions is not None
+
+    def lost(self, spec: TaskSpec) -> Rollouts:
+        """The rollouts, all of which failed, as their task cannot score them."""
+        count, steps = len(self._steps), self.task.steps
         if self._actions is None:
-            self._actions = np.zeros((1, self.task.steps, spec.action))
+            self._actions = np.zeros((count, steps, spec.action))
         if self.terms is None:
-            self.terms = np.zeros((1, self.task.steps, len(spec.terms)))
-        low = np.array([[each.low for each in self.task.measures]]).reshape(1, -1)
-        return self._rollouts(np.array([RETURN_FLOOR]), self.terms, np.zeros(1, dtype=bool), self._failed, low)
+            self.terms = np.zeros((count, steps, len(spec.terms)))
+        low = np.tile([each.low for each in self.task.measures], (count, 1)).astype(float)
+        success = np.zeros(count, dtype=bool)
+        return self._rollouts(np.full(count, RETURN_FLOOR), self.terms, success, self._failed, low)
 
     def record(self) -> Record:
         """What was measured after each control step so far."""
@@ -298,7 +309,7 @@ class Batch:
         return Record(frames, self.start, self._actions, self._steps, self._failed, self.which)
 
     def rollouts(self) -> Rollouts:
-        """Score the rollouts after all have ended."""
+        """Score the rollouts after all have ended; some have acted."""
         record = self.record()
         score = self.task.score(record)
         terms, success = (self.terms, self._success) if score is None else (score.terms, score.success)
@@ -391,7 +402,7 @@ def _run(
         try:
             batch = Batch(task, sim, seeds, kept.every, tolerant=not task.config.strict)
             _act(batch, Acting(policy, theta), sums if kept.moments else None, history)
-            rollouts = batch.rollouts()
+            rollouts = batch.rollouts() if batch.acted else batch.lost(spec)
         except (*NOT_OF_TASK, Rebound):
             raise
         except Exception as error:

@@ -65,10 +65,11 @@ def main(words: Sequence[str]) -> int:
         table.add_row(name, str(row["rollouts"]), str(row["failed"]), success, *returns, str(row["ended"]), *cells)
     Console().print(table)
     if figures["nominal"]["failed"]:
-        say("the mean policy is unstable from its nominal start: farm check looks for the cause")
+        say("it fails from its nominal start, unstable or by an error: farm check looks for the cause")
     elif failed := figures["perturbed"]["failed"]:
         say(
-            f"unstable in {failed} of {command.rollouts} rollouts, which are in no mean: farm check looks for the cause"
+            f"{failed} of {command.rollouts} rollouts failed, unstable or by an error, and are in no mean: "
+            "farm check looks for the cause"
         )
     return 0
 

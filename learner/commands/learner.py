@@ -114,13 +114,15 @@ def _announcement(run: Run, place: Placement) -> list[str]:
 def _worth(summary: Mapping[str, Any]) -> str:
     """What the mean policy returns, from the nominal start and from others."""
     value, failed = summary["mean_policy_return"], summary["robust_failed"]
-    nominal = "is unstable" if value is None else f"returns {value:.3f}"
+    nominal = "fails" if value is None else f"returns {value:.3f}"
     if summary["mean_policy_success"] is None:
         others = f"; from other starts {figure(summary['robust_return'])} on average"
     else:
         success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
         others = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
-    return f"the mean policy {nominal}{others}" + (f", {failed} of {EVALUATION_ROLLOUTS} unstable" if failed else "")
+    return f"the mean policy {nominal}{others}" + (
+        f"; {failed} of {EVALUATION_ROLLOUTS} failed, unstable or by an error" if failed else ""
+    )
 
 
 def chosen(summary: Mapping[str, Any]) -> list[str]:

@@ -85,10 +85,10 @@ class RunConfig(Settings):
     start: Literal["printed", "fitted"] = "printed"
     """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies kernel, projected)."""
     pilot: bool = setting(None)  # filled in below
-    """Measure before the first generation how far the search explores, and scale sigma and steps to it. It is left out
-    if one of them is given."""
+    """Measure before the first generation how far the search explores, and scale sigma and steps to it. Left out if
+    --initial-sigma, --sigma-floor, --learning-rate-mu, --max-speed or --init-from is given."""
     pilot_sigma: float | None = setting(None, above=0.0)
-    """The initial sigma that the pilot found; steps are in proportion. A run fills it in."""
+    """The initial sigma that a pilot found (a run fills it in); steps are in proportion. With it there is no pilot."""
     validate: bool = setting(None)  # filled in below
     """Now and then simulate the mean policy from starts that no learning uses, with at most 5 % more rollouts, and
     take the best one as the run's policy; say at the end what it is worth beside doing nothing."""
@@ -190,10 +190,13 @@ def pilot_unless(config: RunConfig, names: Collection[str]) -> RunConfig:
       config: with the settings.
       names: theirs, with underscores. With `pilot` among them the pilot is as the user says.
     """
+    found = config.pilot_sigma if "pilot_sigma" in names else None
+    if "pilot" in names:  # a new one, or none
+        return replace(config, pilot_sigma=found)
     scaled = hasattr(config.algorithm_config, "scaled")
-    if "pilot" in names or not config.pilot or (scaled and not SCALE.intersection(names)):
+    if scaled and not SCALE.intersection(names):
         return config
-    return replace(config, pilot=False)
+    return replace(config, pilot=False, pilot_sigma=found)
 
 
 _GENERATIONS: Final = 150
@@ -320,6 +323,8 @@ def changed_by(config: RunConfig, values: Mapping[str, Any], *, fresh: bool = Fa
     run = {k: v for k, v in values.items() if k in _fields(config) and k not in names}
     if config.pilot and not hasattr(parts["algorithm_config"], "scaled"):
         run.setdefault("pilot", False)
+    if any(parts[part] != getattr(config, part) for part in PARTS):
+        run.setdefault("pilot_sigma", None)  # it was measured for another search
     if unknown := [k for k in values if k not in names and k not in run]:
         raise ConfigError(f"unknown setting {', '.join(unknown)}")
     return replace(config, **parts, **run)

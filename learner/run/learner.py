@@ -173,10 +173,6 @@ class Learner:
                     f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to generation "
                     f"{before.generation}: {advice}"
                 ) from None
-            if all_failed == HOPELESS:
-                raise RunError(
-                    f"all rollouts of {HOPELESS} generations failed, so that nothing is learnt: farm check says why"
-                )
             for message in diagnosis.after(progress, one_step=self._one_step):
                 log.warning("%s", message)
             dispatcher.report(progress)
@@ -188,6 +184,10 @@ class Learner:
                 replay=results.trajectory(jobs + 1),
                 replay_generation=last.best_generation,
             )
+            if all_failed == HOPELESS:
+                raise RunError(
+                    f"all rollouts of {HOPELESS} generations failed, so that nothing is learnt: farm check says why"
+                )
 
     def _checked(self, dispatcher: Dispatcher) -> dict[str, int]:
         """Number of spot checks that each host has passed in the whole run."""

@@ -78,11 +78,13 @@ class Tried:
 def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> RunConfig:
     """The configuration with the sigma that the pilot found, if it asks for one and has none yet.
 
+    A run that goes on from another (`init_from`) has that one's scale.
+
     Raises:
       ConfigError: the task cannot start.
       Interrupted: the user stopped it; nothing has begun.
     """
-    if not config.pilot or config.pilot_sigma is not None:
+    if not config.pilot or config.pilot_sigma is not None or config.init_from is not None:
         return config
     log.info("a pilot measures how far to explore (--no-pilot: begin at once)")
     sigma = 0.0

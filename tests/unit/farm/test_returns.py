@@ -13,10 +13,12 @@ def test_a_failed_rollout_is_a_deviation_below_the_worst():
     assert returns[1, 0] == RETURN_FLOOR, "the argument is left as it is"
 
 
-@pytest.mark.parametrize("value", [-300.0, 0.0, 2e-9, 5e5])
-def test_among_equal_returns_it_is_the_worst_too(value):
-    values = penalised(np.array([value, RETURN_FLOOR, value]))
-    assert values[1] < values[0] == values[2] == value
+@pytest.mark.parametrize("value", [-300.0, 0.0, 2e-9, 0.1, 1.1, 5e5])
+@pytest.mark.parametrize("count", [1, 3, 7, 31])
+def test_among_equal_returns_it_is_clearly_the_worst(value, count):
+    values = penalised(np.array([RETURN_FLOOR, *[value] * count]))
+    assert values[1:].tolist() == [value] * count
+    assert values[0] == value - max(abs(value), 1.0)
 
 
 def test_without_any_failure_or_any_return_nothing_changes():

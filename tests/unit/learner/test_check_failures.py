@@ -52,7 +52,7 @@ def test_all_unstable_is_a_failure_with_its_causes(tmp_path: Path, capsys: pytes
     assert "the simulation of 8 of 8 rollouts became unstable:\n" in out
     assert "joint 'shoulder' of body 'upper' left first" in out
     assert "too long for it; at most" in out
-    assert '  tried armature="0.01" and damping="0.1" for the 1 joints that have neither: ' in out
+    assert '  tried armature="0.01" and damping="0.1" for each joint that has neither (1): ' in out
     assert "e+12" not in out + err
 
 

@@ -66,8 +66,9 @@ def sigma_of(task: str, **changed: object) -> float:
 
 def test_it_explores_little_where_much_is_fatal(tmp_path: Path) -> None:
     wide = sigma_of(reach(tmp_path, 1e9))
-    careful = reach(tmp_path / "careful", 0.05) if (tmp_path / "careful").mkdir() is None else ""
-    assert sigma_of(careful) < 0.4 * wide
+    careful = tmp_path / "careful"
+    careful.mkdir()
+    assert sigma_of(reach(careful, 0.05)) < 0.4 * wide
     assert wide == 0.1
 
 
@@ -132,7 +133,7 @@ def test_a_scale_that_is_given_wins(tmp_path: Path, changed: dict[str, object], 
     assert configure(task, **changed).pilot is has_one
     words = ["--task", task]
     for name, value in changed.items():
-        words += [options.flag(name, str(value))] if isinstance(value, bool) else [options.flag(name, str(value))]
+        words.append(options.flag(name, str(value)))
     command, _, _ = options.parse(RunCommand, words, "farm run")
     assert command.run.pilot is has_one
 
@@ -161,6 +162,35 @@ def test_the_search_uses_what_it_found_and_the_file_repeats_it(tmp_path: Path) -
     again = configs.from_dict(json.loads(json.dumps(configs.to_dict(config))), "config.json")
     assert again == config
     assert piloted(again) is again, "no second pilot"
+
+
+@pytest.mark.parametrize(
+    ("words", "pilot", "kept"),
+    [
+        ([], True, True),
+        (["--seed", "7", "--pairs", "3"], True, True),
+        (["--initial-sigma", "0.3"], False, False),
+        (["--max-speed", "0.3"], False, False),
+        (["--no-pilot"], False, False),
+        (["--pilot"], True, False),
+        (["--pilot-sigma", "0.02"], True, True),
+        (["--algorithm", "snes"], True, False),
+        (["--policy", "mlp"], True, False),
+    ],
+)
+def test_what_was_found_for_one_search_is_not_used_for_another(
+    tmp_path: Path, words: list[str], pilot: bool, kept: bool
+) -> None:
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(configs.to_dict(configure(reach(tmp_path, 1.0), pilot_sigma=0.02))))
+    command, _, _ = options.parse(RunCommand, ["--config", str(path), *words], "farm run")
+    assert command.run.pilot is pilot
+    assert command.run.pilot_sigma == (0.02 if kept else None)
+
+
+def test_a_run_that_goes_on_from_another_has_its_scale(tmp_path: Path) -> None:
+    config = configure(reach(tmp_path, 0.05), init_from=str(tmp_path))
+    assert piloted(config) is config
 
 
 @pytest.mark.parametrize(
