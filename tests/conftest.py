@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -16,6 +17,12 @@ from farm.tasks.finger_gait.model import Hand
 
 hypothesis.settings.register_profile("any machine", deadline=None)  # time says nothing of what is tested
 hypothesis.settings.load_profile("any machine")
+
+
+# What `nohup`, or a shell's `&`, ignores is ignored in every process that the tests start, too.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
