@@ -104,7 +104,9 @@ def learnt(rule: str, seed: int, generations: int, **settings: Any) -> tuple[flo
     """Mean return of the final mean policy over the starts from which it did not fail, and how many it failed from."""
     config = farm.configure(f"{__file__}:Follow", seed=seed, policy="linear", **settings)
     search = problem(config)
-    runner, state, algorithm = search.runner(), search.begin(), config.algorithm_config
+    runner = search.runner()
+    state = search.begin()
+    algorithm = config.algorithm_config
     for _ in range(generations):
         eps, jobs = explored(config, state)
         returns = runner.run(state.mu, jobs, "none", NOT_NORMALISED).returns.reshape(len(eps), -1)

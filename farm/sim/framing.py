@@ -114,7 +114,9 @@ class _Spheres:
     """Spheres around all geometries that move, of all models of a scene, fixed to its drawn bodies."""
 
     def __init__(self, scene: Scene) -> None:
-        bodies, offsets, radii = [], [], []
+        bodies = []
+        offsets = []
+        radii = []
         for each in scene.each:
             model = each.model
             drawn = sorted(set(model.geom_bodyid.tolist()))
@@ -164,7 +166,9 @@ def _reach(scene: Scene) -> FloatArray:
     free = {int(model.body_rootid[body]) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]}
     slides = {int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE]}
     for joint in range(model.njnt):
-        kind, body, at = int(model.jnt_type[joint]), int(model.jnt_bodyid[joint]), int(model.jnt_qposadr[joint])
+        kind = int(model.jnt_type[joint])
+        body = int(model.jnt_bodyid[joint])
+        at = int(model.jnt_qposadr[joint])
         hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
         limited = bool(model.jnt_limited[joint])
         planar = hinge and not limited and body in slides  # the root of what walks in a plane

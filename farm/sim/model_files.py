@@ -52,7 +52,9 @@ def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
             return {TEXT: model}
         name, texts = TEXT, {TEXT: model}
     else:
-        name, texts, path = posixpath.normpath(Path(model).as_posix()), {}, Path(model)
+        path = Path(model)
+        name = posixpath.normpath(path.as_posix())
+        texts = {}
         if path.is_absolute():
             folder = folder if folder is not None and path.is_relative_to(folder) else path.parent
             name = path.relative_to(folder).as_posix()

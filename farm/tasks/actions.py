@@ -32,7 +32,9 @@ def check(task: Task) -> None:
     Raises:
       ConfigError: says what is missing.
     """
-    name, size, actuators = type(task).__name__, task.action_size, task.model.nu
+    name = type(task).__name__
+    size = task.action_size
+    actuators = task.model.nu
     if not size:
         raise ConfigError(
             f"task {name}: its model has no actuator: say how many numbers an action has (actions = 3), and use them "

@@ -56,7 +56,6 @@ log = logging.getLogger(__name__)
 REPLAY_EVERY: Final = 10
 """Generations between two recordings of the best rollout at physics rate: late in a run, most have a new best."""
 
-
 HOPELESS: Final = 3
 """Successive generations in which all rollouts failed, after which a run ends."""
 

@@ -379,12 +379,18 @@ def test_learning_again_ends_at_once(
     assert "stopped; no difference in" in capsys.readouterr().out
 
 
+def altered(folder: RunFolder, **values: float) -> None:
+    """Change what is written of the third generation."""
+    path = folder.path / "progress.jsonl"
+    lines = path.read_text().splitlines()
+    lines[2] = json.dumps(json.loads(lines[2]) | values)
+    path.write_text("\n".join(lines) + "\n")
+
+
 def test_what_was_altered_is_found_in_the_one_pass(tmp_path: Path) -> None:
     folder = learnt(tmp_path / "r")
     thinned(folder, 6)
-    lines = (folder.path / "progress.jsonl").read_text().splitlines()
-    lines[2] = json.dumps(json.loads(lines[2]) | {"return_mean": 0.5})
-    (folder.path / "progress.jsonl").write_text("\n".join(lines) + "\n")
+    altered(folder, return_mean=0.5)
     with pytest.raises(Differs, match="generation 3 differs: return_mean is 0.5 in progress.jsonl"):
         verified(folder, [2, 3, 5])
 
@@ -392,9 +398,7 @@ def test_what_was_altered_is_found_in_the_one_pass(tmp_path: Path) -> None:
 def test_another_number_of_rollouts_is_found(tmp_path: Path) -> None:
     folder = learnt(tmp_path / "r")
     thinned(folder, 6)
-    lines = (folder.path / "progress.jsonl").read_text().splitlines()
-    lines[2] = json.dumps(json.loads(lines[2]) | {"rollouts": 1000})
-    (folder.path / "progress.jsonl").write_text("\n".join(lines) + "\n")
+    altered(folder, rollouts=1000)
     with pytest.raises(Differs, match="generation 3 differs: rollouts is 1000 in progress.jsonl, and 24 when"):
         verified(folder, [3])
 
