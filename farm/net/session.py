@@ -10,7 +10,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, Final, TypeVar
@@ -21,8 +21,9 @@ from farm.errors import ConfigError, FarmError, Interrupted
 from farm.net import probe
 from farm.net.events import Event, Events
 from farm.net.forks import begin_zenoh
+from farm.net.intake import PERIOD, Intake
 from farm.net.rates import Rates
-from farm.net.sockets import raise_descriptors, silence
+from farm.net.sockets import raise_descriptors, received, silence
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LARGEST, RECEIVE, client_settings, router_settings
 
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _TOKENS: Final = 65_536  # most tokens in one query's answer; a router accepts 4096 sessions
 _JOIN_S: Final = 1.0
+_DUTY: Final = 4.0  # answers to one topic's queries take one part in so many of a core's time, at most
 _CUT: Final = 60.0  # [s] that a machine is cut off
 _REMIND: Final = 60.0  # [s] between two messages about the same problem
 
@@ -48,8 +50,18 @@ def free_endpoint() -> str:
 class Session:
     """An open session; use `listen` or `connect`."""
 
-    def __init__(self, session: zenoh.Session, *, certified: bool = False) -> None:
-        self._session, self._certified = session, certified  # whether certificates say whose keys are whose
+    def __init__(
+        self,
+        session: zenoh.Session,
+        *,
+        certified: bool = False,
+        viewers: Collection[str] = (),
+    ) -> None:
+        """Use a session; `certified`: certificates say whose keys are whose; `viewers`: names of machines' that ask."""
+        self._session = session
+        self._certified = certified
+        self._viewers = frozenset(viewers)
+        self._closed = threading.Event()
         self.events = Events()
         """Everything received by subscriptions."""
         self._declared: list[zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LinkEventsListener[None]] = []
@@ -62,6 +74,8 @@ class Session:
         if certified:
             opened = self._callback(self._on_link)
             self._declared.append(_as_daemon(lambda: session.info.declare_link_events_listener(opened)))
+        if viewers:
+            threading.Thread(target=self._count, daemon=True).start()
 
     def publish(self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True) -> None:
         """Send bytes to the subscribers of the key; without `block` a receiver that is stuck loses them."""
@@ -100,12 +114,18 @@ class Session:
         self.answer_asked(key, lambda _: reply())
 
     def answer_asked(self, key: str, reply: Callable[[str], bytes]) -> None:
-        """Like `answer`, where `reply` takes the query's parameters (the text after the key and a question mark)."""
+        """Like `answer`, where `reply` takes the query's parameters (the text after the key and a question mark).
+
+        Each topic's queries are answered one after the other, and those that come too fast have to wait: whoever asks
+        without end takes a quarter of a core, not all of it.
+        """
 
         def serve(query: zenoh.Query) -> None:
-            """Answer one. Thread: Zenoh's."""
+            """Answer one. Thread: Zenoh's, this topic's own."""
+            start = time.thread_time()
             with query, suppress(zenoh.ZError):
                 query.reply(key, reply(str(query.parameters)))
+            self._closed.wait((_DUTY - 1.0) * (time.thread_time() - start))
 
         callback = self._callback(serve)
         self._declared.append(_as_daemon(lambda: self._session.declare_queryable(key, callback)))
@@ -152,9 +172,19 @@ class Session:
         if self._is_cut(name):
             return False
         self._cut[name] = time.monotonic() + _CUT
-        log.warning("machine %s sends more messages than any worker: it is cut off for %g s", name, _CUT)
+        role = "viewer" if name in self._viewers else "worker"
+        log.warning("machine %s sends more than any %s: it is cut off for %g s", name, role, _CUT)
         threading.Thread(target=self._silence, args=(name,), daemon=True).start()
         return True
+
+    def _count(self) -> None:
+        """Cut off viewers that send much: Zenoh says of no query, and no subscription, whose it is. Thread: helper."""
+        intake = Intake()
+        while not self._closed.wait(PERIOD):
+            links = {_address(link): link.auth_identifier or "" for link in self._session.info.links()}
+            viewers = {address: name for address, name in links.items() if name in self._viewers}
+            for name in intake.over(received() if viewers else {}, viewers):
+                self.cut(name)
 
     def _silence(self, name: str) -> None:
         """Silence a machine's connections: callbacks of Zenoh's must not list them. Thread: helper."""
@@ -170,6 +200,7 @@ class Session:
 
     def close(self) -> None:
         """Undeclare everything and wait for the callbacks: one left running in Rust aborts the interpreter's exit."""
+        self._closed.set()
         for token in self._tokens:
             token.undeclare()
         for declared in self._declared:
@@ -246,7 +277,8 @@ def listen(
     """
     settings = router_settings(endpoint, farm, bundle, trusted=trusted, routers=routers)
     try:
-        return _closing(_open(settings | {RECEIVE: largest}), certified=bundle is not None)
+        viewers = () if bundle is None else bundle.roster().viewers
+        return _closing(_open(settings | {RECEIVE: largest}), certified=bundle is not None, viewers=viewers)
     except zenoh.ZError as error:
         raise ConfigError(
             f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? "
@@ -318,8 +350,8 @@ def _open(settings: Mapping[str, object]) -> zenoh.Session:
 
 
 @contextmanager
-def _closing(session: zenoh.Session, *, certified: bool) -> Iterator[Session]:
-    opened = Session(session, certified=certified)
+def _closing(session: zenoh.Session, *, certified: bool, viewers: Collection[str] = ()) -> Iterator[Session]:
+    opened = Session(session, certified=certified, viewers=viewers)
     try:
         yield opened
     finally:

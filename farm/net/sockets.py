@@ -24,6 +24,7 @@ _NO_DATA: Final = (  # classic BPF: take segments that are no longer than their 
 )  # fmt: skip
 _PROGRAM: Final = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in _NO_DATA))
 _FILTER: Final = struct.pack("HP", len(_NO_DATA), ctypes.addressof(_PROGRAM))  # struct sock_fprog
+_TCP_INFO: Final = struct.Struct("=128xQ")  # of struct tcp_info, tcpi_bytes_received: Linux 4.1 and later
 _OPEN: Final = Path("/dev/fd")  # a process' descriptors, on Linux and macOS
 
 
@@ -66,6 +67,21 @@ def silence(peers: Collection[str]) -> None:
                     connection.setsockopt(socket.SOL_SOCKET, _ATTACH_FILTER, _FILTER)
                 else:
                     connection.shutdown(socket.SHUT_RDWR)
+
+
+def received() -> dict[str, int]:
+    """Bytes that came in so far over each of this process's connections, by the peer's HOST:PORT; IPv6 has brackets.
+
+    Empty on systems other than Linux, which do not count them.
+    """
+    counts: dict[str, int] = {}
+    for connection in _connections() if sys.platform == "linux" else ():
+        with connection, suppress(OSError, struct.error):  # one that listens has no peer
+            host, port, *_ = connection.getpeername()
+            answer = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+            peer = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+            counts[peer] = _TCP_INFO.unpack(answer)[0]
+    return counts
 
 
 def _connections() -> Iterator[socket.socket]:

@@ -13,6 +13,7 @@ _PORT: Final = re.compile(r"[0-9]{1,5}")
 _OPEN_S: Final = 1.0
 _REQUEST: Final = 65_536  # [bytes] of a request for work
 _REQUESTS: Final = 1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
+_QUERIES: Final = 20.0  # [1/s] queries per link and topic; workers ask once per run, recorders some times per second
 LARGEST: Final = 64 * 1024 * 1024  # [bytes] of a message
 RECEIVE: Final = "transport/link/rx/max_message_size"
 _COMMON: Final = {
@@ -106,11 +107,19 @@ def router_settings(
 
 
 def _limits(farm: str) -> dict[str, object]:
-    """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over one link."""
+    """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over one link.
+
+    A query that is dropped is unanswered at once, and asked again later.
+    """
     requests, common = keys.want(farm, "**"), {"flows": ["ingress"], "messages": ["put"]}
+    asked = [topic(farm, "*") for topic in (keys.spec, keys.generation, keys.status, keys.history)]
+    queries = [{"key_expr": key, "freq": _QUERIES} for key in asked]
     return {
         "low_pass_filter": [{**common, "key_exprs": [requests], "size_limit": _REQUEST}],
-        "downsampling": [{**common, "rules": [{"key_expr": requests, "freq": _REQUESTS}]}],
+        "downsampling": [
+            {**common, "rules": [{"key_expr": requests, "freq": _REQUESTS}]},
+            {**common, "messages": ["query"], "rules": queries},
+        ],
     }
 
 

@@ -177,11 +177,7 @@ class _Folder:
         content = file.read_bytes()
         if file.suffix.lower() not in SUFFIXES:
             return content
-        try:
-            text = content.decode()
-        except UnicodeDecodeError:
-            text = content.decode("latin-1")
-        return self._relative(text)
+        return self._relative(decoded(content))
 
     def _relative(self, text: str) -> str:
         """A text whose absolute paths in the folder are relative to the model's: it is compiled elsewhere, too."""
@@ -212,6 +208,14 @@ class _Folder:
             f"{path} lies outside of the task's folder {self._folder}: put the task's file into {folder} and name "
             "the model from there, or give the class that folder: root = Path(...)"
         )
+
+
+def decoded(content: bytes) -> str:
+    """A model's text in UTF-8, or in Latin-1 if it is not."""
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
 
 
 def _key(contents: Files, main: str) -> str:

@@ -14,7 +14,9 @@ from learner.run.launch import open_run
 @pytest.fixture(scope="session")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("certificates") / "own"
-    certificates.main(["new", str(folder), "--learner", "127.0.0.1", *(w for h in HOSTS for w in ("--worker", h))])
+    workers = [word for name in HOSTS for word in ("--worker", name)]
+    words = ["new", str(folder), "--learner", "127.0.0.1", *workers, "--viewer", "looker"]
+    certificates.main(words)
     return folder
 
 

@@ -73,7 +73,28 @@ def test_a_machine_that_floods_is_cut_off(
         while viewer.present(token, 1.0):
             next(learning)
         assert len(run.dispatcher.workers) == 1  # the honest one
-    assert "machine liar sends more messages than any worker" in caplog.text
+    assert "machine liar sends more than any worker" in caplog.text
+
+
+@pytest.mark.parametrize("what", ["histories", "statuses", "token-queries", "subscriptions"])
+def test_a_viewer_that_floods_is_cut_off_and_the_run_goes_on(
+    certs: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
+) -> None:
+    task, place = pole(tmp_path / "mine"), placed(certs)
+    config = farm.configure(f"{task}:Pole", generations=10_000, pairs=15)
+    with ExitStack() as stack:
+        run = stack.enter_context(open_run(config, tmp_path / "run", place))
+        learning = run.learn()
+        stack.enter_context(host(place.listen, certs, "a", task))
+        next(learning)
+        attack = ["benchmarks/floods.py", "--attack", what, "--at", place.listen, str(certs)]
+        words = [sys.executable, *attack]
+        stack.enter_context(subprocess.Popen(words, stdin=subprocess.PIPE, cwd=ROOT))
+        while "machine looker sends more than any viewer" not in caplog.text:
+            next(learning)
+        for _ in range(10):
+            next(learning)
+        assert len(run.dispatcher.workers) == 1
 
 
 @contextmanager

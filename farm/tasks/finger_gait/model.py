@@ -13,7 +13,9 @@ import mujoco
 
 import farm
 from farm.errors import ConfigError
+from farm.sim.model_files import decoded
 from farm.tasks.finger_gait.hand import FINGERS, POSES, Pose
+from farm.tasks.finger_gait.markup import tree
 
 CONTACTS: Final = 4
 """Contacts kept per fingertip (the strongest); a sphere on a convex body has one."""
@@ -62,8 +64,8 @@ def _object(name: str) -> str:
     if not name.endswith(".xml") and name not in names:
         raise ConfigError(f"unknown object {name!r}; known are {', '.join(names)}, or a file NAME.xml")
     try:
-        return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return decoded(path.read_bytes())
+    except OSError as error:
         raise ConfigError(f"cannot read the object {path}: {error}") from None
 
 
@@ -118,8 +120,8 @@ def _body(root: ET.Element, name: str) -> ET.Element:
 
 def _parsed(sources: Mapping[str, str], name: str) -> ET.Element:
     try:
-        return ET.fromstring(sources[name])
-    except (KeyError, ET.ParseError) as error:
+        return tree(sources[name])
+    except (KeyError, ValueError) as error:
         raise ConfigError(f"the hand's model: {name} cannot be read: {error}") from None
 
 
@@ -127,7 +129,7 @@ def mjcf(sources: Mapping[str, str], thing: str = "object.xml", name: str = "") 
     """The texts of `files` with one object as one MJCF text that needs no other file, a model of this name.
 
     Raises:
-      ConfigError: a text is not XML.
+      ConfigError: a text cannot be read.
     """
     whole = ET.Element("mujoco", {"model": name} if name else {})
     for part in ("hand.xml", "finger_gait.xml", thing):

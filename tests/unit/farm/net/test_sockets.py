@@ -8,7 +8,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from farm.net.sockets import silence
+from farm.net.sockets import received, silence
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems close the connection")
@@ -41,3 +41,21 @@ def test_a_silenced_connection_receives_nothing_and_stays_open(family: int, host
             got += near[0].recv(1_000_000)
         sending.join(10.0)
         assert got == payload
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not count them")
+@pytest.mark.parametrize(
+    ("family", "host", "name"),
+    [(socket.AF_INET, "127.0.0.1", "127.0.0.1"), (socket.AF_INET6, "::1", "[::1]")],
+)
+def test_bytes_that_came_in_are_counted_by_connection(family: int, host: str, name: str) -> None:
+    with ExitStack() as stack:
+        listener = stack.enter_context(socket.create_server((host, 0), family=family))
+        address = (host, listener.getsockname()[1])
+        near = stack.enter_context(socket.create_connection(address))
+        far = stack.enter_context(listener.accept()[0])
+        near.sendall(b"x" * 5000)
+        got = 0
+        while got < 5000:
+            got += len(far.recv(5000))
+        assert received()[f"{name}:{near.getsockname()[1]}"] == 5000
