@@ -23,6 +23,14 @@ if TYPE_CHECKING:
     from farm.sim.channels import Quantity as Quantity
     from farm.sim.interfaces import Backend as Backend
     from farm.sim.sim import Sim as Sim
+    from farm.tasks.actions.clock import Clock as Clock
+    from farm.tasks.actions.mirrored import Mirrored as Mirrored
+    from farm.tasks.actions.moves import Moves as Moves
+    from farm.tasks.actions.offsets import Offsets as Offsets
+    from farm.tasks.actions.residual import Residual as Residual
+    from farm.tasks.actions.rhythm import Rhythm as Rhythm
+    from farm.tasks.actions.space import ActionSpace as ActionSpace
+    from farm.tasks.actions.synergies import Synergies as Synergies
     from farm.tasks.base import Record as Record
     from farm.tasks.base import Score as Score
     from farm.tasks.base import Task as Task
@@ -36,6 +44,10 @@ _WHERE: Final = {
     "load": "learner.again.replay", "rewind": "learner.again.rewind",
     "RunConfig": "learner.run.config", "configure": "learner.run.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
+    "ActionSpace": "farm.tasks.actions.space", "Offsets": "farm.tasks.actions.offsets",
+    "Moves": "farm.tasks.actions.moves", "Residual": "farm.tasks.actions.residual",
+    "Synergies": "farm.tasks.actions.synergies", "Mirrored": "farm.tasks.actions.mirrored",
+    "Rhythm": "farm.tasks.actions.rhythm", "Clock": "farm.tasks.actions.clock",
     "Channel": "farm.sim.channels", "Camera": "farm.sim.channels", "Measure": "farm.sim.channels",
     "Quantity": "farm.sim.channels",
     "Touch": "farm.tasks.touch", "TouchConfig": "farm.tasks.touch",

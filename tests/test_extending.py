@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+import farm as public
 from farm import Task
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks import loop
+from farm.tasks.actions.space import ActionSpace
 from farm.tasks.probe import specification
 from learner.commands import new_task
 
@@ -118,19 +120,11 @@ def test_what_the_page_says_of_sim() -> None:
     assert (record["goal"][1] != 0.0).all()
 
 
-LEGS = "".join(
-    f"""<body pos="{i} 0 1"><joint name="{name}" axis="0 1 0" damping="1"/><geom size=".1" pos="0 0 -.3"/></body>"""
-    for i, name in enumerate("abcd")
-)
-MOTORS = "".join(f'<motor joint="{name}" ctrlrange="-2 2"/>' for name in "abcd")
 PUCK = '<body name="puck"><freejoint/><geom size=".1"/></body>'
 MODELS = {
     "Dragged": f"""<worldbody><body name="target" mocap="true"/>{PUCK}</worldbody>
       <equality><weld body1="target" body2="puck"/></equality>""",
     "Pushed": f"<worldbody>{PUCK}</worldbody>",
-    "Synergies": f"<worldbody>{LEGS}</worldbody><actuator>{MOTORS}</actuator>",
-    "Generator": f"<worldbody>{LEGS}</worldbody><actuator>{MOTORS}</actuator>",
-    "Symmetric": f"<worldbody>{LEGS}</worldbody><actuator>{MOTORS}</actuator>",
 }
 """A model for each of the page's actions."""
 
@@ -162,6 +156,16 @@ def test_an_action_of_the_page_moves_the_model(name: str) -> None:
     still, moving = loop.again(moved)
     assert still == 0.0
     assert moving > 1e-3
+
+
+def test_each_action_space_of_the_page_is_a_public_class() -> None:
+    table = PAGE.partition("### What an action is")[2].partition("They nest")[0]
+    cells = re.findall(r"^\| `(farm\..*?)` \|", table, re.M)
+    spaces = [eval(cell, {"farm": public}) for cell in cells]
+    kinds = {type(each) for each in spaces}
+    names = [getattr(public, name) for name in public.__all__]
+    known = {each for each in names if isinstance(each, type) and issubclass(each, ActionSpace)}
+    assert kinds == known - {ActionSpace}
 
 
 def test_a_keyframe_of_the_page_is_the_start() -> None:

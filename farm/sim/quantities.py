@@ -74,6 +74,14 @@ def controls(model: mujoco.MjModel) -> tuple[Quantity, ...]:
     )  # fmt: skip
 
 
+def of_joint(model: mujoco.MjModel, actuator: int) -> int | None:
+    """The hinge or slide that an actuator moves; None if it moves something else."""
+    target = int(model.actuator_trnid[actuator, 0])
+    if model.actuator_trntype[actuator] not in _OF_JOINT or model.jnt_type[target] not in (_HINGE, _SLIDE):
+        return None
+    return target
+
+
 def moved(model: mujoco.MjModel, actuator: int) -> str:
     """Name of the joint or tendon that an actuator moves; empty if it moves something else."""
     kind, target = model.actuator_trntype[actuator], int(model.actuator_trnid[actuator, 0])

@@ -13,6 +13,7 @@ from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, TaskError
 from farm.settings import Settings, setting
 from farm.sim.channels import Camera, Channel, Measure, Quantity
+from farm.tasks.actions.space import ActionSpace
 
 if TYPE_CHECKING:
     import mujoco
@@ -223,10 +224,11 @@ class Task:
     """Sizes of the observation's parts if they differ in kind; empty: one part."""
     observations: tuple[Quantity, ...] = ()
     """What the observation's numbers are, for exports; empty: numbered, or qpos and qvel if those are observed."""
-    actions: int | tuple[Quantity, ...] = ()
-    """How many numbers an action has, or what they are; empty: one for each actuator.
+    actions: int | tuple[Quantity, ...] | ActionSpace = ()
+    """An action space, or how many numbers an action has, or what they are; empty: one for each actuator.
 
-    Without actuators it is three for each mocap body. `act` makes controls of any other number.
+    `farm.Offsets` and the other spaces say what the numbers do. Without actuators there are three for each mocap body.
+    `act` makes controls of any other number.
     """
     ends: tuple[str, str] | None = None
     """Names of the states in which rollouts begin and should end; with `reached` and `lost` policies can be chained."""
@@ -333,12 +335,14 @@ class Task:
         """What the policy sees, (B, d); qpos and qvel unless overridden."""
         return np.concatenate([sim.qpos, sim.qvel], axis=1)
 
-    def act(self, sim: "Sim", action: FloatArray) -> FloatArray:  # noqa: ARG002
-        """Controls of raw actions (B, A); -1 to 1 rescaled to the actuators' ranges unless overridden.
+    def act(self, sim: "Sim", action: FloatArray) -> FloatArray:
+        """Controls of raw actions (B, A): of the action space, or -1 to 1 rescaled to the actuators' ranges.
 
         It may also write qpos, qvel, mocap_pos, xfrc_applied and the others of `farm.sim.sim.WRITABLE`: pushes, moving
         goals, jumps. They hold from this control step's first physics step on.
         """
+        if self.space:
+            return self.space.controls(sim, action)
         low, high = self.limits
         if action.shape[1] != len(low):
             raise TaskError(f"Task.act got actions of {action.shape[1]} numbers; expected {len(low)}, one per actuator")
@@ -395,9 +399,21 @@ class Task:
         low, high = self.model.actuator_ctrlrange.T
         return np.where(limited, low, -1.0), np.where(limited, high, 1.0)
 
+    @cached_property
+    def space(self) -> ActionSpace | None:
+        """The action space that `actions` declares, fitted to the model; None if it declares none.
+
+        Raises:
+          ConfigError: it does not fit the model.
+        """
+        return self.actions.fitted(self) if isinstance(self.actions, ActionSpace) else None
+
     @property
     def action_size(self) -> int:
         """Length A of the action; 0 if nothing says it."""
+        if self.space:
+            return self.space.size
+        assert not isinstance(self.actions, ActionSpace)
         if isinstance(self.actions, int):
             return self.actions
         return len(self.actions) or self.model.nu or 3 * self.model.nmocap

@@ -114,6 +114,14 @@ def _explained(call: Callable[P, T]) -> Callable[P, T]:
     return method
 
 
+def seen(task: Task, sim: Sim) -> FloatArray:
+    """What the policy sees, (B, d): the task's observation, and what its action space adds."""
+    x = task.observe(sim)
+    if task.space and np.ndim(x) == 2:
+        return task.space.see(sim, x)
+    return x
+
+
 class Batch:
     """Rollouts of one task that are stepped together, independent of how actions are chosen."""
 
@@ -135,6 +143,8 @@ class Batch:
         unique = list(dict.fromkeys(seeds))
         rngs = [None if seed is None else np.random.default_rng(seed) for seed in unique]
         sim.begin(len(unique), drawn(task, rngs) if len(sim.models) > 1 else None)
+        if task.space:
+            task.space.begin(sim)
         task.prepare(sim, rngs)
         sim.start(np.array([unique.index(seed) for seed in seeds]))
         self.which = sim.which
@@ -161,7 +171,7 @@ class Batch:
     @_explained
     def observe(self) -> FloatArray:
         """Observations of the active rollouts, (n, d)."""
-        x = self.task.observe(self.sim)
+        x = seen(self.task, self.sim)
         self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
         x = shaped("observe", x, (len(self.sim), self._width))
         if np.isfinite(x).all():

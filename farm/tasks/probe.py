@@ -15,7 +15,8 @@ from farm.sim.channels import Camera, Channel, Measure, Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
-from farm.tasks import actions
+from farm.tasks.actions import described as actions
+from farm.tasks.actions.space import ActionSpace
 from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
 
@@ -52,10 +53,14 @@ def specification(task: Task) -> TaskSpec:
 def _check_quantities(task: Task, what: str) -> None:
     """Check that an attribute names quantities, if it names any, or says how many numbers an action has."""
     quantities: object = getattr(task, what)
-    if what == "actions" and actions.is_size(quantities):
+    if isinstance(quantities, type) and issubclass(quantities, ActionSpace):
+        raise ConfigError(
+            f"task {type(task).__name__}: {what} is a class; expected an object: {quantities.__name__}(...)"
+        )
+    if what == "actions" and (task.space or actions.is_size(quantities)):
         return
     if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
-        number = f"a number from 1 to {actions.LIMIT} or " if what == "actions" else ""
+        number = f"a farm.ActionSpace, a number from 1 to {actions.LIMIT} or " if what == "actions" else ""
         raise ConfigError(
             f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of farm.Quantity"
         )
@@ -64,6 +69,8 @@ def _check_quantities(task: Task, what: str) -> None:
 def _check_count(task: Task, what: str, count: int) -> None:
     """Check that an attribute names as many numbers as there are, if it names any."""
     quantities = getattr(task, what)
+    if task.space:
+        quantities = task.space.names(quantities) if quantities and what == "observations" else ()
     size = quantities if isinstance(quantities, int) else len(quantities)
     if size and size != count:
         raise ConfigError(f"task {type(task).__name__}: {what} names {size} numbers; there are {count}")

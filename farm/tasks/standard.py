@@ -47,7 +47,10 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
     """
     x = _observed(task, np.random.default_rng(0).normal(0.0, action, (_ROLLOUTS, task.action_size)))
     low, high = np.quantile(x, (0.25, 0.75), axis=0)
-    spread, parts = (high - low) / _QUARTILES, task.parts or (x.shape[1],)
+    spread = (high - low) / _QUARTILES
+    parts = task.parts or (x.shape[1],)
+    if task.space and sum(parts) < len(spread):
+        parts = (*parts, len(spread) - sum(parts))  # what the action space adds
     if sum(parts) != len(spread):
         raise TaskError(f"parts are {parts}; expected sizes that add up to the observation's {len(spread)}")
     for part in np.split(spread, np.cumsum(parts)[:-1]):  # views

@@ -10,7 +10,7 @@ from farm import archives
 from farm.errors import ConfigError, brief
 from farm.sim import quantities
 from farm.sim.channels import Quantity
-from farm.tasks import actions
+from farm.tasks.actions.described import described
 from farm.tasks.base import Task
 from learner.again.replay import LoadedPolicy
 
@@ -24,8 +24,8 @@ def interface(policy: LoadedPolicy) -> dict[str, Any]:
     mean = constants.get("observation_mean")
     moved = [quantities.moved(model, i) for i in range(model.nu)]
     return {
-        "observations": _rows(task.observations or _observations(task, spec.observation)),
-        "actions": _rows(actions.described(task, spec.action)),
+        "observations": _rows(_observations(task, spec.observation)),
+        "actions": _rows(described(task, spec.action)),
         "controls": [row | {"moves": name} for row, name in zip(_rows(quantities.controls(model)), moved, strict=True)],
         "joints": quantities.joints(model),
         "normaliser": None
@@ -36,10 +36,13 @@ def interface(policy: LoadedPolicy) -> dict[str, Any]:
 
 
 def _observations(task: Task, count: int) -> tuple[Quantity, ...]:
-    """Those of a task that does not name its own."""
-    if type(task).observe is Task.observe:
-        return quantities.states(task.model)
-    return tuple(Quantity(f"observation {i}") for i in range(count))
+    """Those that a task names, with what its action space adds; otherwise states, or numbers."""
+    own = task.observations
+    if not own and type(task).observe is Task.observe:
+        own = quantities.states(task.model)
+    if own and task.space:
+        own = task.space.names(own)
+    return own or tuple(Quantity(f"observation {i}") for i in range(count))
 
 
 def _rows(quantities: Sequence[Quantity]) -> list[dict[str, Any]]:

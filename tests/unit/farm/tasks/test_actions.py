@@ -10,7 +10,8 @@ from farm.errors import ConfigError, FarmError
 from farm.sim.channels import Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
-from farm.tasks import actions, loop
+from farm.tasks import loop
+from farm.tasks.actions import described as actions
 from farm.tasks.base import Task
 from farm.tasks.probe import specification
 
@@ -116,7 +117,7 @@ def test_a_mistake_is_one_line(case: str) -> None:
 @pytest.mark.parametrize("value", [0, -1, True, 2.0, "three", None, 10_001, (1, 2)])
 def test_what_is_no_size(value: object) -> None:
     with pytest.raises(
-        ConfigError, match=r"actions is .*; expected a number from 1 to 10000 or a tuple of farm.Quantity"
+        ConfigError, match=r"actions is .*; expected a farm.ActionSpace, a number from 1 to 10000 or a tuple"
     ):
         specification(of(Together, actions=value))
 

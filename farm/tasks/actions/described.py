@@ -13,6 +13,8 @@ LIMIT: Final = 10_000
 
 def described(task: Task, count: int) -> tuple[Quantity, ...]:
     """What the numbers of an action are: as the task names them, or by the actuators if there are as many."""
+    if task.space:
+        return task.space.quantities
     if isinstance(task.actions, tuple | list) and task.actions:
         return tuple(task.actions)
     bounds = (-1.0, 1.0) if type(task).act is Task.act else ()
@@ -33,6 +35,8 @@ def check(task: Task) -> None:
       ConfigError: says what is missing.
     """
     name = type(task).__name__
+    if task.space:
+        return
     size = task.action_size
     actuators = task.model.nu
     if not size:
