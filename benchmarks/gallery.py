@@ -1,4 +1,4 @@
-"""Learns the tasks of examples/tasks, measures them beside trivial policies, films them, and writes docs/gallery.md.
+"""Learns the tasks of examples/, measures them beside trivial policies, films them, and writes docs/gallery.md.
 
     python benchmarks/gallery.py [--only arm,cart] [--seed 0] [--runs runs/gallery] [--docs docs]
 
@@ -10,7 +10,7 @@ from 100 perturbed starts that no learning has seen:
     still       the policy whose parameters are all 0
 
 Rows are kept in docs/results/tables/gallery.jsonl, films in docs/pictures/gallery. Needs the extras `gym` and `video`,
-and what the head of `jaco.py` and docs/gymnasium.md say.
+and what the heads of the robots' files and docs/gymnasium.md say.
 """
 
 import argparse
@@ -48,6 +48,8 @@ class Piece:
     """Of `farm run`, beside the task."""
     needs: str = ""
     """What else is to be installed."""
+    folder: str = "tasks"
+    """Of examples/."""
 
     @property
     def name(self) -> str:
@@ -57,17 +59,22 @@ class Piece:
     @property
     def words(self) -> list[str]:
         """The command that learns it."""
-        return ["run", "--task", f"examples/tasks/{self.task}", *shlex.split(self.flags)]
+        return ["run", "--task", f"examples/{self.folder}/{self.task}", *shlex.split(self.flags)]
 
+
+_ROBOT: Final = "Its model: [robots of other people](../examples/README.md#robots-of-other-people)."
 
 PIECES: Final = (
+    Piece("go1.py:Walk", "A Unitree Go1 trots at the speed that the bar shows.", needs=_ROBOT, folder="robots"),
+    Piece("crazyflie.py:Hover", "A Crazyflie recovers from a tumble, and hovers.", needs=_ROBOT, folder="robots"),
+    Piece("ur5e.py:Push", "A UR5e pushes a puck to its goal.", needs=_ROBOT, folder="robots"),
     Piece("pendulum.py:Pendulum", "A motor that is too weak to lift a pendulum swings it up.", "--generations 150"),
     Piece("cart.py:Cart", "A cart balances a pole of random mass."),
     Piece("arm.py:Arm", "An arm follows a ball; the circle and its speed are random.", "--generations 300"),
     Piece("hopper.py:Hopper", "A planar hopper of random weight hops on random ground."),
     Piece("quadrotor.py:Quadrotor", "A quadrotor flies to a point and hovers there."),
     Piece("jaco.py:Jaco", "A Kinova arm with its meshes follows a ball.", "--generations 60",
-          needs="Meshes: [a robot with meshes](../examples/README.md#a-robot-with-meshes)."),
+          needs=_ROBOT),
     Piece(
         "gripper.py:Gripper", "A gripper lifts a box of unknown weight by touch.",
         "--policy linear --normalise --algorithm ars --learning-rate-mu 0.1 --initial-sigma 0.1 --touch-noise 0.05 "
@@ -109,7 +116,7 @@ def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
         _farm(*piece.words, "--seed", str(seed), "--out", str(run.parent), "--name", run.name, "--no-record")
     summary, policy = json.loads((run / "summary.json").read_text()), load(run)
     returns = policy.runner.run(policy.mu, evaluation_jobs(STARTS, SEED)).returns[:STARTS]
-    task = f"{ROOT}/examples/tasks/{piece.task}"
+    task = f"{ROOT}/examples/{piece.folder}/{piece.task}"
     scores = {"learnt": float(returns.mean()), "constant": constant(task, 0, 0, *TRIES), "still": still(task, 0, 0)}
     row = {"task": piece.task, "seed": seed, "rollouts": summary["rollouts"], "seconds": round(summary["seconds"])}
     return row | {name: round(score, 3) for name, score in scores.items()}
@@ -138,7 +145,7 @@ def page(rows: dict[str, Any]) -> str:
     """docs/gallery.md."""
     lines = [
         "# Gallery", "",
-        "Each task is one file in `examples/tasks`. The command below its film learnt it on two cores. Scores are mean",
+        "Each task is one file in `examples`. The command below its film learnt it on two cores. Scores are mean",
         "returns from 100 perturbed starts that no learning has seen; *constant* is the best of 50 random constant",
         "actions, and *still* the policy whose parameters are all 0. `python benchmarks/gallery.py` repeats all of it.",
     ]  # fmt: skip

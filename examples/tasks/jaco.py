@@ -1,6 +1,6 @@
 """A Kinova Jaco arm of dm_control, with its meshes, reaches for a ball that moves.
 
-The robot's files are beside this one, in a folder `kinova`; examples/README.md says how they get there.
+pip install --no-deps dm_control     # the model and its meshes: Kinova's, in third_party
 """
 
 import numpy as np
@@ -11,6 +11,7 @@ from farm import Task
 class Jaco(Task):
     """Keep the wrist at the ball."""
 
+    package, root = "dm_control", "third_party"
     xml = """<mujoco>
       <include file="kinova/jaco_arm.xml"/>
       <compiler meshdir="kinova/meshes_decimated"/>

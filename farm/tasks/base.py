@@ -4,6 +4,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -206,6 +207,11 @@ class Task:
     """
     root: str | Path = ""
     """Folder of all files of `xml`, seen from the folder of the task's file; empty: that folder itself."""
+    package: str = ""
+    """An installed package in whose folder `root` is, for a robot that comes from there; it is not imported.
+
+    Only the learner needs it: workers get the model's files from the learner.
+    """
     steps: int = 100
     """Control steps of a rollout."""
     substeps: int = 1
@@ -258,10 +264,25 @@ class Task:
 
     @property
     def _folder(self) -> Path | None:
-        """Of the file whose class says what `xml` is."""
+        """Of the package, or of the file whose class says what `xml` is."""
+        if self.package:
+            return self._installed()
         module = next(kind.__module__ for kind in type(self).__mro__ if "xml" in vars(kind))
         file = getattr(sys.modules.get(module), "__file__", None)
         return Path(file).parent if file else None
+
+    def _installed(self) -> Path:
+        """The folder of the package."""
+        try:
+            found = find_spec(self.package) if "." not in self.package else None
+        except ValueError:
+            found = None
+        if found is None or not found.submodule_search_locations:
+            raise ConfigError(
+                f"task {type(self).__name__}: its model is in the package {self.package!r:.60}, which is not "
+                f"installed here: install it with pip, beside rolloutfarm"
+            )
+        return Path(next(iter(found.submodule_search_locations)))
 
     @property
     def model(self) -> "mujoco.MjModel":

