@@ -28,7 +28,8 @@ class Push(farm.Task):
         """The package's arm with a table, a puck and a goal, and a rod as its tool."""
         scene = f"""<geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.85 0.85 0.85 1"/>
           <body name="puck" pos="{PLACE[0]} {PLACE[1]} {HEIGHT}"><freejoint name="puck"/>
-            <geom name="puck" type="cylinder" size="0.04 {HEIGHT}" mass="0.3" friction="0.5" rgba="0.9 0.62 0 1"/></body>
+            <geom name="puck" type="cylinder" size="0.04 {HEIGHT}" mass="0.3" friction="0.5"
+              rgba="0.9 0.62 0 1"/></body>
           <body name="goal" mocap="true" pos="0 0.8 0.001">
             <geom type="cylinder" size="0.03 0.001" contype="0" conaffinity="0" rgba="0 0.62 0.45 1"/></body>"""
         rod = '<geom name="rod" type="capsule" fromto="0 0.1 0 0 0.13 0" size="0.015" mass="0.1"/>'
