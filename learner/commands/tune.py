@@ -162,7 +162,8 @@ def _conclude(race: Race, *, recorded: bool) -> None:
         replace_text(race.path / "result.md", result.page(race, figure=drawable))
     wide().print(_table(race))
     folder = race.folder(race.winner)
-    say(f"{race.winner.name} wins; the numbers are mean returns from perturbed starts: {race.path}/result.md")
+    say(result.verdict(race).replace("**", ""))
+    say(f"the numbers are mean returns from perturbed starts: {race.path}/result.md")
     say(f"without the race: {result.command(race)}")
     say(f"look at it with: farm {'view' if recorded else 'replay'} {folder}")
     if not drawable:

@@ -36,6 +36,7 @@ from learner.run.config import RunConfig
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
 from learner.run.learner import explored
+from learner.run.worth import without_learning
 from learner.sweep.runs import RunWatcher, Site
 
 MOST: Final = 256
@@ -98,6 +99,8 @@ class Race:
     scores: list[dict[str, float | None]] = field(default_factory=list)
     """For each rung that is over, the score from perturbed starts by entry: the mean return, in which a failed rollout
     counts as the worst one less a standard deviation. None if a run diverged, or failed from every start."""
+    without_learning: dict[str, Any] | None = None
+    """Figures of doing nothing and of the best constant action, as in summary.json; None before the race is over."""
 
     @property
     def rungs(self) -> list[Rung]:
@@ -162,7 +165,24 @@ class Race:
                 raise RunError(f"rung {number + 1} is not complete: an entry failed, see above")
             self.scores.append({entry.name: _score(self.folder(entry)) for entry in self.running(number)})
             self._write()
+        if self.without_learning is None:
+            self.without_learning = without_learning(setup.problem(self.winner.config), stopped)
+            self._write()
         return True
+
+    @property
+    def worth(self) -> dict[str, float | None]:
+        """Scores of doing nothing and of the best constant action, by what the table calls them."""
+        of = self.without_learning or {}
+        names = {"nothing": "doing nothing", "constant": "best constant action"}
+        return {words: of[name]["score"] for name, words in names.items() if name in of}
+
+    @property
+    def learnt(self) -> bool:
+        """Whether the winner of a race that is over is better than each policy that learnt nothing."""
+        score = self.scores[-1][self.winner.name]
+        others = [value for value in self.worth.values() if value is not None]
+        return score is not None and all(score > value for value in others)
 
     def prepare(self) -> None:
         """Make the folder, or continue with it.
@@ -181,7 +201,10 @@ class Race:
 
     def _write(self) -> None:
         with writing(f"to {self.path}"):
-            replace_text(self.path / "race.json", json.dumps({**self._settings(), "scores": self.scores}, indent=2))
+            values = {**self._settings(), "scores": self.scores}
+            if self.without_learning is not None:
+                values["without_learning"] = self.without_learning
+            replace_text(self.path / "race.json", json.dumps(values, indent=2))
 
     def _settings(self) -> dict[str, Any]:
         entries = {entry.name: configs.to_dict(entry.config) for entry in self.entries}
@@ -200,6 +223,7 @@ class Race:
         for name, values in saved["entries"].items():
             if values != current["entries"][name]:
                 raise ConfigError(f"{self.path} was started with different settings of {name}: use a different --out")
+        self.without_learning = saved.get("without_learning")
         return list(saved["scores"])
 
 

@@ -1,5 +1,6 @@
 """What a race is reported as: a table, a page, and curves."""
 
+import math
 import re
 import shlex
 from typing import Final
@@ -20,7 +21,7 @@ entry's mean policy returned {untrained}.
 
 {table}
 
-**{winner}** won: its run is in `{folder}`. Without the race,
+{verdict} Its run is in `{folder}`. Without the race,
 
     {command}
 
@@ -40,8 +41,18 @@ def heads(race: Race) -> list[str]:
 
 
 def rows(race: Race) -> list[list[str]]:
-    """The scores of each entry as text, best first; those dropped last come before those dropped first."""
-    return [[entry.name, *_scores(race, entry)] for entry in race.standing]
+    """The scores of each entry as text, best first; those dropped last come before those dropped first.
+
+    Policies that learnt nothing are below them, when the race is over.
+    """
+    entries = [[entry.name, *_scores(race, entry)] for entry in race.standing]
+    empty = [""] * (len(race.rungs) - 1)
+    others = [[name, *empty, _score(score)] for name, score in race.worth.items()]
+    return [*entries, *others]
+
+
+def _score(score: float | None) -> str:
+    return "failed" if score is None else f"{score:.4g}"
 
 
 def _scores(race: Race, entry: Entry) -> list[str]:
@@ -68,9 +79,17 @@ def page(race: Race, *, figure: bool) -> str:
         task=winner.config.task, seed=winner.config.seed, rollouts=race.rollouts, starts=EVALUATION_ROLLOUTS,
         untrained="-" if untrained is None else f"{untrained:.4g}",
         table="\n".join(f"| {' | '.join(line)} |" for line in table),
-        winner=winner.name, folder=race.folder(winner).name, path=race.folder(winner), command=command(race),
+        verdict=verdict(race), folder=race.folder(winner).name, path=race.folder(winner), command=command(race),
         figure="\n![Return of the mean policies over rollouts](figure.svg)\n" if figure else "",
     )  # fmt: skip
+
+
+def verdict(race: Race) -> str:
+    """Who has won, and whether that is worth anything."""
+    if race.learnt:
+        return f"**{race.winner.name}** won."
+    best = max(race.worth, key=lambda name: -math.inf if (of := race.worth[name]) is None else of, default="")
+    return f"No entry won: {race.winner.name} is the best of them, and no better than {best or 'a failure'}."
 
 
 def curves(race: Race) -> list[Curve]:
