@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 __version__ = "0.3.0.dev0"
 
 if TYPE_CHECKING:
+    from farm.environments import environment as environment
     from farm.errors import CheckpointError as CheckpointError
     from farm.errors import ConfigError as ConfigError
     from farm.errors import FarmError as FarmError
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 _WHERE: Final = {
     "learn": "learner.run.launch", "tune": "learner.sweep.tune", "Farm": "learner.farm", "Evaluated": "learner.farm",
+    "environment": "farm.environments",
     "load": "learner.again.replay", "rewind": "learner.again.rewind",
     "RunConfig": "learner.run.config", "configure": "learner.run.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",

@@ -1,6 +1,7 @@
 """Builds a run's simulation from its specification and runs jobs; for workers and learners."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias, cast
@@ -227,6 +228,31 @@ def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Files |
     """A task from its class, the settings in a table, and the run's files."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
     return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
+
+
+def task_of(task: object, **values: Any) -> Task:  # noqa: ANN401  settings, checked there
+    """A task from its name, FILE.py:CLASS, its class, or an object of it, which has its settings.
+
+    Settings are those of `farm run`: of the task's first preset, but for `values`.
+
+    Raises:
+      ConfigError: there is no such task, or a setting is invalid.
+    """
+    if isinstance(task, Task):
+        if values:
+            raise ConfigError(f"{', '.join(values)}: the task is an object that has its settings; give its class")
+        return task
+    if isinstance(task, str):
+        plugin = plugins.find("tasks", task)
+    else:
+        plugin = plugins.Plugin("tasks", getattr(task, "__name__", ""), task)
+    kind: object = plugin.target
+    if not isinstance(kind, type) or not issubclass(kind, Task):
+        what = task if isinstance(task, str) else f"a {type(task).__name__}"
+        raise ConfigError(f"task is {what}; expected a farm.Task, its class, or its name")
+    known = {each.name for each in fields(kind.Config)}
+    preset = {name: value for name, value in next(iter(kind.presets.values()), {}).items() if name in known}
+    return build_task(plugin, {**preset, **values}, None)
 
 
 def draw_constants(

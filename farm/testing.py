@@ -21,7 +21,7 @@ import numpy as np
 from farm import __version__, archives, fingerprint, plugins, seeds, settings
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, writing
-from farm.runner import build_policy, build_task, draw_constants
+from farm.runner import build_policy, draw_constants, task_of
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
 from farm.tasks.loop import Acts
@@ -62,7 +62,7 @@ def same(
         raise ConfigError("there are no seeds; expected one for each rollout")
     if not update and not path.is_file():
         raise ConfigError(f"there is no file {path}: update=True (pytest --golden-update) writes it")
-    arrays = _simulated(_task(task), policy, words)
+    arrays = _simulated(task_of(task), policy, words)
     origin = {
         "seeds": [None if word is None else word[2] for word in words], "rolloutfarm": __version__,
         "mujoco": version("mujoco"), "numbers": fingerprint.digest()[:8],
@@ -84,15 +84,6 @@ def _word(seed: Any) -> Seed:  # noqa: ANN401  a user's
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < seeds.SEEDS:
         raise ConfigError(f"seed {str(seed)[:40]!r}; expected a whole number from 0 to {seeds.SEEDS - 1}, or None")
     return seeds.trial(0, int(seed))
-
-
-def _task(task: Any) -> Task:  # noqa: ANN401  a user's
-    if isinstance(task, str):
-        return build_task(plugins.find("tasks", task), {}, None)
-    instance: object = task() if isinstance(task, type) else task
-    if not isinstance(instance, Task):
-        raise ConfigError(f"task is a {type(instance).__name__}; expected a farm.Task, its class, or its name")
-    return instance
 
 
 class _Function:

@@ -34,7 +34,12 @@ DOORS = {
     "msgpack": ("farm/net/codec.py",),
     "tyro": ("farm/settings.py", "farm/commands/", "learner/commands/", "workers/command.py"),
     "mujoco": ("farm/sim/", "farm/tasks/", "learner/export/npz.py", "workers/backends/"),
-    "gymnasium": ("farm/tasks/gymnasium.py", "farm/tasks/gymnasium_engine.py", "farm/tasks/finger_gait/env.py"),
+    "gymnasium": (
+        "farm/tasks/gymnasium.py",
+        "farm/tasks/gymnasium_engine.py",
+        "farm/tasks/environment.py",
+        "farm/tasks/finger_gait/env.py",
+    ),
     "rerun": ("learner/recording/",),
     "rerun_cli": ("learner/recording/",),
     "matplotlib": ("learner/sweep/figure.py",),

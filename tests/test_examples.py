@@ -51,6 +51,25 @@ def test_random_actions_play_episodes(tmp_path: Path) -> None:
     assert all(line.endswith(("dropped", "success", "held")) for line in output.splitlines())
 
 
+def test_ppo_says_what_it_needs(tmp_path: Path) -> None:
+    if importlib.util.find_spec("stable_baselines3"):
+        pytest.skip("it is installed")
+    command = [sys.executable, LEARN.parent / "ppo.py"]
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert (process.returncode, process.stdout) == (1, "")
+    assert process.stderr == "this example needs stable-baselines3: pip install stable-baselines3\n"
+
+
+@pytest.mark.slow
+def test_ppo_learns_beside_the_farm(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    command = [sys.executable, LEARN.parent / "ppo.py"]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    farm_run, ppo = (float(line.split()[-3]) for line in output.splitlines()[:2])
+    assert farm_run > 0.0, "doing nothing returns -100"
+    assert ppo > 0.0
+
+
 def test_a_cycle_makes_its_grips_in_turn() -> None:
     task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
     runner = problem(configure(task, steps=51)).runner()

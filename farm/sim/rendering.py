@@ -58,24 +58,73 @@ def pictures(
     Raises:
       RunError: MuJoCo cannot draw on this machine.
     """
-    scene = Scene(model, qpos[0], None if mocap is None else mocap[0])
-    view, marks = View(scene, camera, [scene.poses(qpos, mocap)]), Marks(scene, channels if values else ())
-    painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
-    model = lit(model, view.camera.distance, size)
-    free = aimed(mujoco.MjvCamera(), view.camera)
-    data = mujoco.MjData(model)
-    with _renderer(model, size) as renderer:
+    first = None if mocap is None else mocap[0]
+    poses = [Scene(model, qpos[0], first).poses(qpos, mocap)]
+    with Painter(model, qpos[0], size, camera=camera, mocap=first, poses=poses, channels=channels) as painter:
         for frame, row in enumerate(qpos):
-            for channel in painted:
-                _paint(model, channel, (values or {})[channel.name][frame])
-            place(data, row, None if mocap is None else mocap[frame])
-            mujoco.mj_forward(model, data)
-            if view.mover is not None:
-                free.lookat += view.moved(data.xpos[view.mover.index])
-            renderer.update_scene(data, free)
-            marks.put(renderer.scene, data, {name: each[frame] for name, each in (values or {}).items()})
-            _backdrop(renderer.scene, model)
-            yield _halved(renderer.render())
+            shown = {name: each[frame] for name, each in (values or {}).items()}
+            yield painter.picture(row, None if mocap is None else mocap[frame], shown)
+
+
+class Painter:
+    """Draws states of a model one after another, as they come."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        start: FloatArray,
+        size: tuple[int, int],
+        *,
+        camera: Camera | None,
+        mocap: FloatArray | None = None,
+        poses: Sequence[FloatArray] = (),
+        channels: Sequence[Channel] = (),
+    ) -> None:
+        """Set up light and point of view.
+
+        Args:
+          model: of the physics; it is not changed.
+          start: (nq,) positions in which the scene is framed.
+          size: width and height [pixels].
+          camera: point of view; None: from beside what moves.
+          mocap: (nmocap, 7) poses of the mocap bodies at the start; None: the model's own.
+          poses: of the bodies in what will be shown, (F, B, 7) each, all of which is then in view.
+          channels: of the task, drawn where their values are given.
+
+        Raises:
+          RunError: MuJoCo cannot draw on this machine.
+        """
+        scene = Scene(model, start, mocap)
+        self._view, self._marks = View(scene, camera, poses), Marks(scene, channels)
+        self._painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
+        self._model = lit(model, self._view.camera.distance, size)
+        self._free = aimed(mujoco.MjvCamera(), self._view.camera)
+        self._data = mujoco.MjData(self._model)
+        self._renderer = _renderer(self._model, size)
+
+    def picture(self, qpos: FloatArray, mocap: FloatArray | None, values: Mapping[str, FloatArray]) -> Picture:
+        """A state (nq,) with values of the channels by name, if there are any: (height, width, 3)."""
+        for channel in self._painted if values else ():
+            _paint(self._model, channel, values[channel.name])
+        place(self._data, qpos, mocap)
+        mujoco.mj_forward(self._model, self._data)
+        if self._view.mover is not None:
+            self._free.lookat += self._view.moved(self._data.xpos[self._view.mover.index])
+        self._renderer.update_scene(self._data, self._free)
+        if values:
+            self._marks.put(self._renderer.scene, self._data, values)
+        _backdrop(self._renderer.scene, self._model)
+        return _halved(self._renderer.render())
+
+    def __enter__(self) -> "Painter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the renderer."""
+        self._renderer.close()
 
 
 def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)) -> mujoco.MjModel:

@@ -326,6 +326,16 @@ class Sim:
         self._rows = as_rows(self._ids)
         self.own = {name: values[going] for name, values in self.own.items()}
 
+    @contextmanager
+    def only(self, rows: BoolArray) -> Iterator[None]:
+        """Let a task see some of the rollouts, (B,), in this block; what it writes into `own` there is lost."""
+        before = self._ids, self._rows, self._now, self.which, self.own
+        self.keep(rows)
+        try:
+            yield
+        finally:
+            self._ids, self._rows, self._now, self.which, self.own = before
+
     def _moved(self) -> None:
         self._now, self._source, self._stepped = {}, None, True
 
