@@ -79,14 +79,15 @@ class RunConfig(Settings):
     most_pairs: int | None = setting(None, least=1)
     """With --interactions: largest number of pairs in a generation; by default eight times --pairs."""
     init_from: str | None = None
-    """Start from the mean, sigma and constants of another run: its folder."""
+    """Start from the mean, sigma and constants of another run: its folder. It may be of another task with observations
+    and actions of the same sizes; sigma and steps then begin anew."""
     init_sigma: Literal["run", "fresh"] = "run"
-    """With --init-from: take that run's sigma as well, or start with --initial-sigma."""
+    """With --init-from RUN of the same task: take that run's sigma as well, or begin anew."""
     start: Literal["printed", "fitted"] = "printed"
     """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies kernel, projected)."""
     pilot: bool = setting(None)  # filled in below
     """Measure before the first generation how far the search explores, and scale sigma and steps to it. Left out if
-    --initial-sigma, --sigma-floor, --learning-rate-mu, --max-speed or --init-from is given."""
+    --initial-sigma, --sigma-floor, --learning-rate-mu, --max-speed is given, or --init-from with that run's sigma."""
     pilot_sigma: float | None = setting(None, above=0.0)
     """The initial sigma that a pilot found (a run fills it in); steps are in proportion. With it there is no pilot."""
     validate: bool = setting(None)  # filled in below

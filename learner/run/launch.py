@@ -41,7 +41,7 @@ from learner.run.folder import RunFolder
 from learner.run.judge import LocalJudge
 from learner.run.learner import Learner
 from learner.run.pilot import begun, piloted
-from learner.run.setup import Problem, fitted, resumed, start
+from learner.run.setup import Problem, fitted, handed_over, resumed, start
 from learner.run.states import RolledBack
 from learner.scheduler.dispatcher import Dispatcher, Stopped
 from learner.scheduler.membership import Admission
@@ -224,7 +224,7 @@ def open_run(
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())
-        config = begun(config, folder) if resume else piloted(fitted(config), stopped)
+        config = begun(config, folder) if resume else _completed(config, stopped)
         if resume:
             problem, at = _resumed(folder, config, place)
         else:
@@ -259,6 +259,13 @@ def open_run(
         )
         publisher = stack.enter_context(closing(Publisher(link, place.farm, dispatcher.incarnation, learner)))
         yield Run(learner, dispatcher, publisher, recording, pool, loggers, place.compare)
+
+
+def _completed(config: RunConfig, stopped: Callable[[], bool]) -> RunConfig:
+    """A new run's configuration with what is computed before it; says from what other task's run it begins."""
+    if line := handed_over(config):
+        log.info(line)
+    return piloted(fitted(config), stopped)
 
 
 def _resumed(folder: RunFolder, config: RunConfig, place: Placement) -> tuple[Problem, Checkpoint]:

@@ -29,7 +29,7 @@ from farm.returns import known, mean, penalised
 from farm.runner import Runner
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
-from learner.run.setup import problem
+from learner.run.setup import beginning, origin_of
 
 log = logging.getLogger(__name__)
 
@@ -78,13 +78,16 @@ class Tried:
 def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> RunConfig:
     """The configuration with the sigma that the pilot found, if it asks for one and has none yet.
 
-    A run that goes on from another (`init_from`) has that one's scale.
+    A run that goes on from another one of the same task (`init_from`) has that one's scale.
 
     Raises:
-      ConfigError: the task cannot start.
+      ConfigError: the task cannot start, or the run to go on from cannot be used.
       Interrupted: the user stopped it; nothing has begun.
     """
-    if not config.pilot or config.pilot_sigma is not None or config.init_from is not None:
+    if not config.pilot or config.pilot_sigma is not None:
+        return config
+    origin = origin_of(config)
+    if origin is not None and not origin.scale_begins_anew:
         return config
     log.info("a pilot measures how far to explore (--no-pilot: begin at once)")
     sigma = 0.0
@@ -105,18 +108,19 @@ def begun(config: RunConfig, folder: RunFolder) -> RunConfig:
 
 def tried(config: RunConfig) -> Iterator[Tried]:
     """What the mean gives, and exploring at each sigma: the last one fits, or is the smallest."""
-    search = problem(config)
+    search, state, moments = beginning(config)
     algorithm: Any = config.algorithm_config
-    mu = search.begin().mu
+    mu = state.mu
     directions = seeds.pilot(config.seed).standard_normal((PAIRS, mu.size))
     runner = search.runner()
     try:
-        results = runner.run(mu, Jobs.mean("none", _starts(config, _MEAN)), "none", _normaliser(runner, config))
+        first = _normaliser(config, moments)
+        results = runner.run(mu, Jobs.mean("none", _starts(config, _MEAN)), "none", first)
         base = replace(_summed(0.0, results), returned=mean(results.returns[:STARTS]))
         yield base
         for step in range(_SIGMAS):
             sigma = float(algorithm.initial_sigma) * _STEP**step
-            each = _explored(runner, mu, sigma, directions, config)
+            each = _explored(runner, mu, sigma, directions, moments, config)
             yield each
             if each.fits(base):
                 return
@@ -128,25 +132,42 @@ def _starts(config: RunConfig, count: int = STARTS) -> list[tuple[int, ...] | No
     return [seeds.pilot_start(config.seed, i) if config.task_config.perturb else None for i in range(count)]
 
 
-def _normaliser(runner: Runner, config: RunConfig, seen: FloatArray | None = None) -> FloatArray:
-    """As in a RoundHeader, (2, 2, d), of the moments of observations (S, 1 + 2 d); None: nothing was seen yet."""
+def _normaliser(
+    config: RunConfig,
+    moments: FloatArray,
+    seen: FloatArray | None = None,
+) -> FloatArray:
+    """As in a RoundHeader, (2, 2, d).
+
+    Args:
+      config: of the run.
+      moments: of the observations with which it begins, (1 + 2 d,).
+      seen: of those that followed, (S, 1 + 2 d).
+    """
     if not config.policy_config.normalise:
         return NOT_NORMALISED
-    none = np.zeros(1 + 2 * runner.spec.observation)
-    return np.stack([normaliser_of(none if seen is None else merged(none, seen))] * 2)
+    return np.stack([normaliser_of(moments if seen is None else merged(moments, seen))] * 2)
 
 
-def _explored(runner: Runner, mu: FloatArray, sigma: float, directions: FloatArray, config: RunConfig) -> Tried:
+def _explored(
+    runner: Runner,
+    mu: FloatArray,
+    sigma: float,
+    directions: FloatArray,
+    moments: FloatArray,
+    config: RunConfig,
+) -> Tried:
     """What exploring around a mean (P,) along directions (K, P) at a sigma gives."""
     starts = _starts(config) * PAIRS
     eps = np.repeat(sigma * directions, STARTS, axis=0)
     perturbed = [start for start in starts if start is not None]
     jobs = Jobs.exploring(eps, (1, -1), perturbed or None)
-    normaliser = _normaliser(runner, config)
+    normaliser = _normaliser(config, moments)
     if config.policy_config.normalise:
         few = jobs.take(list(range(2 * STARTS)))
         for _ in range(_NORMALISING):
-            normaliser = _normaliser(runner, config, runner.run(mu, few, "none", normaliser).moments)
+            seen = runner.run(mu, few, "none", normaliser).moments
+            normaliser = _normaliser(config, moments, seen)
     results = runner.run(mu, jobs, "none", normaliser)
     if not known(results.returns).any():
         return _summed(sigma, results)

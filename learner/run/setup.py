@@ -44,6 +44,11 @@ class Problem:
     spec: TaskSpec
     policy: Policy
 
+    @property
+    def task_name(self) -> str:
+        """The task's name, of a file without its folder."""
+        return self._plugins["task"].wire
+
     @cached_property
     def scene(self) -> Scene:
         """The scene to draw."""
@@ -194,20 +199,35 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
     Raises:
       ConfigError: the task is not available here, or the run to start from cannot be used.
     """
-    other = None if config.init_from is None else _other(config)
-    result = problem(config, other.constants if other else None, files)
-    state = result.begin()
-    if other is not None:
-        state = _taken_over(config, state, other)
-    moments = np.zeros(1 + 2 * result.spec.observation if config.policy_config.normalise else 0)
+    result, state, moments = beginning(config, files)
     texts, assets = split(result.task.sources)
     checkpoint = Checkpoint(
         run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
         solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True,
         code=result.code, files=texts, assets=assets, constants=dict(result.policy.constants),
-        moments=other.moments if other else moments, chain=hash_chain.first(config),
+        moments=moments, chain=hash_chain.first(config),
     )  # fmt: skip
     return result, checkpoint
+
+
+def beginning(
+    config: RunConfig,
+    files: Files | None = None,
+) -> tuple[Problem, SearchState, FloatArray]:
+    """A run's problem, its first state, and the moments of observations with which it begins.
+
+    Raises:
+      ConfigError: the task is not available here, or the run to start from cannot be used.
+    """
+    origin = origin_of(config)
+    if origin is None:
+        result = problem(config, None, files)
+        size = 1 + 2 * result.spec.observation if config.policy_config.normalise else 0
+        return result, result.begin(), np.zeros(size)
+    if origin.other_task:
+        _check_sizes(config, origin, files)
+    result = problem(config, origin.at.constants, files)
+    return result, _taken_over(config, result.begin(), origin), origin.at.moments
 
 
 def resumed(
@@ -239,25 +259,107 @@ def resumed(
     return result, at
 
 
-def _other(config: RunConfig) -> Checkpoint:
-    """The run to start from, if its parameters have the same meaning."""
-    folder = RunFolder.open(Path(str(config.init_from)), configs.class_files(config))
+@dataclass(frozen=True)
+class Origin:
+    """The run that another one begins from."""
+
+    folder: RunFolder
+    config: RunConfig
+    """Its own."""
+    at: Checkpoint
+    heir: RunConfig
+    """That of the run that begins."""
+
+    @property
+    def other_task(self) -> bool:
+        """Whether it has learnt another task."""
+        return self.config.task != self.heir.task
+
+    @property
+    def scale_begins_anew(self) -> bool:
+        """Whether its sigma says nothing of the run that begins."""
+        return self.other_task or self.heir.init_sigma == "fresh"
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What it has learnt, as its class is today."""
+        config = replace(self.config, stop_when_solved=None)
+        return problem(config, self.at.constants, self.folder.files(self.at))
+
+
+def origin_of(config: RunConfig) -> Origin | None:
+    """The run that this one begins from, if there is one and its parameters have the same meaning.
+
+    Raises:
+      ConfigError: its policy is another one.
+    """
+    if config.init_from is None:
+        return None
+    folder = RunFolder.open(Path(config.init_from), configs.class_files(config))
     other = folder.read_config()
-    for name in ("task", "policy", "policy_config"):
+    for name in ("policy", "policy_config"):
         value, here = getattr(other, name), getattr(config, name)
         if value != here:
             raise ConfigError(
                 f"--init-from {config.init_from}: its parameters mean something else ({value}, not {here})"
             )
-    return checkpoints.load(folder.checkpoint)
+    return Origin(folder, other, checkpoints.load(folder.checkpoint), config)
 
 
-def _taken_over(config: RunConfig, fresh: SearchState, at: Checkpoint) -> SearchState:
+def _check_sizes(config: RunConfig, origin: Origin, files: Files | None) -> None:
+    """Check that the policy of one task can act in another.
+
+    Raises:
+      ConfigError: it cannot; names both sizes.
+    """
+    plugin, there = plugins.find("tasks", config.task), origin.problem
+    here = specification(build_task(plugin, settings.to_dict(config.task_config), files))
+    for what in ("observation", "action"):
+        new, old = getattr(here, what), getattr(there.spec, what)
+        if new != old:
+            raise ConfigError(
+                f"--init-from {config.init_from}: in its task {there.task_name} an {what} has "
+                f"{old} numbers, in {plugin.wire} {new}: its policy cannot act here"
+            )
+
+
+def handed_over(config: RunConfig) -> str:
+    """What differs between a run's task and that of the run that it begins from, in a line.
+
+    Empty if it begins from none, or from one of the same task.
+    """
+    origin = origin_of(config)
+    if origin is None or not origin.other_task:
+        return ""
+    old, new = origin.problem, beginning(config)[0]
+    names = [each.task_name for each in (old, new)]
+    if names[0] == names[1]:
+        names = [origin.config.task, config.task]
+    parts = [f"task {names[1]} (there {names[0]})", *_settings_that_differ(old, new)]
+    sources = [each.task.sources for each in (old, new)]
+    files = [name for name in {**sources[0], **sources[1]} if sources[0].get(name) != sources[1].get(name)]
+    parts += [f"files {', '.join(files)}"] if files else []
+    named = [[each.name for each in task.observations] for task in (old.task, new.task)]
+    parts += [f"observation {i} {b!r} (there {a!r})" for i, (a, b) in enumerate(zip(*named, strict=False)) if a != b]
+    return f"begins with the mean of {config.init_from}; different here: {', '.join(parts)}"
+
+
+def _settings_that_differ(old: Problem, new: Problem) -> list[str]:
+    there, here = (settings.to_dict(each.config.task_config) for each in (old, new))
+    return [
+        f"{name.replace('_', '-')} {value}" + (f" (there {there[name]})" if name in there else "")
+        for name, value in here.items()
+        if name not in there or there[name] != value
+    ]
+
+
+def _taken_over(config: RunConfig, fresh: SearchState, origin: Origin) -> SearchState:
     """Start from another run's mean, and perhaps its sigma."""
-    if len(at.state["mu"]) != len(fresh.mu):
+    before = origin.at.state
+    if len(before["mu"]) != len(fresh.mu):
         raise ConfigError(
-            f"--init-from {config.init_from}: it has {len(at.state['mu'])} parameters, this run {len(fresh.mu)}: "
-            "its observation is another"
+            f"--init-from {config.init_from}: it has {len(before['mu'])} parameters, this run "
+            f"{len(fresh.mu)}: its observation is another"
         )
-    state = replace(fresh, mu=at.state["mu"])
-    return replace(state, sigma=at.state["sigma"]) if config.init_sigma == "run" else state
+    state = replace(fresh, mu=before["mu"])
+    return state if origin.scale_begins_anew else replace(state, sigma=before["sigma"])

@@ -188,11 +188,6 @@ def test_what_was_found_for_one_search_is_not_used_for_another(
     assert command.run.pilot_sigma == (0.02 if kept else None)
 
 
-def test_a_run_that_goes_on_from_another_has_its_scale(tmp_path: Path) -> None:
-    config = configure(reach(tmp_path, 0.05), init_from=str(tmp_path))
-    assert piloted(config) is config
-
-
 @pytest.mark.parametrize(
     ("algorithm", "lengths"),
     [
