@@ -21,6 +21,7 @@ from farm.errors import ConfigError
 from farm.moments import normaliser_of
 from farm.policies.normalised import Normalised
 from farm.runner import Runner, build_task
+from farm.seeds import trial
 from farm.sim.model_files import Content, Files
 from farm.sim.trajectory import Trajectory
 from farm.tasks.loop import Acting
@@ -71,10 +72,13 @@ class LoadedPolicy:
         """It acts in this number of rollouts, with their memories."""
         return Acting(self.problem.policy, np.repeat(self.mu[None], count, axis=0))
 
-    def rollout(self, theta: FloatArray | None = None, seed: Seed = None) -> Replay:
-        """One rollout of it, or of other parameters (P,), from the start for a seed (None: nominal)."""
+    def rollout(self, theta: FloatArray | None = None, seed: Seed | int = None) -> Replay:
+        """One rollout of it, or of other parameters (P,), from the start for a seed (None: nominal).
+
+        A number is that start of `farm evaluate`.
+        """
         theta = self.mu if theta is None else theta
-        return self.rollouts(theta[None], [seed])[0]
+        return self.rollouts(theta[None], [trial(0, seed) if isinstance(seed, int) else seed])[0]
 
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
         """Rollouts of parameters (B, P), from the starts for their seeds."""

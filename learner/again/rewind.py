@@ -17,12 +17,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from farm import seeds as streams
-from farm.arrays import FloatArray
+from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.moments import merged, normaliser_of
 from farm.net.work import Jobs, Simulated
 from farm.tasks.rollouts import Rollouts, Seed
 from learner import algorithms
+from learner.again.ranked import Ranked
 from learner.again.replay import LoadedPolicy, Replay, restored, seeing
 from learner.algorithms import SearchState
 from learner.run import checkpoint as checkpoints
@@ -38,7 +39,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Rewound:
+class Rewound(Ranked):
     """The exploring rollouts of a generation, simulated again at control rate; S of them, in the run's order."""
 
     policy: LoadedPolicy
@@ -59,17 +60,10 @@ class Rewound:
         """Return of each, (S,): bit for bit those that the run learnt from, before the reward's offset."""
         return self.rollouts.returns
 
-    def best(self, count: int) -> list[int]:
-        """Indices of the rollouts with the highest returns, in descending order; of equal ones the first."""
-        return np.argsort(-self.returns, kind="stable")[:count].tolist()
-
-    def worst(self, count: int) -> list[int]:
-        """Indices of the rollouts with the lowest returns, in ascending order; of equal ones the first."""
-        return np.argsort(self.returns, kind="stable")[:count].tolist()
-
-    def ended(self, count: int) -> list[int]:
-        """Indices of the first rollouts that the task ended before their last step, for example after a drop."""
-        return np.flatnonzero(self.rollouts.ended)[:count].tolist()
+    @property
+    def early(self) -> BoolArray:
+        """Which of them the task ended before their last step, (S,)."""
+        return self.rollouts.ended
 
     def again(self, indices: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
         """Simulate some of them at physics rate, with the task's settings of `policy` if it is given.

@@ -1,10 +1,10 @@
 """`farm evaluate`: the learnt mean policy on perturbed starts."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import tyro
@@ -14,7 +14,7 @@ from rich.table import Table
 from farm import settings
 from farm.arrays import IntArray
 from farm.commands.logs import say
-from farm.commands.screen import figure, plain
+from farm.commands.screen import compact, figure, plain
 from farm.net.work import Simulated
 from farm.seeds import SEEDS, trial
 from farm.settings import setting
@@ -26,6 +26,9 @@ from learner.commands.of_run import OfRun
 from learner.run.config import MOST_GENERATIONS
 from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs, failures, statistics
 from learner.run.folder import RunFolder
+
+_LABEL: Final = 24  # characters of a name before it is folded
+_GAP: Final = 2  # between columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,18 +55,13 @@ def main(words: Sequence[str]) -> int:
     if command.json:
         say(json.dumps(figures, indent=2))
         return 0
-    table = Table(title=plain(f"{figures['run']}, mean policy after generation {figures['generation']}"))
-    measures = figures["nominal"].get("measures", {})
-    counts = ("rollouts", "failed", "success")
-    for column in ("conditions", *counts, "return mean", "min", "max", "ended early", *measures):
-        table.add_column(column, justify="left" if column == "conditions" else "right")
-    of = {f"  {name}": row for name, row in figures.get("models", {}).items()}
-    for name, row in ({name: figures[name] for name in ("nominal", "perturbed")} | of).items():
-        success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
-        returns = [figure(row[key]) for key in ("return_mean", "return_min", "return_max")]
-        cells = [figure(value, ".3g") for value in row.get("measures", {}).values()]
-        table.add_row(name, str(row["rollouts"]), str(row["failed"]), success, *returns, str(row["ended"]), *cells)
-    Console().print(table)
+    console = Console()
+    console.print(plain(f"{folder.name}, mean policy after generation {figures['generation']}"), soft_wrap=True)
+    for table in tables(figures, console.width):
+        console.print(table)
+    if command.seed == EVALUATION_SEED and command.average is None:
+        which = f"{command.run}{' --last' if command.last else ''}"
+        say(f"the worst start: farm replay {which} --seed {figures['perturbed']['worst_start']}")
     if figures["nominal"]["failed"]:
         say("it fails from its nominal start, unstable or by an error: farm check looks for the cause")
     elif failed := figures["perturbed"]["failed"]:
@@ -72,6 +70,50 @@ def main(words: Sequence[str]) -> int:
             "farm check looks for the cause"
         )
     return 0
+
+
+def tables(figures: Mapping[str, Any], width: int) -> Iterator[Table]:
+    """The figures, a column for each kind of conditions, as many tables as they need.
+
+    Args:
+      figures: as `evaluate` gives them.
+      width: of the screen [characters], in which no number is cut.
+    """
+    rows = {name: figures[name] for name in ("nominal", "perturbed")} | figures.get("models", {})
+    columns = [(name, _column(row)) for name, row in rows.items()]
+    left = min(_LABEL, max(map(len, columns[0][1])))
+    while columns:
+        table = compact()
+        table.add_column(max_width=_LABEL, overflow="fold")
+        room, shown = width - left - _GAP, list[list[str]]()
+        while columns:
+            name, cells = columns[0]
+            number = max(map(len, cells.values()))
+            wide = max(number, min(len(name), _LABEL))
+            if shown and wide > room:
+                break
+            table.add_column(plain(name), justify="right", min_width=number, max_width=wide, overflow="fold")
+            shown.append(list(cells.values()))
+            room -= wide + _GAP
+            columns.pop(0)
+        for label, *numbers in zip(cells, *shown, strict=True):
+            table.add_row(plain(label), *numbers)
+        yield table
+
+
+def _column(row: Mapping[str, Any]) -> dict[str, str]:
+    """Figures of some rollouts as texts, by what they are."""
+    success = "-" if row["success_rate"] is None else f"{row['success_rate']:.0%}"
+    return {
+        "rollouts": str(row["rollouts"]),
+        "failed": str(row["failed"]),
+        "ended early": str(row["ended"]),
+        "success": success,
+        "return": figure(row["return_mean"]),
+        "  lowest": figure(row["return_min"]),
+        "  highest": figure(row["return_max"]),
+        **{name: figure(value, ".3g") for name, value in row.get("measures", {}).items()},
+    }
 
 
 def evaluate(
@@ -84,6 +126,7 @@ def evaluate(
     figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}
     figures["nominal"] = _figures(spec, results, np.array([rollouts]))
     figures["perturbed"] = _figures(spec, results, np.arange(rollouts))
+    figures["perturbed"]["worst_start"] = int(np.argmin(results.returns[:rollouts]))
     task = policy.problem.task
     if len(task.simulated) > 1:
         which = drawn(task, [np.random.default_rng(trial(seed, i)) for i in range(rollouts)])
