@@ -14,7 +14,7 @@ import signal
 import stat
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, wraps
 from importlib.metadata import EntryPoint, entry_points
@@ -22,6 +22,7 @@ from itertools import dropwhile
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
+from farm import neighbours
 from farm.errors import ConfigError, TaskError, UnservedError, described
 
 P = ParamSpec("P")
@@ -121,7 +122,7 @@ class Plugin:
     file: Path | None = None
     """Its file, if it comes from a file."""
     source: bytes = field(default=b"", repr=False)
-    """That file's bytes as they were when it was imported."""
+    """That file's bytes as they were when it was imported, with those of its neighbours (`farm.neighbours`)."""
 
     @property
     def wire(self) -> str:
@@ -134,7 +135,7 @@ class Plugin:
         return str(self.file) if self.file else self.release or "built in"
 
     def digest(self) -> str:
-        """SHA-256 of its code: of its file, or of its module and everything that this imports from the same package."""
+        """SHA-256 of its code: of its file and neighbours, or of its module and its imports from the same package."""
         return hashlib.sha256(self.source).hexdigest() if self.file else code_digest(self.target.__module__)
 
 
@@ -156,7 +157,7 @@ def find(kind: str, name: str) -> Plugin:
     path, _, inside = name.rpartition(":")
     if path.endswith(".py"):
         where = Path(path).resolve()
-        return _of_source(kind, where, _read(where, f"{_one(kind)} {where}"), inside)
+        return _of_source(kind, where, _bundle(where, f"{_one(kind)} {where}"), inside)
     base, _, variant = name.partition(":")
     if base in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][base].partition(":")
@@ -221,6 +222,27 @@ def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes
         raise kind(f"{what}: it cannot be read: {error.strerror}") from None
 
 
+def _bundle(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
+    """A class's source with that of its neighbours, all of sensible size together."""
+    source = _read(path, what, kind)
+    others = {}
+    for name in neighbours.named(path, source):
+        beside = path.with_name(f"{name}.py")
+        others[name] = _read(beside, f"{beside}, a neighbour that {path.name} names", kind)
+    bundle = neighbours.packed(source, others)
+    if len(bundle) > SOURCE_LIMIT:
+        raise kind(f"{what} and its neighbours have {len(bundle)} bytes; expected at most {SOURCE_LIMIT}")
+    return bundle
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file that may have a class, with its neighbours; empty if it has none or cannot be read."""
+    try:
+        return hashlib.sha256(_bundle(path, str(path))).hexdigest()
+    except ConfigError:
+        return ""
+
+
 def no_exit(call: Callable[P, T]) -> Callable[P, T]:
     """Let what a plug-in's code raises be an error of this function, also sys.exit and others that end programs."""
 
@@ -261,27 +283,30 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
 @cache
 def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
     """Import a file as it is now; its folder is not on the import path, so it cannot shadow other modules."""
-    name = _MODULES + hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:12]
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look for their annotations there
     try:
-        exec(compile(source, str(path), "exec"), vars(module))
+        return neighbours.imported(path, source, _MODULES)
     except BaseException as error:  # whatever the file may raise
-        del sys.modules[name]
         if isinstance(error, KeyboardInterrupt) and _of_signal(error):
             raise
-        raise ConfigError(f"{path} cannot be imported: {_where(error, path)}") from error
-    return module
+        where = _where(error, neighbours.paths(path, source))
+        raise ConfigError(f"{path} cannot be imported: {where}{_undeclared(error, path)}") from error
 
 
-def _where(error: BaseException, path: Path) -> str:
-    """An error as text, with its line in this file."""
+def _where(error: BaseException, paths: Sequence[Path]) -> str:
+    """An error as text, with its line in the last of these files; the first is the one that is imported."""
+    names = {str(each): f"{each.name}, " if each != paths[0] else "" for each in paths}
     if isinstance(error, SyntaxError) and error.lineno:
-        return f"line {error.lineno}: {error.msg}"
-    lines = [each.lineno for each in traceback.extract_tb(error.__traceback__) if each.filename == str(path)]
-    return (f"line {lines[-1]}: " if lines else "") + described(error)
+        return f"{names.get(error.filename or '', '')}line {error.lineno}: {error.msg}"
+    frames = [each for each in traceback.extract_tb(error.__traceback__) if each.filename in names]
+    return (f"{names[frames[-1].filename]}line {frames[-1].lineno}: " if frames else "") + described(error)
+
+
+def _undeclared(error: BaseException, path: Path) -> str:
+    """A hint if a file beside would be what cannot be imported."""
+    name = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+    if not name.isidentifier() or not path.with_name(f"{name}.py").is_file():
+        return ""
+    return f"; to import {name}.py beside it, add the line {neighbours.DECLARED} = ({name!r},)"
 
 
 def author_frames(error: BaseException) -> traceback.StackSummary:
@@ -326,9 +351,12 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
     name, _, inside = wire.rpartition(":")
     for path in files:
         if path.name == name:
-            source = _read(path, str(path), UnservedError)
+            source = _bundle(path, str(path), UnservedError)
             if hashlib.sha256(source).hexdigest() != digest:
-                raise UnservedError(f"{path} differs from the learner's {name}: copy the learner's file there")
+                names = [each.name for each in neighbours.paths(path, source)[1:]]
+                several = f", or {', '.join(names)} beside it" if names else ""
+                copy = f"copy the learner's file{'s' if names else ''} there"
+                raise UnservedError(f"{path}{several} differs from the learner's {name}: {copy}")
             return _of_source(kind, path.resolve(), source, inside)
     raise UnservedError(
         f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file {name}, "

@@ -132,7 +132,7 @@ def serve(link: socket.socket) -> None:
 def _failed(error: Exception, files: tuple[str, ...], *, built: bool = True) -> Answer:
     text = str(error) if isinstance(error, FarmError) else described(error)
     if isinstance(plugins.root(error), FileNotFoundError):
-        text += "; files beside a class do not travel, but those that its xml names do"
+        text += "; files beside a class do not travel, but those that its xml names do, and neighbours"
     text, lines = _named((text, plugins.author_traceback(error)), files)
     return Answer(error=brief(text), served=built and not isinstance(error, UnservedError), traceback=lines)
 
@@ -141,9 +141,10 @@ def _named(error: tuple[str, tuple[str, ...]], files: tuple[str, ...]) -> tuple[
     """An error and its traceback, with names in place of paths: the author knows no path of this machine."""
     text, lines = error
     for path in files:
-        name = Path(path).name
-        text = text.replace(path, name)
-        lines = tuple(line.replace(path, name) for line in lines)
+        folder = f"{Path(path).parent}/" if Path(path).is_absolute() else ""
+        for long, short in ((path, Path(path).name), *([(folder, "")] if folder else [])):
+            text = text.replace(long, short)
+            lines = tuple(line.replace(long, short) for line in lines)
     return text, lines
 
 

@@ -98,7 +98,7 @@ class Runners:
     def _build(self, run: str, spec: Spec) -> AnyRunner | None:
         """The runner of a run's jobs; None if a source file is unavailable."""
         files = list(self._config.allow_file)
-        here = {(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file()}
+        here = {(path.name, plugins.file_digest(path)) for path in files}
         sources = {(plugins.named_file(spec.task), spec.code.get("task", "")),
                  (plugins.named_file(spec.policy), spec.code.get("policy", ""))}  # fmt: skip
         travels = sorted((name, digest) for name, digest in sources - here if name)

@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from farm import neighbours
 from farm.errors import UnservedError
 from farm.plugins import FILE_NAME, SOURCE_LIMIT
 from farm.sim.model_files import FILE_LIMIT
@@ -57,18 +58,26 @@ class SourceCache:
         return self._folder / digest / name
 
     def keep(self, name: str, digest: str, source: bytes) -> Path:
-        """Store a received source; returns its path.
+        """Store a received source, with its neighbours beside it; returns its path.
 
         Raises:
-          UnservedError: it is too large, or does not match its digest.
+          UnservedError: it is too large, does not match its digest, or is no bundle of files.
         """
         path = self.place(name, digest)
         if len(source) > SOURCE_LIMIT:
             raise UnservedError(f"the received source of {name} has more than {SOURCE_LIMIT} bytes")
         if hashlib.sha256(source).hexdigest() != digest:
             raise UnservedError(f"the received source of {name} does not match its digest")
+        try:
+            own, others = neighbours.unpacked(source)
+        except ValueError as error:
+            raise UnservedError(f"the received source of {name} is {error}") from None
+        if path.stem in others:
+            raise UnservedError(f"the received source of {name} has that file twice")
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(source)
+        for each, content in others.items():
+            path.with_name(f"{each}.py").write_bytes(content)
+        path.write_bytes(own)
         return path
 
     @property

@@ -97,6 +97,27 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
 
 
+def test_neighbours_travel_with_their_task(farm: Farm, certs: Path, router: str) -> None:
+    """Two workers in empty folders; an edited neighbour is another task."""
+    folder = farm.folder / "tasks"
+    made.pole(
+        folder, f"__neighbours__ = ('gaits',)\nimport gaits\n{made.POLE.replace('np.cos', 'gaits.SIZE * np.cos')}"
+    )
+    words = ("--connect", router, "--tls", str(certs / "own"), "--task", "tasks/pole.py:Pole", *FEW)
+    workers = [hire(farm, router, certs, name, "--accept-code") for name in ("w1", "w2")]
+    try:
+        for size in (1, 3):
+            (folder / "gaits.py").write_text(f"SIZE = {size}\n")
+            farm.call("learner", *words, "--name", f"r{size}")
+            farm.call("run", "--task", "tasks/pole.py:Pole", "--name", f"here{size}", *FEW)
+            there, here = (farm.summary(f"{name}{size}") for name in ("r", "here"))
+            assert there["parameters_sha256"] == here["parameters_sha256"]
+            assert there["robust_return"] == pytest.approx(4.0 * size, rel=0.1)
+    finally:
+        output = "".join(map(output_of, workers))
+    assert output.count("received pole.py") == 4
+
+
 def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(farm: Farm, certs: Path, router: str) -> None:
     """Meshes, a moving goal and pushes: checked, learnt over TLS by a worker that has nothing, repeated bit by bit."""
     robot(farm.folder)

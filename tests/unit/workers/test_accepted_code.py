@@ -18,8 +18,10 @@ import pytest
 from made import POLE, pole, spec_of
 from stage import FARM, WAIT, Learner, Runner, Stage, indices, until
 
+from farm import plugins
 from farm.commands import certificates
-from farm.errors import ConfigError
+from farm.errors import ConfigError, UnservedError
+from farm.neighbours import MAGIC, packed
 from farm.net import keys
 from farm.net.session import Session, connect, free_endpoint, listen
 from farm.net.tls import find
@@ -54,7 +56,7 @@ class Author(Learner):
     def __init__(
         self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None, presence: Session | None = None
     ) -> None:
-        self.source = file.read_bytes()
+        self.source = plugins.find("tasks", f"{file}:Pole").source
         spec = spec_of(file)
         if sends is not None:
             spec = replace(spec, code=spec.code | {"task": digest(file)})
@@ -65,7 +67,7 @@ class Author(Learner):
 
 
 def digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return plugins.file_digest(file)
 
 
 def write(folder: Path, text: str = "", name: str = "pole.py") -> Path:
@@ -216,7 +218,31 @@ def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Pa
     other.send(worker.id, 0)
     _, failure = safe.next("result of other", kind=Failure)
     assert failure.index is None, "the task cannot be built here"  # type: ignore[attr-defined]
-    assert failure.error.endswith("files beside a class do not travel, but those that its xml names do")  # type: ignore[attr-defined]
+    assert failure.error.endswith("but those that its xml names do, and neighbours")  # type: ignore[attr-defined]
+
+
+def test_neighbours_come_with_it(safe: Stage, certs: Path, tmp_path: Path) -> None:
+    """Kept beside it, imported from there; an error in one names it and no path of the worker."""
+    (tmp_path / "gaits.py").write_text("import parts\n\ndef level(t):\n    return parts.SIZE / (t < 3)\n")
+    (tmp_path / "parts.py").write_text("SIZE = 3.0\n")
+    text = f"__neighbours__ = ('gaits', 'parts')\nimport gaits\n{POLE}"
+    file = pole(tmp_path, text.replace("return np", "return gaits.level(sim.t) * np"))
+    author, worker = Author(safe, file), hire(safe, certs)
+    author.send(worker.id, 3)
+    results = safe.results()
+    assert {path.name for path in kept(file)} == {"pole.py", "gaits.py", "parts.py"}
+    assert all(path.read_bytes() == (tmp_path / path.name).read_bytes() for path in kept(file))
+    assert results.error == "ZeroDivisionError: float division by zero"
+    assert '  File "gaits.py", line 4, in level' in results.traceback
+    assert not any("rolloutfarm-code" in line for line in results.traceback)
+
+
+def test_a_bundle_that_is_none_is_refused(tmp_path: Path) -> None:
+    cache = SourceCache()
+    with closing(cache):
+        for content in (MAGIC + b"[]\n", packed(b"", {"pole": b""})):
+            with pytest.raises(UnservedError, match=r"the received source of pole.py (is|has)"):
+                cache.keep("pole.py", hashlib.sha256(content).hexdigest(), content)
 
 
 def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
