@@ -46,7 +46,7 @@ def environment(
       num_envs: this number of environments that are stepped together, a
         `gymnasium.vector.VectorEnv`; None: one.
       render_mode: "rgb_array" for pictures by `render`; of one environment only.
-      settings: of the task, such as perturb=False.
+      settings: of the task, such as perturb=False; others are those of `farm run`.
 
     Raises:
       ConfigError: gymnasium is missing, a setting is invalid, or the task scores whole rollouts.
@@ -83,10 +83,10 @@ def environment(
             raise ConfigError(f"num_envs is {num_envs!r:.40}; expected {expected}")
         if render_mode is not None:
             raise ConfigError("render_mode is for one environment: leave out num_envs")
-        return FarmVectorEnv(task_of(task, **settings), num_envs)
+        return FarmVectorEnv(task_of(task, preset=True, **settings), num_envs)
 
     def make(render_mode: Literal["rgb_array"] | None = None) -> "FarmEnv":
-        return FarmEnv(task_of(task, **settings), render_mode)
+        return FarmEnv(task_of(task, preset=True, **settings), render_mode)
 
     env = make(render_mode)
     env.spec = described(env.name, make)

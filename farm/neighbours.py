@@ -4,13 +4,13 @@ A file says which files beside it its code imports, in a line that is read witho
 
     __neighbours__ = ("gaits",)
 
-Then `import gaits` and `from gaits import trot` in these files mean gaits.py in the same folder, and
-nowhere else: no module of this name in `sys.modules` is looked at, and none is put there. So classes
-of different folders, or of an older and a newer file, do not meet.
+Then `import gaits` and `from gaits import trot` in these files mean gaits.py in the same folder,
+and nowhere else: no module of this name in `sys.modules` is looked at, and none is put there. So
+classes of different folders, or of an older and a newer file, do not meet.
 
-Class file and neighbours are one sequence of bytes, the bundle, which has the class's digest: without
-neighbours the file's own bytes; otherwise `MAGIC`, a line of JSON with [name, size] of each file, the
-class's first and without a name, and their contents.
+Class file and neighbours are one sequence of bytes, the bundle, which has the class's digest:
+without neighbours the file's own bytes; otherwise `MAGIC`, a line of JSON with [name, size] of each
+file, the class's first and without a name, and their contents.
 """
 
 import ast
@@ -57,10 +57,12 @@ def named(path: Path, source: bytes) -> tuple[str, ...]:
     except ValueError:
         names = None
     if not isinstance(names, tuple | list) or not all(isinstance(each, str) for each in names):
-        raise ConfigError(f"{where}: expected names of modules, such as {DECLARED} = ('gaits',) for gaits.py beside it")
+        example = f"{DECLARED} = ('gaits',) for gaits.py beside it"
+        raise ConfigError(f"{where}: expected names of modules, such as {example}")
     for name in names:
         if not name.isidentifier() or len(name) > MOST or name == path.stem:
-            raise ConfigError(f"{where}: {name[:80]!r} is no other file beside it; expected 'gaits' for gaits.py")
+            expected = "expected 'gaits' for gaits.py"
+            raise ConfigError(f"{where}: {name[:80]!r} is no other file beside it; {expected}")
     if len(names) > MOST:
         raise ConfigError(f"{where}: {len(names)} neighbours; at most {MOST} travel with a class")
     return tuple(dict.fromkeys(names))
@@ -109,7 +111,8 @@ def unpacked(bundle: bytes) -> tuple[bytes, dict[str, bytes]]:
 def _is_entry(entry: object) -> bool:
     match entry:
         case [str(name), int(size)]:
-            return (not name or name.isidentifier()) and len(name) <= MOST and size >= 0 and type(size) is int
+            valid = not name or (name.isidentifier() and len(name) <= MOST)
+            return valid and size >= 0 and type(size) is int
     return False
 
 
@@ -144,7 +147,7 @@ def imported(path: Path, bundle: bytes, prefix: str) -> ModuleType:
             del modules[file.stem], sys.modules[full]
             raise
 
-    def find(asked: str, *details: Any, **words: Any) -> Any:  # noqa: ANN401  as Python calls __import__
+    def find(asked: str, *details: Any, **words: Any) -> Any:  # noqa: ANN401  __import__'s
         if asked not in others:
             return builtins.__import__(asked, *details, **words)
         if asked not in modules:

@@ -230,17 +230,18 @@ def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Files |
     return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
 
 
-def task_of(task: object, **values: Any) -> Task:  # noqa: ANN401  settings, checked there
+def task_of(task: object, *, preset: bool = False, **values: Any) -> Task:  # noqa: ANN401  settings, checked there
     """A task from its name, FILE.py:CLASS, its class, or an object of it, which has its settings.
 
-    Settings are those of `farm run`: of the task's first preset, but for `values`.
+    With `preset`, settings that are not among `values` are those of `farm run`: of the first preset.
 
     Raises:
       ConfigError: there is no such task, or a setting is invalid.
     """
     if isinstance(task, Task):
         if values:
-            raise ConfigError(f"{', '.join(values)}: the task is an object that has its settings; give its class")
+            names = ", ".join(values)
+            raise ConfigError(f"{names}: the task is an object that has its settings; give its class")
         return task
     if isinstance(task, str):
         plugin = plugins.find("tasks", task)
@@ -250,9 +251,10 @@ def task_of(task: object, **values: Any) -> Task:  # noqa: ANN401  settings, che
     if not isinstance(kind, type) or not issubclass(kind, Task):
         what = task if isinstance(task, str) else f"a {type(task).__name__}"
         raise ConfigError(f"task is {what}; expected a farm.Task, its class, or its name")
+    first = next(iter(kind.presets.values()), {}) if preset else {}
     known = {each.name for each in fields(kind.Config)}
-    preset = {name: value for name, value in next(iter(kind.presets.values()), {}).items() if name in known}
-    return build_task(plugin, {**preset, **values}, None)
+    usual = {name: value for name, value in first.items() if name in known}
+    return build_task(plugin, {**usual, **values}, None)
 
 
 def draw_constants(

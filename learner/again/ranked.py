@@ -19,7 +19,7 @@ class Ranked:
         raise NotImplementedError
 
     def best(self, count: int) -> list[int]:
-        """Indices of those with the highest returns, in descending order; of equal ones the first."""
+        """Indices of those with the highest returns, the highest first; of equal ones the first."""
         return np.argsort(-self.returns, kind="stable")[:count].tolist()
 
     def worst(self, count: int) -> list[int]:
@@ -27,5 +27,5 @@ class Ranked:
         return np.argsort(self.returns, kind="stable")[:count].tolist()
 
     def ended(self, count: int) -> list[int]:
-        """Indices of the first that the task ended before their last step, for example by a drop."""
+        """Indices of the first that the task ended early, for example by a drop."""
         return np.flatnonzero(self.early)[:count].tolist()

@@ -337,7 +337,8 @@ def handed_over(config: RunConfig) -> str:
         names = [origin.config.task, config.task]
     parts = [f"task {names[1]} (there {names[0]})", *_settings_that_differ(old, new)]
     sources = [each.task.sources for each in (old, new)]
-    files = [name for name in {**sources[0], **sources[1]} if sources[0].get(name) != sources[1].get(name)]
+    both = {**sources[0], **sources[1]}
+    files = [name for name in both if sources[0].get(name) != sources[1].get(name)]
     parts += [f"files {', '.join(files)}"] if files else []
     named = [[each.name for each in task.observations] for task in (old.task, new.task)]
     parts += [f"observation {i} {b!r} (there {a!r})" for i, (a, b) in enumerate(zip(*named, strict=False)) if a != b]

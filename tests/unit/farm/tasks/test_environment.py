@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -207,6 +208,15 @@ def test_actions_have_the_bounds_that_the_task_declares():
 
     space = farm.environment(Pushed).action_space
     assert (space.low.tolist(), space.high.tolist()) == ([-0.5, -1.0], [0.25, 1.0])
+
+
+def test_settings_are_those_of_a_run():
+    class Usual(Pole):
+        presets: ClassVar = {"default": {"width": 0.2, "steps": 5, "policy": "linear"}, "other": {}}
+
+    task = farm.environment(Usual, steps=7)._is.task
+    assert (task.config.width, task.steps) == (0.2, 7)
+    assert farm.environment(Usual(Usual.Config(steps=3)))._is.task.config.width == 0.6
 
 
 class Whole(Pole):
