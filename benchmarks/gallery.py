@@ -65,7 +65,9 @@ class Piece:
 _ROBOT: Final = "Its model: [robots of other people](../examples/README.md#robots-of-other-people)."
 
 PIECES: Final = (
-    Piece("go1.py:Walk", "A Unitree Go1 trots at the speed that the bar shows.", "--generations 60", needs=_ROBOT, folder="robots"),
+    Piece(
+        "go1.py:Walk", "A Unitree Go1 trots at a commanded speed.", "--generations 60", needs=_ROBOT, folder="robots"
+    ),
     Piece("crazyflie.py:Hover", "A Crazyflie recovers from a tumble, and hovers.", needs=_ROBOT, folder="robots"),
     Piece("ur5e.py:Push", "A UR5e pushes a puck to its goal.", needs=_ROBOT, folder="robots"),
     Piece("pendulum.py:Pendulum", "A motor that is too weak to lift a pendulum swings it up.", "--generations 150"),

@@ -15,7 +15,7 @@ from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import ConfigError, TaskError
 from farm.seeds import SEEDS, trial
 from farm.sim.rendering import Painter
-from farm.tasks import actions
+from farm.tasks.actions import described as actions
 from farm.tasks.base import Task
 from farm.tasks.episodes import Episodes
 from farm.tasks.loop import scores

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import farm
+from farm import seeds
 from farm.errors import ConfigError
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
@@ -277,3 +278,19 @@ def test_moves_need_position_servos():
     with pytest.raises(ConfigError, match="no position servo moves site 'FL_foot'"):
         specification(legs(farm.Moves("FL_foot"), xml=motors))
     mujoco.MjModel.from_xml_string(motors)
+
+
+def test_an_environment_shows_and_takes_what_the_space_does():
+    pytest.importorskip("gymnasium")
+    task = legs(RHYTHM)
+    environment = farm.environment(type(task))
+    assert environment.observation_space.shape == (10,)
+    assert environment.action_space.shape == (3,)
+    running = batch(task, [seeds.trial(0, 7)])
+    x, _ = environment.reset(seed=7)
+    for k in range(task.steps):
+        assert np.array_equal(x, running.observe()[0])
+        action = np.array([0.5, -0.2, 0.1 * k])
+        x, *_ = environment.step(action)
+        running.step(action[None])
+    environment.close()
