@@ -14,7 +14,7 @@ MAY_IMPORT = {"farm": set(), "workers": {"farm"}, "learner": {"farm"}}
 """Of the project's own packages; no module is excused."""
 
 FLOORS = {
-    "farm/sim/": ("farm.arrays", "farm.errors", "farm.returns", "farm.sim"),
+    "farm/sim/": ("farm.arrays", "farm.errors", "farm.noise", "farm.returns", "farm.sim"),
     "farm/net/": ("farm.arrays", "farm.errors", "farm.net", "farm.sim.trajectory"),
     "farm/tasks/base.py": ("farm.arrays", "farm.errors", "farm.settings", "farm.sim", "farm.tasks.actions.space"),
     "farm/tasks/actions/space.py": ("farm.arrays", "farm.errors", "farm.sim", "farm.tasks.base"),  # types of it
@@ -64,6 +64,7 @@ PURE = (
         "farm/errors.py",
         "farm/elementary.py",
         "farm/moments.py",
+        "farm/noise.py",
         "farm/returns.py",
         "farm/seeds.py",
         "farm/net/keys.py",

@@ -6,11 +6,13 @@
     sim.t             control steps done
     sim.which         (B,), which of the task's models each rollout has
     sim.expand("geom_friction")   a field of the model with separate values for each rollout
+    sim.noise(3)      (B, 3), random numbers of each rollout's own in this control step
 
 While a rollout is prepared the arrays are writable views. Afterwards they are read-only, but for those of WRITABLE in
 `act`: what it writes there counts from the next physics step on.
 """
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,6 +23,8 @@ import numpy as np
 
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import TaskError
+from farm.noise import KINDS as KINDS_OF_NOISE
+from farm.noise import Kind, key, numbers
 from farm.sim.complaints import KINDS
 from farm.sim.interfaces import Engine
 from farm.sim.named import Named
@@ -76,6 +80,10 @@ class Sim:
         """Which of `models` each rollout has, (B,)."""
         self._ids: IntArray = np.arange(0)
         self._rows: slice | IntArray = slice(0)  # the same, for arrays
+        self._seeds: Sequence[Sequence[int] | None] = ()  # of the prepared rollouts
+        self._prepared: IntArray = np.arange(0)  # which of them each rollout started from
+        self._keys: AnyArray | None = None  # of the prepared ones, once they are needed
+        self._still: BoolArray = np.zeros(0, dtype=bool)  # which of those are nominal
         self._source: IntArray | None = None  # rows that outputs are read from, until the first step
         self._expanded: dict[str, AnyArray] = {}
         self._nominal: dict[str, AnyArray] = {}  # the models' own values of them, (M, ...)
@@ -128,14 +136,17 @@ class Sim:
         rows.flags.writeable = False
         return rows
 
-    def begin(self, count: int, which: IntArray | None = None) -> None:
-        """Begin `count` rollouts at the model's own start, with `which` model each (None: the first); arrays can be
-        written until `start`."""  # noqa: D205, D209
+    def begin(
+        self, count: int, which: IntArray | None = None, seeds: Sequence[Sequence[int] | None] | None = None
+    ) -> None:
+        """Begin `count` rollouts at the model's own start, with `which` model each (None: the first), and with seeds
+        (None: nominal); arrays can be written until `start`."""  # noqa: D205, D209
         self._ids, self._rows, self._source = np.arange(count), slice(count), None
         several = len(self.models) > 1
         self.which = np.zeros(count, dtype=int) if which is None else which
         if several:
             self.engine.assign(self.which)  # type: ignore[attr-defined]  # it has several models
+        self._seeds, self._prepared, self._keys = seeds or [None] * count, self._ids, None
         self.own, self.t, self._now = {}, 0, {}
         self._live, self._stepped = True, False
         for name in self._expanded:  # before the reset: what it takes from the model is nominal too
@@ -163,7 +174,7 @@ class Sim:
         self._live = False
         if not shared:
             return
-        self._ids, self._rows = np.arange(len(sources)), slice(len(sources))
+        self._ids, self._rows, self._prepared = np.arange(len(sources)), slice(len(sources)), sources
         self.engine.copy(sources)
         for values in self._expanded.values():
             values[: len(sources)] = values[sources]
@@ -187,6 +198,46 @@ class Sim:
             return values
         self._dirty = True
         return self._expanded[name][: len(self)]
+
+    def noise(self, shape: int | tuple[int, ...] = (), stream: str = "", kind: Kind = "normal") -> FloatArray:
+        """Random numbers (B, *shape) of this control step, in `observe`, `act`, `reward` and everywhere else.
+
+        They follow from the rollout's seed, `sim.t`, stream and kind alone: whoever asks again gets the same ones.
+        Nominal rollouts get zeros. `reward` is called after the step, so its `sim.t` is that of the next `observe`.
+
+        Args:
+          shape: of a rollout's numbers.
+          stream: a name for what they are; another one gives other numbers.
+          kind: "normal", with mean 0 and standard deviation 1, or "uniform" from -1 to 1.
+
+        Raises:
+          TaskError: no such kind, or a shape that is none.
+
+        Example:
+          ```python
+          import numpy as np
+
+          import farm
+
+          class Noisy(farm.Task):
+              def observe(self, sim):  # joint readings with a standard deviation of 0.01 rad; one in ten speeds is 0
+                  there = sim.noise(sim.qvel.shape[1], "drop-outs", "uniform") > -0.8
+                  return np.concatenate([sim.qpos + 0.01 * sim.noise(sim.qpos.shape[1]), there * sim.qvel], axis=1)
+          ```
+        """
+        sizes = (shape,) if isinstance(shape, int) else tuple(shape)
+        if kind not in KINDS_OF_NOISE or not all(isinstance(n, int | np.integer) and n >= 0 for n in sizes):
+            raise TaskError(
+                f"sim.noise of shape {shape!r:.60} and kind {kind!r:.20}; expected numbers of at least 0, and "
+                f"{' or '.join(KINDS_OF_NOISE)}"
+            )
+        if self._keys is None:
+            self._keys = np.array([0 if seed is None else key(seed) for seed in self._seeds], dtype=np.uint64)
+            self._still = np.array([seed is None for seed in self._seeds], dtype=bool)
+        rows = self._prepared[self._ids]
+        values = numbers(self._keys[rows], stream, self.t, math.prod(sizes), kind)
+        values[self._still[rows]] = 0.0
+        return values.reshape(len(self), *sizes)
 
     def step(self, count: int = 1) -> None:
         """Advance all rollouts by physics steps."""

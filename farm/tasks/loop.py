@@ -142,7 +142,7 @@ class Batch:
         self._substeps = task.substeps // self._parts
         unique = list(dict.fromkeys(seeds))
         rngs = [None if seed is None else np.random.default_rng(seed) for seed in unique]
-        sim.begin(len(unique), drawn(task, rngs) if len(sim.models) > 1 else None)
+        sim.begin(len(unique), drawn(task, rngs) if len(sim.models) > 1 else None, unique)
         if task.space:
             task.space.begin(sim)
         task.prepare(sim, rngs)

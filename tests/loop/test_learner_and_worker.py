@@ -61,6 +61,17 @@ PUSHED = (
 """
 )
 """The same, with a goal that moves, and a push and a jump at a step that is drawn for each rollout."""
+NOISY = (
+    TASK
+    + """
+    def observe(self, sim):
+        return super().observe(sim) + 0.1 * sim.noise(2, "readings")
+
+    def act(self, sim, action):
+        return super().act(sim, action + 0.2 * sim.noise(1, "motor", "uniform"))
+"""
+)
+"""The same, with noise in each control step."""
 SMALL: dict[str, Any] = {"generations": 6, "pairs": 6, "initial_sigma": 0.5}
 
 
@@ -103,6 +114,21 @@ def test_pushes_jumps_and_moving_goals_are_the_same_for_any_workers_and_repeated
     again = rewind(tmp_path / "half", 4)
     assert again.returns.max() == RunFolder.open(tmp_path / "1").progress()[3].return_max
     assert again.rollout(7).trajectory.value == again.returns[7]
+
+
+def test_noise_is_the_same_for_any_workers_resumed_and_repeated(
+    cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cart.write_text(NOISY)
+    config = configure(f"{cart}:Cart", **SMALL)
+    runs = [learnt(config, tmp_path / str(count), count, cart, audit=0.5) for count in (1, 2, 3)]
+    learnt(replace(config, generations=3), tmp_path / "half", 2, cart)
+    runs.append(learnt(config, tmp_path / "half", 1, cart, resume=True))
+    assert len({run["parameters_sha256"] for run in runs}) == 1
+    assert "gave different numbers" not in caplog.text
+    again = rewind(tmp_path / "half", 4)
+    assert again.returns.max() == RunFolder.open(tmp_path / "1").progress()[3].return_max
+    assert [again.rollout(row).trajectory.value for row in (2, 3, 7)] == again.returns[[2, 3, 7]].tolist()
 
 
 def test_evolution_strategies_learn_alike_by_any_workers_and_resumed(cart: Path, tmp_path: Path) -> None:
