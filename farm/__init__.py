@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from farm.tasks.base import Task as Task
     from farm.tasks.base import TaskConfig as TaskConfig
     from farm.tasks.base import TaskSpec as TaskSpec
+    from farm.tasks.robust import Robust as Robust
     from farm.tasks.touch import Touch as Touch
     from farm.tasks.touch import TouchConfig as TouchConfig
 
@@ -53,7 +54,7 @@ _WHERE: Final = {
     "Channel": "farm.sim.channels", "Camera": "farm.sim.channels", "Measure": "farm.sim.channels",
     "Quantity": "farm.sim.channels",
     "Touch": "farm.tasks.touch", "TouchConfig": "farm.tasks.touch",
-    "Record": "farm.tasks.base", "Score": "farm.tasks.base",
+    "Robust": "farm.tasks.robust", "Record": "farm.tasks.base", "Score": "farm.tasks.base",
     "Policy": "farm.policies.base", "PolicyConfig": "farm.policies.base",
     "Algorithm": "learner.algorithms", "SearchState": "learner.algorithms",
     "Backend": "farm.sim.interfaces", "Sim": "farm.sim.sim", "Settings": "farm.settings", "setting": "farm.settings",

@@ -16,7 +16,10 @@ MAY_IMPORT = {"farm": set(), "workers": {"farm"}, "learner": {"farm"}}
 FLOORS = {
     "farm/sim/": ("farm.arrays", "farm.errors", "farm.noise", "farm.returns", "farm.sim"),
     "farm/net/": ("farm.arrays", "farm.errors", "farm.net", "farm.sim.trajectory"),
-    "farm/tasks/base.py": ("farm.arrays", "farm.errors", "farm.settings", "farm.sim", "farm.tasks.actions.space"),
+    "farm/tasks/base.py": (
+        *("farm.arrays", "farm.errors", "farm.settings", "farm.sim"),
+        *("farm.tasks.actions.space", "farm.tasks.robust"),
+    ),
     "farm/tasks/actions/space.py": ("farm.arrays", "farm.errors", "farm.sim", "farm.tasks.base"),  # types of it
     "farm/policies/": (
         "farm.arrays",
@@ -71,6 +74,7 @@ PURE = (
         "farm/net/work.py",
     ),
     *("farm/net/messages.py", "farm/net/stats.py", "farm/sim/channels.py", "farm/sim/trajectory.py", "farm/policies/"),
+    "farm/tasks/robust.py",
     *(f"farm/tasks/finger_gait/{name}.py" for name in ("hand", "observations", "rewards", "touch")),
     *(f"learner/algorithms/{name}.py" for name in ("ars", "gradients", "mirrored", "pgpe", "snes", "state")),
     *("learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),

@@ -199,7 +199,18 @@ class Sim:
         self._dirty = True
         return self._expanded[name][: len(self)]
 
-    def noise(self, shape: int | tuple[int, ...] = (), stream: str = "", kind: Kind = "normal") -> FloatArray:
+    @property
+    def nominal(self) -> BoolArray:
+        """Which rollouts have nominal conditions, so no random numbers, (B,)."""
+        return np.array([self._seeds[row] is None for row in self._prepared[self._ids].tolist()], dtype=bool)
+
+    def noise(
+        self,
+        shape: int | tuple[int, ...] = (),
+        stream: str = "",
+        kind: Kind = "normal",
+        step: int | None = None,
+    ) -> FloatArray:
         """Random numbers (B, *shape) of this control step, in `observe`, `act`, `reward` and everywhere else.
 
         They follow from the rollout's seed, `sim.t`, stream and kind alone: whoever asks again gets the same ones.
@@ -209,6 +220,7 @@ class Sim:
           shape: of a rollout's numbers.
           stream: a name for what they are; another one gives other numbers.
           kind: "normal", with mean 0 and standard deviation 1, or "uniform" from -1 to 1.
+          step: a control step; by default this one. With 0 the numbers stay during a rollout.
 
         Raises:
           TaskError: no such kind, or a shape that is none.
@@ -235,7 +247,7 @@ class Sim:
             self._keys = np.array([0 if seed is None else key(seed) for seed in self._seeds], dtype=np.uint64)
             self._still = np.array([seed is None for seed in self._seeds], dtype=bool)
         rows = self._prepared[self._ids]
-        values = numbers(self._keys[rows], stream, self.t, math.prod(sizes), kind)
+        values = numbers(self._keys[rows], stream, self.t if step is None else step, math.prod(sizes), kind)
         values[self._still[rows]] = 0.0
         return values.reshape(len(self), *sizes)
 

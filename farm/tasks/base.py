@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from farm.sim.interfaces import Engine, MakeEngine
     from farm.sim.model_files import Content, Files
     from farm.sim.sim import Sim
+    from farm.tasks.robust import Robust
 
 STEPS_LIMIT: Final = 10_000
 """Control steps of a rollout, at most."""
@@ -55,6 +56,8 @@ class TaskConfig(Settings):
     """Train with random starts and conditions (the same for both rollouts of a pair)."""
     reward_offset: float = setting(0.0, least=-1e6, most=1e6)
     """Added to the reward of every control step, for learning only: -1 removes a bonus of 1 for not falling."""
+    robust: float = setting(1.0, least=0.0, most=10.0)
+    """Strength of the conditions that the task declares by farm.Robust: 0 turns them off, 2 doubles their ranges."""
     strict: bool = False
     """End the run if a rollout raises an error or gives a number that is not finite; otherwise it counts as failed."""
 
@@ -220,6 +223,8 @@ class Task:
     """What a rollout shows in addition to bodies, actions and reward terms."""
     measures: tuple[Measure, ...] = ()
     """Numbers that `outcomes` gives of a whole rollout, beside its return."""
+    robust: "Robust | None" = None
+    """Sensor errors, delays, motors, masses, friction and pushes that differ between rollouts."""
     camera: Camera | None = None
     """Point of view of pictures; by default from the side of the moving bodies."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"default": {}}

@@ -238,8 +238,8 @@ class EnvironmentEngine:
         raise NotImplementedError
 
     def expand(self, name: str) -> AnyArray:
-        """An environment's model is its own."""
-        raise NotImplementedError(name)
+        """An environment's model is its own: always a TaskError."""
+        raise TaskError(f"{name} cannot differ between rollouts in an environment that steps itself")
 
     def set_const(self, ids: IntArray) -> None:
         """Nothing to do: there are no derived constants."""

@@ -22,6 +22,7 @@ from farm.sim.complaints import KINDS
 from farm.sim.interfaces import Rebound
 from farm.sim.sim import Sim, complaint, unwritable, warned
 from farm.sim.trajectory import single
+from farm.tasks import disturbances
 from farm.tasks.base import Record, Task, TaskSpec
 from farm.tasks.rollouts import Rollouts, Seed, discounted, drawn, measured
 from farm.tasks.trouble import NOT_OF_TASK, Trouble
@@ -141,12 +142,18 @@ class Batch:
         self._parts = task.substeps // (every or task.substeps)
         self._substeps = task.substeps // self._parts
         unique = list(dict.fromkeys(seeds))
+        robust = disturbances.of(task)
+        self._disturbed = None if robust is None else disturbances.Disturbances(robust, task)
         rngs = [None if seed is None else np.random.default_rng(seed) for seed in unique]
         sim.begin(len(unique), drawn(task, rngs) if len(sim.models) > 1 else None, unique)
         if task.space:
             task.space.begin(sim)
         task.prepare(sim, rngs)
+        if self._disturbed:
+            self._disturbed.prepare(sim)
         sim.start(np.array([unique.index(seed) for seed in seeds]))
+        if self._disturbed:
+            self._disturbed.start(sim)
         self.which = sim.which
         """Which of the task's models each has, (B,)"""
         count, self.active = len(seeds), np.arange(len(seeds))
@@ -174,6 +181,8 @@ class Batch:
         x = seen(self.task, self.sim)
         self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
         x = shaped("observe", x, (len(self.sim), self._width))
+        if self._disturbed:
+            x = self._disturbed.observe(self.sim, x, self.active)
         if np.isfinite(x).all():
             return x
         bad: BoolArray = np.logical_not(np.isfinite(x).all(axis=1))
@@ -206,9 +215,14 @@ class Batch:
         if self._actions is None:
             self._actions = np.zeros((len(self._steps), task.steps, action.shape[1]))
         self._actions[self.rows, t] = action
+        late = self._disturbed.late(action, t, self.active) if self._disturbed else action
         with sim.writing() as states:
+            if self._disturbed:
+                self._disturbed.release(sim, self.active)
             width = sim.engine.field("ctrl").shape[1]  # an environment's actions need not be the model's controls
-            sim.control(shaped("act", task.act(sim, action), (len(sim), width)))
+            sim.control(shaped("act", task.act(sim, late), (len(sim), width)))
+            if self._disturbed:
+                self._disturbed.press(sim, self.active)
         sim.write(states)
         for part in range(self._parts):
             sim.step(self._substeps)
@@ -228,7 +242,8 @@ class Batch:
         if not isinstance(frame, dict):
             raise TaskError(f"measure gave a {type(frame).__name__}; expected arrays by name")
         arrays = {name: shaped(name, v, (count, *np.shape(v)[1:])) for name, v in frame.items()}
-        return {"qpos": self.sim.qpos, **self._mocap(), **arrays}
+        conditions = self._disturbed.measured(self.sim, self.active) if self._disturbed else {}
+        return {"qpos": self.sim.qpos, **self._mocap(), **arrays, **conditions}
 
     def _mocap(self) -> dict[str, FloatArray]:
         """Poses of mocap bodies (n, nmocap, 7), if there are any: with qpos, where everything is."""
@@ -279,6 +294,8 @@ class Batch:
         for values in self.frames.values():
             values[self.active[failed], frames] = 0.0  # discard the numbers of unstable states
         self.active = self.rows = self.active[~over]
+        if self._disturbed:
+            self._disturbed.keep(~over)
         self.sim.keep(~over)
 
     @property

@@ -15,10 +15,12 @@ from farm.sim.channels import Camera, Channel, Measure, Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
+from farm.tasks import disturbances
 from farm.tasks.actions import described as actions
 from farm.tasks.actions.space import ActionSpace
 from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
+from farm.tasks.robust import SIZES
 
 T = TypeVar("T")
 
@@ -37,6 +39,7 @@ def specification(task: Task) -> TaskSpec:
     """
     for what in ("observations", "actions"):
         _check_quantities(task, what)
+    disturbances.check(task)
     spec = task.spec() or _found(task)
     measures: object = task.measures
     if not isinstance(measures, tuple | list) or not all(isinstance(each, Measure) for each in measures):
@@ -46,8 +49,12 @@ def specification(task: Task) -> TaskSpec:
         raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
         _check_count(task, what, count)
+    if task.robust is not None:
+        for cause in SIZES:
+            task.robust.sizes(cause, spec.observation, task.parts)
     several = (_models(task),) if len(task.simulated) > 1 else ()
-    return replace(spec, measures=tuple(task.measures), channels=(*spec.channels, *several))
+    channels = (*spec.channels, *disturbances.channels(task), *several)
+    return replace(spec, measures=tuple(task.measures), channels=channels)
 
 
 def _check_quantities(task: Task, what: str) -> None:

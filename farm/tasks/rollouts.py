@@ -13,6 +13,7 @@ from farm.sim.channels import flat
 from farm.sim.scene import MODEL, Scene
 from farm.sim.trajectory import Trajectory, single
 from farm.tasks.base import Record, Task, TaskSpec
+from farm.tasks.disturbances import CHANNELS
 
 Seed = tuple[int, ...] | None
 """Seed of a rollout's random numbers; None for nominal conditions."""
@@ -152,10 +153,15 @@ def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row
         bodies=scene.each[which].poses(frames["qpos"], frames.get("mocap")),
         actions=np.concatenate([np.zeros((1, actions.shape[1])), actions[control]]),
         terms=np.concatenate([np.zeros((1, terms.shape[1])), terms[control]]),
-        channels=task.show(frames) | scene.said(which, len(frames["qpos"])),
+        channels=shown(task, frames) | scene.said(which, len(frames["qpos"])),
         value=float(rollouts.returns[row]),
         success=bool(rollouts.success[row]) if spec.success else None,
     )
+
+
+def shown(task: Task, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Values of the channels of frames with any leading shape: of the task's own, and of its `farm.Robust`."""
+    return task.show(frames) | {name: frames[name] for name in CHANNELS if name in frames}
 
 
 def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
@@ -170,7 +176,7 @@ def channel_traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArra
     """The traces of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
     if not spec.trace_channels or not len(rows):
         return np.zeros((len(rows), *spec.trace_shape), dtype="<f4")
-    values = flat(spec.trace_channels, task.show({name: frames[rows] for name, frames in rollouts.frames.items()}))
+    values = flat(spec.trace_channels, shown(task, {name: frames[rows] for name, frames in rollouts.frames.items()}))
     values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
     return values
 
@@ -191,7 +197,7 @@ def step_traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) 
 
     Observation and action are those before a step's physics, terms and channels those after it.
     """
-    channels = task.show({name: frames[rows] for name, frames in rollouts.frames.items()})
+    channels = shown(task, {name: frames[rows] for name, frames in rollouts.frames.items()})
     if len(task.simulated) > 1:
         which = np.eye(len(task.simulated))[rollouts.which[rows]]
         channels = channels | {MODEL: np.repeat(which[:, None], task.steps, axis=1)}

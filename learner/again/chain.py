@@ -121,7 +121,7 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
 
 def _longer(kind: type[Task], learnt: LoadedPolicy, steps: int) -> Task:
     task = learnt.problem.task
-    return kind(replace(task.config, steps=steps), task.variant, task.sources)
+    return kind(replace(task.config, steps=steps, robust=0.0), task.variant, task.sources)
 
 
 def _run(

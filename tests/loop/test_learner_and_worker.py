@@ -72,6 +72,15 @@ NOISY = (
 """
 )
 """The same, with noise in each control step."""
+ROBUST = TASK.replace("from farm import", "from farm import Robust,").replace(
+    "    steps, substeps",
+    """    robust = Robust(
+        noise=0.02, bias=0.01, observation_delay=(0.0, 0.03), action_delay=(0.0, 0.03), motors=(0.8, 1.2),
+        mass=(0.9, 1.1), payload=(0.0, 0.2), friction=(0.5, 1.5), push=(0.0, 2.0), push_duration=0.05, body="cart",
+    )
+    steps, substeps""",
+)
+"""The same, with all conditions of `farm.Robust`."""
 SMALL: dict[str, Any] = {"generations": 6, "pairs": 6, "initial_sigma": 0.5}
 
 
@@ -116,10 +125,11 @@ def test_pushes_jumps_and_moving_goals_are_the_same_for_any_workers_and_repeated
     assert again.rollout(7).trajectory.value == again.returns[7]
 
 
-def test_noise_is_the_same_for_any_workers_resumed_and_repeated(
-    cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("text", [NOISY, ROBUST], ids=["noise", "robust"])
+def test_noise_and_conditions_are_the_same_for_any_workers_resumed_and_repeated(
+    cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str
 ) -> None:
-    cart.write_text(NOISY)
+    cart.write_text(text)
     config = configure(f"{cart}:Cart", **SMALL)
     runs = [learnt(config, tmp_path / str(count), count, cart, audit=0.5) for count in (1, 2, 3)]
     learnt(replace(config, generations=3), tmp_path / "half", 2, cart)
