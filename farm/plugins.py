@@ -36,6 +36,7 @@ COMMANDS: Final = {
     "new-task": "writes a task of 31 lines that runs, to start from",
     "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
     "evaluate": "tries the learnt mean policy on perturbed starts",
+    "stress": "tries it under sensor errors, delays, weak motors, payloads and pushes",
     "verify": "repeats a run, and compares its numbers to the last bit",
     "dataset": "writes episodes of the learnt policy as a data set, in LeRobot's format",
     "replay": "simulates any policy or rollout of a run again, into a recording or a video",

@@ -11,7 +11,7 @@ from farm.errors import ConfigError, TaskError
 from farm.sim.channels import Channel
 from farm.sim.sim import WRITABLE, Sim
 from farm.tasks.base import Task
-from farm.tasks.robust import NEUTRAL, Robust
+from farm.tasks.robust import NEUTRAL, SIZES, Robust
 
 CONDITIONS: Final = "robust/conditions"
 PUSH: Final = "robust/push"
@@ -118,7 +118,9 @@ class Disturbances:
     """The conditions of a batch of B rollouts, of which n are still going: their rows are given with each call."""
 
     def __init__(self, robust: Robust, task: Task) -> None:
-        self._robust, self._task = robust, task
+        self._robust, self._task, self._causes = robust, task, robust.causes
+        self._sizes: dict[str, FloatArray] | None = None  # of errors, (d,) each
+        self._bias = np.zeros((0, 0))  # (B, d)
         self._drawn: dict[str, FloatArray] = {}
         self._seen, self._done = _Late(), _Late()
         self._body: IntArray = np.zeros(0, dtype=int)
@@ -129,17 +131,16 @@ class Disturbances:
 
     def prepare(self, sim: Sim) -> None:
         """Change the models of rollouts that are being prepared."""
-        robust = self._robust
-        if "motors" in robust.causes:
+        if "motors" in self._causes:
             factors = self._uniform(sim, "motors", (sim.model.nu,))
             self._weaken(sim, factors)
-        if "mass" in robust.causes:
+        if "mass" in self._causes:
             factors = self._uniform(sim, "mass")
             sim.expand("body_mass")[:] *= factors[:, None]
             sim.expand("body_inertia")[:] *= factors[:, None, None]
-        if "payload" in robust.causes:
+        if "payload" in self._causes:
             sim.expand("body_mass")[np.arange(len(sim)), self._bodies(sim)] += self._uniform(sim, "payload")
-        if "friction" in robust.causes:
+        if "friction" in self._causes:
             factors = self._uniform(sim, "friction")[:, None, None]
             sim.expand("geom_friction")[:] *= factors
             if any(model.npair for model in sim.models):
@@ -152,9 +153,9 @@ class Disturbances:
             values = self._uniform(sim, cause, (sim.model.nu,) if cause == "motors" else ())
             self._drawn[cause] = values.mean(axis=1) if cause == "motors" else values
         for cause, late in (("observation_delay", self._seen), ("action_delay", self._done)):
-            if cause in robust.causes:
+            if cause in self._causes:
                 late.by(self._drawn[cause] / period)
-        if "push" in robust.causes:
+        if "push" in self._causes:
             if "xfrc_applied" not in getattr(sim.engine, "writable", WRITABLE):
                 raise TaskError("robust: nothing can be pushed in an environment that steps itself")
             self._body = self._bodies(sim)
@@ -162,12 +163,14 @@ class Disturbances:
 
     def observe(self, sim: Sim, x: FloatArray, rows: IntArray) -> FloatArray:
         """What the policy sees of observations (n, d)."""
-        robust = self._robust
+        if self._sizes is None:  # the first time: all rollouts are going
+            self._sizes = {cause: self._robust.sizes(cause, x.shape[1], self._task.parts) for cause in SIZES}
+            self._bias = self._sizes["bias"] * sim.noise(x.shape[1], _STREAM + "bias", "uniform", 0)
         x = self._seen.of(x, sim.t, rows)
-        for cause, kind in (("bias", "uniform"), ("noise", "normal")):
-            if cause in robust.causes:
-                sizes = robust.sizes(cause, x.shape[1], self._task.parts)
-                x = x + sizes * sim.noise(x.shape[1], _STREAM + cause, kind, 0 if cause == "bias" else None)
+        if "bias" in self._causes:
+            x = x + self._bias[rows]
+        if "noise" in self._causes:
+            x = x + self._sizes["noise"] * sim.noise(x.shape[1], _STREAM + "noise")
         return x
 
     def late(self, action: FloatArray, t: int, rows: IntArray) -> FloatArray:

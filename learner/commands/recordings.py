@@ -96,12 +96,14 @@ def _pictures(
 ) -> "list[Picture]":
     from farm.sim import rendering, video
     from farm.sim.scene import MODEL
+    from farm.tasks import disturbances
 
     last, which = len(rollout.times) - 1, rollout.channels.get(MODEL)
+    arrows = [channel for channel in disturbances.channels(task) if channel.kind == "arrows"]
     model = task.model if which is None else task.simulated[int(which[0].argmax())]
     unique = sorted({min(moment, last) for moment in moments})
     pictures = rendering.pictures(
-        model, frames["qpos"][unique], video.SIZE, camera=task.camera, channels=task.channels,
+        model, frames["qpos"][unique], video.SIZE, camera=task.camera, channels=(*task.channels, *arrows),
         mocap=frames["mocap"][unique] if "mocap" in frames else None,
         values={name: each[unique] for name, each in rollout.channels.items()},
     )  # fmt: skip
