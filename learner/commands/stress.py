@@ -33,7 +33,7 @@ _WIDTH: Final = 8
 
 @dataclass(frozen=True, kw_only=True)
 class StressCommand(OfRun):
-    """Tries the learnt policy under conditions that differ, each cause alone and all together, on unseen starts.
+    """Tries the learnt policy under conditions that differ, each cause alone and all together.
 
     The conditions are those that the task declares by farm.Robust, or sensible ones.
     """

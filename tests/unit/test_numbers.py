@@ -19,7 +19,7 @@ from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
 WORDS = {
-    "replay": ("RUN",), "play": ("RUN",), "evaluate": ("RUN",), "verify": ("RUN",), "export": ("RUN", "p.npz"),
+    "replay": ("RUN",), "play": ("RUN",), "evaluate": ("RUN",), "stress": ("RUN",), "verify": ("RUN",), "export": ("RUN", "p.npz"),
     "chain": ("RUN",),
     "certificates": ("new", "certs"),
 }  # fmt: skip
