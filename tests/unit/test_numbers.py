@@ -19,8 +19,8 @@ from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
 WORDS = {
-    "replay": ("RUN",), "play": ("RUN",), "evaluate": ("RUN",), "stress": ("RUN",), "verify": ("RUN",), "export": ("RUN", "p.npz"),
-    "chain": ("RUN",),
+    "replay": ("RUN",), "play": ("RUN",), "evaluate": ("RUN",), "stress": ("RUN",), "verify": ("RUN",),
+    "export": ("RUN", "p.npz"), "chain": ("RUN",),
     "certificates": ("new", "certs"),
 }  # fmt: skip
 """What commands need besides the number."""

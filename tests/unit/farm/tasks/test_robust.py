@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from carts import Pole, arrays, new_runner, same, thetas
+from carts import XML, Pole, arrays, new_runner, same, thetas
 
 import farm
 from farm.errors import ConfigError, TaskError
@@ -11,6 +11,7 @@ from farm.policies.networks import Linear, LinearConfig
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks import loop
+from farm.tasks.gymnasium import Environment
 from farm.tasks.loop import Batch, Kept, again
 from farm.tasks.probe import specification
 
@@ -334,3 +335,39 @@ def test_pairs_of_geometries_have_their_own_friction():
     drawn = batch.start["robust/conditions"][:, 0]
     assert np.array_equal(batch.sim.expand("pair_friction")[:, 0, 0], 0.5 * drawn)
     assert mujoco.mj_name2id(batch.sim.model, mujoco.mjtObj.mjOBJ_GEOM, "floor") >= 0
+
+
+def test_an_environment_that_steps_itself_has_errors_and_delays_but_one_model():
+    task = Environment(Environment.Config(steps=4), "HumanoidStandup-v5")
+    sim = Sim(task.engine(BatchEngine))
+    seeds = [(1, 0, 0, 0), None]
+    plain = Batch(task, sim, seeds).observe().copy()
+    task.robust = farm.Robust(bias=0.5, observation_delay=(0.0, 0.03))
+    specification(task)
+    seen = Batch(task, sim, seeds).observe()
+    assert np.array_equal(seen[1], plain[1]), "nominal"
+    assert 0.3 < np.abs(seen[0] - plain[0]).max() < 0.5
+    task.robust = farm.Robust(mass=(0.5, 2.0))
+    with pytest.raises(TaskError, match="body_mass cannot differ between rollouts in an environment that steps itself"):
+        Batch(task, sim, seeds)
+    sim.engine.close()
+
+
+class Several(Pole):
+    """Poles of two lengths, the second with a geometry more."""
+
+    robust = ALL
+
+    def models(self):
+        """Two."""
+        longer = XML.replace("0.4", "0.6").replace('<geom type="capsule"', '<geom size="0.05"/><geom type="capsule"')
+        return [XML, longer]
+
+
+def test_conditions_of_several_models_do_not_depend_on_the_batch():
+    runner = new_runner(Several)
+    theta, seeds = thetas(runner, 7, 4.0), [None, *((i, 2, 3, 4) for i in range(6))]
+    together = runner.rollouts(theta, seeds)
+    assert set(together.which.tolist()) == {0, 1}
+    for row in range(7):
+        same(together, row, runner.rollouts(theta[row : row + 1], [seeds[row]]), 0)
