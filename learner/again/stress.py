@@ -85,7 +85,7 @@ def stressed(policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], c
     for cause, one in rows.items():
         row = []
         for strength in strengths:
-            if strength == 0.0 and without is not None:
+            if strength == 0.0 and without is not None and cause != ALL:
                 row.append(without)
                 continue
             _put(task, one.scaled(strength))
