@@ -40,8 +40,10 @@ class Stress:
     strengths: tuple[float, ...]
     cells: Mapping[str, tuple[Mapping[str, Any], ...]]
     """By cause, ALL last: figures at each strength."""
+    shown: float
+    """Strength at which the worst starts are shown: 1, or the next larger one there is, else the largest."""
     worst: tuple[int, ...]
-    """Starts with all causes at strength 1, or the next one there is, those with the lowest returns first."""
+    """Starts with all causes at that strength, those with the lowest returns first."""
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON."""
@@ -75,39 +77,37 @@ def stressed(policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], c
     if not robust.causes:
         raise ConfigError("there are no conditions: the ranges of farm.Robust are all empty")
     rows = {cause: robust.only(cause) for cause in robust.causes} | {ALL: robust}
-    without: dict[str, Any] | None = None
-    cells: dict[str, tuple[Mapping[str, Any], ...]] = {}
     for each in (one.scaled(strength) for one in rows.values() for strength in strengths):
         _put(task, each)  # all are checked before anything is simulated
         disturbances.check(task)
-    shown = min((strength for strength in strengths if strength >= 1.0), default=max(strengths))
-    worst: tuple[int, ...] = ()
-    for cause, one in rows.items():
-        row = []
-        for strength in strengths:
-            if strength == 0.0 and without is not None and cause != ALL:
-                row.append(without)
-                continue
-            _put(task, one.scaled(strength))
-            results = policy.runner.run(policy.mu, jobs)
-            row.append(_figures(policy, results))
-            if strength == 0.0:
-                without = row[-1]
-            if cause == ALL and strength == shown:
-                failed = results.flags[:, 2] | results.flags[:, 3]
-                returns = np.where(failed, -np.inf, results.returns)
-                worst = tuple(np.argsort(returns, kind="stable").tolist())
-        cells[cause] = tuple(row)
+    results: dict[tuple[str, float], Simulated] = {}
+    for cause, strength in _places(rows, strengths):
+        if (cause, strength) not in results:
+            _put(task, rows[cause].scaled(strength))
+            results[cause, strength] = policy.runner.run(policy.mu, jobs)
     _put(task, robust if declared else None)
-    return Stress(robust, declared, tuple(strengths), cells, worst)
+    figures = [_figures(policy, results[place]) for place in _places(rows, strengths)]
+    cells = {cause: tuple(figures[i * len(strengths) : (i + 1) * len(strengths)]) for i, cause in enumerate(rows)}
+    shown = min((strength for strength in strengths if strength >= 1.0), default=max(strengths))
+    return Stress(robust, declared, tuple(strengths), cells, shown, _worst(results[ALL, shown]))
+
+
+def _places(rows: Mapping[str, Robust], strengths: Sequence[float]) -> list[tuple[str, float]]:
+    """What is simulated for each cell, row by row: at strength 0 all causes are alike."""
+    return [(cause if strength else ALL, strength) for cause in rows for strength in strengths]
+
+
+def _worst(results: Simulated) -> tuple[int, ...]:
+    """Starts by their returns, the lowest first; those that failed have none and are before them."""
+    failed = results.flags[:, 2] | results.flags[:, 3]
+    return tuple(np.argsort(np.where(failed, -np.inf, results.returns), kind="stable").tolist())
 
 
 def again(policy: LoadedPolicy, stress: Stress, indices: Sequence[int], count: int, seed: int) -> list[Replay]:
-    """Rollouts from some of the starts, with all causes, at physics rate."""
-    shown = min((strength for strength in stress.strengths if strength >= 1.0), default=max(stress.strengths))
-    all_seeds = starts(count, seed)
-    _put(policy.problem.task, stress.robust.scaled(shown))
-    return policy.rollouts(np.repeat(policy.mu[None], len(indices), axis=0), [all_seeds[i] for i in indices])
+    """Rollouts from some of the starts, with all causes at the strength that is shown, at physics rate."""
+    chosen = starts(count, seed)
+    _put(policy.problem.task, stress.robust.scaled(stress.shown))
+    return policy.rollouts(np.repeat(policy.mu[None], len(indices), axis=0), [chosen[i] for i in indices])
 
 
 def sensible(policy: LoadedPolicy, seed: int, body: str = "") -> Robust:
