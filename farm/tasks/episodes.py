@@ -15,7 +15,7 @@ from farm.sim.interfaces import Rebound
 from farm.sim.scene import quiet
 from farm.sim.sim import Sim
 from farm.tasks.base import Task
-from farm.tasks.loop import Batch, again, seen
+from farm.tasks.loop import Batch, again
 from farm.tasks.rollouts import Seed
 
 
@@ -139,7 +139,7 @@ class _Watched(Batch):
         if self.seen is None or not rows.any():
             return
         with self.sim.only(rows):
-            x = np.array(seen(self.task, self.sim))
+            x = np.array(self._seen(self.active[rows]))
         sound = np.isfinite(x).all(axis=1)
         self.seen[self.active[rows][sound]] = x[sound]
 

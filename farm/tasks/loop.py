@@ -178,11 +178,7 @@ class Batch:
     @_explained
     def observe(self) -> FloatArray:
         """Observations of the active rollouts, (n, d)."""
-        x = seen(self.task, self.sim)
-        self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
-        x = shaped("observe", x, (len(self.sim), self._width))
-        if self._disturbed:
-            x = self._disturbed.observe(self.sim, x, self.active)
+        x = self._seen(self.active)
         if np.isfinite(x).all():
             return x
         bad: BoolArray = np.logical_not(np.isfinite(x).all(axis=1))
@@ -194,6 +190,15 @@ class Batch:
             self._fail(TaskError(f"observe is not finite {where}, though the physics is fine"))
         self._conclude(bad, np.zeros(len(bad), dtype=bool), self.sim.t)
         return x[~bad]
+
+    def _seen(self, rows: IntArray) -> FloatArray:
+        """What the policy sees of rollouts (n,): the observation with its errors, and what the action space adds."""
+        x = self.task.observe(self.sim)
+        self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
+        x = shaped("observe", x, (len(self.sim), self._width))
+        if self._disturbed:
+            x = self._disturbed.observe(self.sim, x, rows)
+        return x if self.task.space is None else self.task.space.see(self.sim, x)
 
     def _fail(self, error: TaskError) -> None:
         """Note why some rollouts fail; raise it if none may fail alone."""

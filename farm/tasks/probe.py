@@ -49,7 +49,7 @@ def specification(task: Task) -> TaskSpec:
         raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
         _check_count(task, what, count)
-    if task.robust is not None:
+    if task.robust is not None and task.space is None:  # with a space the first observation checks them
         for cause in SIZES:
             task.robust.sizes(cause, spec.observation, task.parts)
     several = (_models(task),) if len(task.simulated) > 1 else ()

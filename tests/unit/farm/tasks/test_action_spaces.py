@@ -294,3 +294,14 @@ def test_an_environment_shows_and_takes_what_the_space_does():
         x, *_ = environment.step(action)
         running.step(action[None])
     environment.close()
+
+
+def test_sensors_have_errors_and_the_spaces_own_phase_has_none():
+    task = legs(RHYTHM, robust=farm.Robust(noise=0.1, observation_delay=(0.02, 0.02)))
+    noisy, exact = batch(task, [(7,)]), batch(legs(RHYTHM), [(7,)])
+    for k in range(4):
+        x, expected = noisy.observe()[0], exact.observe()[0]
+        assert (x[:8] != expected[:8]).any()
+        assert np.array_equal(x[8:], expected[8:])
+        for running in (noisy, exact):
+            running.step(np.full((1, 3), 0.1 * k))
