@@ -17,10 +17,10 @@ import numpy as np
 from running import learn
 
 from farm import seeds
-from learner.again.chain import Chained, chain
-from learner.again.replay import LoadedPolicy, load
 from learner.run.config import configure
 from learner.run.folder import RunFolder
+from learner.tools.chain.chain import Chained, chain
+from learner.tools.replay.loaded import LoadedPolicy, load
 
 GAITS: Final = ("middle-on", "index-off", "index-on", "middle-off")
 SETTINGS: Final[dict[str, dict[str, Any]]] = {

@@ -26,9 +26,9 @@ from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
-from learner.again.replay import LoadedPolicy, load
 from learner.run import setup
 from learner.run.config import configure
+from learner.tools.replay.loaded import LoadedPolicy, load
 
 HERE: Final = Path(__file__).parent
 TASK: Final = f"{HERE.parent / 'examples/tasks/cycle.py'}:Cycle"

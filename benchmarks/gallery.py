@@ -27,8 +27,8 @@ from own_tasks import SEED, STARTS, constant, still
 from PIL import Image, ImageSequence
 from running import script
 
-from learner.again.replay import LoadedPolicy, load
 from learner.run.evaluation import evaluation_jobs
+from learner.tools.replay.loaded import LoadedPolicy, load
 
 ROOT: Final = Path(__file__).parents[1]
 SECONDS: Final = 5.0  # of a film

@@ -43,7 +43,7 @@ from farm.runner import Runner
 from learner.run.evaluation import evaluation_jobs
 from learner.run.folder import RunFolder
 from learner.run.setup import problem
-from learner.sweep.race import entry_of
+from learner.tools.sweep.race import entry_of
 
 HERE: Final = Path(__file__).parent
 TABLE: Final = HERE.parent / "docs/results/tables/learning-speed.jsonl"

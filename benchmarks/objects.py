@@ -19,9 +19,9 @@ import numpy as np
 from running import learn, script
 
 from farm.arrays import FloatArray
-from learner.again.replay import load
 from learner.run.config import configure
 from learner.run.evaluation import evaluation_jobs
+from learner.tools.replay.loaded import load
 
 OBJECTS: Final = ("bar", "thin-bar", "thick-bar", "cylinder", "bolt")
 UNSEEN: Final = ("hexagon", "stepped-bar", "club")

@@ -41,11 +41,11 @@ from farm.arrays import FloatArray
 from farm.moments import merged, normaliser_of
 from farm.net.work import Jobs
 from farm.runner import Runner
-from learner.again.replay import loaded
 from learner.run.evaluation import evaluation_jobs
 from learner.run.folder import RunFolder
 from learner.run.setup import problem
-from learner.sweep.race import entry_of
+from learner.tools.replay.loaded import loaded
+from learner.tools.sweep.race import entry_of
 
 HERE: Final = Path(__file__).parent
 SUITE: Final = HERE / "suite.py"

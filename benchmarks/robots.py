@@ -18,8 +18,8 @@ from typing import Any, Final
 import numpy as np
 from running import script
 
-from learner.again.replay import load
 from learner.run.evaluation import evaluation_jobs
+from learner.tools.replay.loaded import load
 
 ROBOTS: Final = {
     "go1": "go1.py:Walk --generations 60",

@@ -9,12 +9,12 @@ from typing import Any
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
 from farm.net.session import free_endpoint
-from learner.commands.sweep import Runs
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
 from learner.run.setup import fitted
-from learner.sweep.runs import Sharing, run
+from learner.tools.sweep.command import Runs
+from learner.tools.sweep.runs import Sharing, run
 
 
 def script(main: Callable[[], None]) -> None:

@@ -35,9 +35,9 @@ from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
 from farm.tasks.loop import Batch, again
 from farm.tasks.rollouts import Seed
-from learner.again.replay import loaded
 from learner.run.folder import RunFolder
 from learner.run.setup import problem
+from learner.tools.replay.loaded import loaded
 
 HERE = Path(__file__).resolve()
 STARTS: tuple[Seed, ...] = tuple((2, 0, 9, i) for i in range(200))

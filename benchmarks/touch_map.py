@@ -25,11 +25,11 @@ from touch import EXACT, STARTS
 from touch_controllers import Cell, Kalman, Touch, Zeroed, by_hand, open_loop
 
 import farm
-from learner.again.replay import loaded
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 from learner.run.setup import problem
-from learner.sweep.runs import Sharing
+from learner.tools.replay.loaded import loaded
+from learner.tools.sweep.runs import Sharing
 
 DRIFTS: Final = (0.0, 0.002, 0.005, 0.01, 0.02)
 """Drift of the joint readings [rad per control step]."""

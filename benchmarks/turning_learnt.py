@@ -27,7 +27,7 @@ from farm.tasks import loop
 from farm.tasks.finger_gait.hand import FINGERS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD, SUBSTEPS
 from farm.tasks.rollouts import Rollouts, Seed
-from learner.again.replay import LoadedPolicy
+from learner.tools.replay.loaded import LoadedPolicy
 
 ROWS: Final = "phase,phase+forces,phase+joints,phase+joints+forces"
 LONG: Final[Mapping[str, Any]] = {"steps": 160}

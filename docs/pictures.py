@@ -25,7 +25,7 @@ from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
-from learner.again.replay import LoadedPolicy, Replay, load
+from learner.tools.replay.loaded import LoadedPolicy, Replay, load
 
 PANEL: Final = (400, 450)
 """Width and height of one hand [pixels]."""

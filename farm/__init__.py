@@ -42,9 +42,10 @@ if TYPE_CHECKING:
     from farm.tasks.touch import TouchConfig as TouchConfig
 
 _WHERE: Final = {
-    "learn": "learner.run.launch", "tune": "learner.sweep.tune", "Farm": "learner.farm", "Evaluated": "learner.farm",
+    "learn": "learner.run.launch", "tune": "learner.tools.sweep.tune",
+    "Farm": "learner.farm", "Evaluated": "learner.farm",
     "environment": "farm.environments",
-    "load": "learner.again.replay", "rewind": "learner.again.rewind",
+    "load": "learner.tools.replay.loaded", "rewind": "learner.tools.replay.rewind",
     "RunConfig": "learner.run.config", "configure": "learner.run.config",
     "Task": "farm.tasks.base", "TaskConfig": "farm.tasks.base", "TaskSpec": "farm.tasks.base",
     "ActionSpace": "farm.tasks.actions.space", "Offsets": "farm.tasks.actions.offsets",

@@ -54,6 +54,18 @@ COMMANDS: Final = {
     "certificates": "makes certificates for a farm of several machines",
 }
 """The built-in commands and their purposes."""
+
+_ELSEWHERE: Final = {
+    **{name: f"learner.commands.{name}" for name in ("run", "learner")},
+    **{name: f"farm.commands.{name}" for name in ("status", "router", "certificates")},
+    "compare": "learner.tools.view.compare",
+    "new-task": "learner.tools.tasks.new_task",
+    "play": "learner.tools.replay.play",
+    "tune": "learner.tools.sweep.tune_command",
+    "worker": "workers.command",
+}
+"""Modules of commands that have no folder of their own in learner/tools/."""
+
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     "tasks": {
         "finger-gait": "farm.tasks.finger_gait.task:FingerGait",
@@ -87,12 +99,8 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "tensorboard": "learner.loggers.tensorboard:TensorBoard",
         "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
-    "portfolios": {"general": "learner.sweep.portfolio:General"},
-    "commands": {
-        **{name: f"learner.commands.{name.replace('-', '_')}:main" for name in COMMANDS},
-        **{name: f"farm.commands.{name}:main" for name in ("status", "router", "certificates")},
-        "worker": "workers.command:main",
-    },
+    "portfolios": {"general": "learner.tools.sweep.portfolio:General"},
+    "commands": {name: f"{_ELSEWHERE.get(name, f'learner.tools.{name}.command')}:main" for name in COMMANDS},
 }
 """Kinds of plug-ins, and the built-in ones by name. Strings, because farm/ must not import learner/ or workers/."""
 

@@ -1,7 +1,12 @@
 """Which package may import which, and through which modules: docs/architecture.md as a test."""
 
 import ast
+import json
+import os
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,8 +40,8 @@ FLOORS = {
 DOORS = {
     "zenoh": ("farm/net/session.py",),
     "msgpack": ("farm/net/codec.py",),
-    "tyro": ("farm/settings.py", "farm/commands/", "learner/commands/", "workers/command.py"),
-    "mujoco": ("farm/sim/", "farm/tasks/", "learner/export/npz.py", "workers/backends/"),
+    "tyro": ("farm/settings.py", "farm/commands/", "learner/commands/", "learner/tools/", "workers/command.py"),
+    "mujoco": ("farm/sim/", "farm/tasks/", "learner/tools/export/npz.py", "workers/backends/"),
     "gymnasium": (
         "farm/tasks/gymnasium.py",
         "farm/tasks/gymnasium_engine.py",
@@ -45,13 +50,13 @@ DOORS = {
     ),
     "rerun": ("learner/recording/",),
     "rerun_cli": ("learner/recording/",),
-    "matplotlib": ("learner/sweep/figure.py",),
-    "rich": ("farm/commands/", "learner/commands/"),
+    "matplotlib": ("learner/plots.py",),
+    "rich": ("farm/commands/", "learner/commands/", "learner/tools/"),
     "cryptography": ("farm/commands/certificates.py",),
-    "onnx": ("learner/export/onnx.py",),
+    "onnx": ("learner/tools/export/onnx.py",),
     "pytest": ("farm/pytest_plugin.py",),
     "cmaes": ("learner/algorithms/cma.py",),
-    "PIL": ("farm/sim/video.py", "learner/commands/check.py"),
+    "PIL": ("farm/sim/video.py", "learner/tools/check/command.py"),
     "tensorboardX": ("learner/loggers/tensorboard.py",),
     "wandb": ("learner/loggers/wandb.py",),
     "pyarrow": ("learner/parquet.py",),
@@ -145,6 +150,49 @@ def test_no_arrow_runs_upward() -> None:
     for module, tops in TOPS.items():
         package = module.partition("/")[0]
         assert not (tops & {*PACKAGES, "assets", "benchmarks"}) - {package} - MAY_IMPORT[package], module
+
+
+def test_the_learner_imports_no_tool_and_a_tool_only_that_which_replays() -> None:
+    tools = "learner.tools."
+    for module, imports in IMPORTS.items():
+        own = module.replace("/", ".").removeprefix(tools).partition(".")[0]
+        for name in imports:
+            if name.startswith(tools):
+                assert module.startswith("learner/tools/"), f"{module} imports {name}"
+                assert name.removeprefix(tools).partition(".")[0] in (own, "replay"), f"{module} imports {name}"
+
+
+def test_a_run_learns_without_the_tools(tmp_path: Path) -> None:
+    """The same numbers from a copy of the packages in which learner/tools/ is deleted."""
+    hashes = []
+    for name in ("whole", "without"):
+        copy = tmp_path / name
+        for package in (*PACKAGES, "assets"):
+            shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
+        if name == "without":
+            shutil.rmtree(copy / "learner/tools")
+        code = f"""import sys
+import farm
+from farm.__main__ import main
+assert farm.__file__.startswith({str(copy)!r})
+sys.exit(main())"""
+        words = [
+            "run",
+            "--generations",
+            "2",
+            "--no-record",
+            "--workers",
+            "1",
+            "--name",
+            "r",
+            "--out",
+            str(copy / "runs"),
+        ]
+        environment = os.environ | {"PYTHONPATH": str(copy)}
+        command = [sys.executable, "-c", code, *words]
+        subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, timeout=120)
+        hashes.append(json.loads((copy / "runs/r/summary.json").read_text())["parameters_sha256"])
+    assert hashes[0] == hashes[1]
 
 
 @pytest.mark.parametrize("floor", FLOORS)

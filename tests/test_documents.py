@@ -76,11 +76,11 @@ def test_flags_that_pages_name_exist(page: Path) -> None:
 
 def test_the_task_in_the_readme_is_the_one_that_new_task_writes() -> None:
     [program] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
-    assert parts(program) == parts((ROOT / "learner/commands/task_template.py.txt").read_text("utf-8"))
+    assert parts(program) == parts((ROOT / "learner/tools/tasks/task_template.py.txt").read_text("utf-8"))
 
 
 def test_the_pendulum_of_the_examples_is_the_one_that_new_task_writes() -> None:
-    template, example = ROOT / "learner/commands/task_template.py.txt", ROOT / "examples/tasks/pendulum.py"
+    template, example = ROOT / "learner/tools/tasks/task_template.py.txt", ROOT / "examples/tasks/pendulum.py"
     assert example.read_text("utf-8") == template.read_text("utf-8")
 
 

@@ -14,9 +14,9 @@ from learning import learnt
 from farm.errors import ConfigError
 from farm.seeds import trial
 from farm.tasks.loop import Batch, again
-from learner.again.replay import load
 from learner.run.config import configure
 from learner.run.setup import problem
+from learner.tools.replay.loaded import load
 
 LEARN = Path(__file__).parents[1] / "examples" / "learn.py"
 

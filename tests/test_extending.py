@@ -19,7 +19,7 @@ from farm.sim.sim import Sim
 from farm.tasks import loop
 from farm.tasks.actions.space import ActionSpace
 from farm.tasks.probe import specification
-from learner.commands import new_task
+from learner.tools.tasks import new_task
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs/extending.md").read_text("utf-8")

@@ -23,10 +23,10 @@ from farm import settings
 from farm.commands import logs
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
-from learner.commands.sweep import Runs, check_sharing
-from learner.sweep import runs as sweep
-from learner.sweep.figure import INSTALL, available
-from learner.sweep.runs import Sharing
+from learner.plots import INSTALL, available
+from learner.tools.sweep import runs as sweep
+from learner.tools.sweep.command import Runs, check_sharing
+from learner.tools.sweep.runs import Sharing
 
 ALL: Final = "thesis"
 """The name for all experiments."""

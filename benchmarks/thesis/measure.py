@@ -25,11 +25,11 @@ from farm.tasks.finger_gait.holding import SUCCESS_STEPS
 from farm.tasks.finger_gait.sensing import Perturbation
 from farm.tasks.finger_gait.task import FingerGait
 from farm.tasks.rollouts import Seed
-from learner.again.chain import chain
-from learner.again.replay import LoadedPolicy, loaded
-from learner.again.replay import load as load_policy
 from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED
 from learner.run.folder import RunFolder
+from learner.tools.chain.chain import chain
+from learner.tools.replay.loaded import LoadedPolicy, loaded
+from learner.tools.replay.loaded import load as load_policy
 
 _POINTS: Final = 40
 """Number of states; the kernel is compared for all pairs of them."""

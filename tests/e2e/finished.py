@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from processes import Farm
 
-from learner.again.replay import LoadedPolicy, Replay, load
 from learner.run.folder import RunFolder
+from learner.tools.replay.loaded import LoadedPolicy, Replay, load
 
 GENERATIONS = 6
 """Of the run `a`."""

@@ -22,8 +22,8 @@ from farm.net import codec, keys, session
 from farm.net.session import Session, free_endpoint
 from farm.net.tls import Bundle, Roster, find
 from farm.net.work import RoundHeader
-from learner.again.replay import load
-from learner.again.rewind import rewind
+from learner.tools.replay.loaded import load
+from learner.tools.replay.rewind import rewind
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 

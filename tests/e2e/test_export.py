@@ -11,7 +11,7 @@ import pytest
 from finished import Say, stored
 from processes import Farm
 
-from learner.export import npz as export
+from learner.tools.export import npz as export
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 PLAY_POLICY = Path(__file__).parents[2] / "examples" / "play_policy.py"

@@ -17,8 +17,8 @@ from processes import Farm
 from farm.policies.recurrent import Rnn, RnnConfig
 from farm.sim.engines import DataEngine
 from farm.sim.sim import Sim
-from learner.again.replay import LoadedPolicy
-from learner.commands.play import rollout
+from learner.tools.replay.loaded import LoadedPolicy
+from learner.tools.replay.play import rollout
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

@@ -17,9 +17,9 @@ from rerun.chunk import RrdReader
 from farm.errors import ConfigError
 from farm.net import codec, keys, session
 from farm.net.telemetry import RunHistory
-from learner.commands.record import RecordCommand, record
 from learner.run.folder import RunFolder
 from learner.run.launch import free_endpoint
+from learner.tools.record.command import RecordCommand, record
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from recordings import read, texts
 from farm.__main__ import main
 from farm.errors import ConfigError
 from farm.tasks.finger_gait import model
-from learner.again.replay import load
+from learner.tools.replay.loaded import load
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

@@ -13,10 +13,10 @@ from processes import SMALL, Farm, children
 
 from farm.net.session import free_endpoint
 from farm.sim.scene import MODEL
-from learner.again.rewind import rewind
 from learner.run.config import configure
 from learner.run.launch import Placement, learn, open_run
 from learner.scheduler.scheduler import SchedulerConfig
+from learner.tools.replay.rewind import rewind
 
 pytestmark = pytest.mark.slow
 

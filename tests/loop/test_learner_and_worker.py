@@ -14,13 +14,13 @@ from learning import learnt, workers
 
 from farm.errors import ConfigError
 from farm.net.session import free_endpoint, listen
-from learner.again.replay import load
-from learner.again.rewind import rewind
-from learner.commands.evaluate import evaluate
 from learner.run import checkpoint as checkpoints
 from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, learn, open_run
+from learner.tools.evaluate.command import evaluate
+from learner.tools.replay.loaded import load
+from learner.tools.replay.rewind import rewind
 
 TASK = '''
 import numpy as np

@@ -12,13 +12,13 @@ from robot import robot, stl
 from farm.errors import CheckpointError, UnservedError
 from farm.net.session import connect, free_endpoint, listen
 from farm.sim.model_files import digest
-from learner.again.replay import load
-from learner.again.rewind import rewind
 from learner.farm import Farm
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
 from learner.telemetry.subscriber import Subscriber
+from learner.tools.replay.loaded import load
+from learner.tools.replay.rewind import rewind
 from workers import source_cache
 from workers.source_cache import SourceCache
 

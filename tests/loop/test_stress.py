@@ -8,11 +8,11 @@ import pytest
 from learning import learnt
 
 from farm.__main__ import main
-from learner.again.replay import loaded
-from learner.again.stress import ALL, sensible, stressed
-from learner.commands.evaluate import evaluate
 from learner.run.config import configure
 from learner.run.folder import RunFolder
+from learner.tools.evaluate.command import evaluate
+from learner.tools.replay.loaded import loaded
+from learner.tools.stress.stress import ALL, sensible, stressed
 
 TASK = '''
 import numpy as np

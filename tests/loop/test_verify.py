@@ -12,8 +12,8 @@ from made import pole
 import farm
 from farm.__main__ import main
 from farm.net.session import free_endpoint
-from learner.commands import verify as command
 from learner.run.launch import Placement, open_run
+from learner.tools.verify import command
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from benchmarks.thesis.folder import ExperimentFolder, find
 from farm.errors import ConfigError
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
-from learner.sweep.runs import todo
+from learner.tools.sweep.runs import todo
 
 
 def folder_with(path: Path, generations: int, state: str = "finished") -> RunFolder:

@@ -13,7 +13,7 @@ import pytest
 
 from farm import archives
 from farm.errors import ConfigError
-from learner.commands.export import listed
+from learner.tools.export.command import listed
 
 SOUND = {
     "task": "gait", "policy": "linear", "generation": 3, "control_period": 0.1, "mu": np.arange(2000.0),

@@ -12,7 +12,7 @@ from farm.commands import screen
 
 @pytest.mark.parametrize("command", ["check", "replay", "chain"])
 def test_a_command_that_draws_does_not_import_mujoco_before_it_has_chosen(command: str) -> None:
-    code = f"import sys, learner.commands.{command}; sys.exit('mujoco' in sys.modules)"
+    code = f"import sys, learner.tools.{command}.command; sys.exit('mujoco' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -11,10 +11,10 @@ from alone import POLE, learnt
 from farm import plugins, seeds
 from farm.errors import ConfigError
 from farm.runner import served
-from learner.again.replay import load
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.config import configure
+from learner.tools.replay.loaded import load
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

@@ -9,11 +9,11 @@ from alone import learnt, state
 
 import farm
 from farm.errors import ConfigError
-from learner.again.replay import load
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.config import configure
 from learner.run.folder import RunFolder
+from learner.tools.replay.loaded import load
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

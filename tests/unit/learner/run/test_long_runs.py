@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from made import stats
 
-from learner.commands.runs import _row
 from learner.run import files
 from learner.run.config import RunConfig
 from learner.run.files import ProgressFile, with_rates
 from learner.run.folder import RunFolder
+from learner.tools.runs.command import _row
 
 GENERATIONS = 20_000
 

@@ -12,12 +12,12 @@ from farm.errors import CheckpointError, ConfigError
 from farm.moments import normaliser_of
 from farm.net.work import Jobs
 from farm.policies.normalised import Normalised
-from learner.again.replay import load
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.learner import REPLAY_EVERY, Learner
+from learner.tools.replay.loaded import load
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

@@ -9,9 +9,9 @@ import pytest
 from alone import POLE, learnt, new_run, state, taken_up
 
 from farm.errors import CheckpointError, RunError
-from learner.again.replay import load
 from learner.run import checkpoint as checkpoints
 from learner.run.config import configure
+from learner.tools.replay.loaded import load
 
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 

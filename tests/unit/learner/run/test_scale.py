@@ -7,12 +7,12 @@ import pytest
 from alone import POLE, Alone
 
 from farm.errors import ConfigError
-from learner.again.replay import load
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.learner import Learner
+from learner.tools.replay.loaded import load
 
 POLICY = """
 import numpy as np

@@ -17,8 +17,6 @@ from farm.net.work import Jobs
 from farm.policies.base import PolicyConfig
 from farm.policies.networks import Constant
 from farm.runner import Runner
-from learner.again.stored import stored
-from learner.again.verify import verify_some, workers
 from learner.commands import learner as command
 from learner.commands.of_run import OfRun
 from learner.run import checkpoint as checkpoints
@@ -27,6 +25,8 @@ from learner.run.evaluation import score
 from learner.run.folder import RunFolder
 from learner.run.hash_chain import state_of
 from learner.run.worth import without_learning
+from learner.tools.verify.stored import stored
+from learner.tools.verify.verify import verify_some, workers
 
 SETTINGS: dict[str, Any] = {"validate": True, "pairs": 80, "policy": "linear", "normalise": True, "initial_sigma": 1.0}
 """With 160 exploring rollouts every second generation validates."""

@@ -13,9 +13,9 @@ from farm.tasks.finger_gait import model
 from farm.tasks.finger_gait.env import FingerGaitEnv
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
 from farm.tasks.probe import tried
-from learner.again.replay import load
 from learner.run.config import configure
 from learner.run.evaluation import evaluation_jobs
+from learner.tools.replay.loaded import load
 
 OBJECTS = ("bar", "bolt")
 """The second has more geometries."""

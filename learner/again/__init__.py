@@ -1,1 +1,0 @@
-"""Learnt policies act again: replays, rewound exploration, chains."""

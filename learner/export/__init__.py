@@ -1,1 +1,0 @@
-"""Learnt policies for use elsewhere."""

@@ -1,0 +1,1 @@
+"""What is done with a run, beside learning it: one folder for each tool. The learner imports none of them."""

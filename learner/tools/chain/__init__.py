@@ -1,0 +1,1 @@
+"""Learnt policies one after another."""

@@ -1,0 +1,1 @@
+"""Episodes of a learnt policy as a data set."""

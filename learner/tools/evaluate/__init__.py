@@ -1,0 +1,1 @@
+"""A learnt policy on perturbed starts."""

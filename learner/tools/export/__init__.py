@@ -1,0 +1,1 @@
+"""A learnt policy in a file of its own."""

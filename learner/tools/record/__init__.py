@@ -1,0 +1,1 @@
+"""A run's recording, over the network."""

@@ -1,0 +1,1 @@
+"""A learnt policy under other conditions than those it has learnt with."""

@@ -1,0 +1,1 @@
+"""Many runs on one set of workers: sweeps, and races of settings."""

@@ -1,0 +1,1 @@
+"""What can be learnt and with what; a task to start from."""

@@ -1,0 +1,1 @@
+"""A run repeated, and compared to the last bit."""
