@@ -10,11 +10,14 @@ where r_0 is the mean return of mu, and r that of the perturbed policies: explor
 it tells about directions. And if mu mostly lasts, hardly more rollouts may end early or fail than with it: a robot that
 stands must not learn from its falls. The directions e_k are the same for each sigma.
 
+Where the configured sigma already returns more than mu, there is nothing to lose, as with a reward that only some see:
+then three times as much is tried too, and taken if it returns more again and its signal is a quarter larger.
+
 It is simulated by this process, so that its result depends on no worker: a run has it before it exists.
 """
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -44,6 +47,7 @@ _SIGMAS: Final = 6  # that are tried at most
 _COST: Final = 6.0  # signals that exploring may cost
 _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond those of the mean
 _LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
+_CLEARLY: Final = 1.25
 _MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts
 _NORMALISING: Final = 2  # rounds in which the normaliser settles to what exploring at a sigma observes
 
@@ -65,6 +69,12 @@ class Tried:
         if self.returned is None or (mean.lost < _LASTS and self.lost > mean.lost + _LOST):
             return False
         return mean.returned is None or mean.returned - self.returned <= _COST * self.signal
+
+    def gains(self, before: "Tried") -> bool:
+        """Whether exploring so far returns more, and tells clearly more, than something before."""
+        if self.returned is None or before.returned is None:
+            return False
+        return self.returned > before.returned and self.signal > _CLEARLY * before.signal
 
     @property
     def line(self) -> str:
@@ -90,13 +100,19 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
     if origin is not None and not origin.scale_begins_anew:
         return config
     log.info("a pilot measures how far to explore (--no-pilot: begin at once)")
-    sigma = 0.0
+    found = []
     for each in tried(config):
         if stopped():
             raise Interrupted("the pilot was stopped; nothing has begun")
         log.info("  %s", each.line)
-        sigma = each.sigma
-    return replace(config, pilot_sigma=sigma)
+        found.append(each)
+    return replace(config, pilot_sigma=choice(found))
+
+
+def choice(found: Sequence[Tried]) -> float:
+    """The sigma that is taken of those that `tried` gives: the last one, unless it is larger and gains nothing."""
+    first, last = found[1], found[-1]
+    return first.sigma if last.sigma > first.sigma and not last.gains(first) else last.sigma
 
 
 def begun(config: RunConfig, folder: RunFolder) -> RunConfig:
@@ -107,7 +123,10 @@ def begun(config: RunConfig, folder: RunFolder) -> RunConfig:
 
 
 def tried(config: RunConfig) -> Iterator[Tried]:
-    """What the mean gives, and exploring at each sigma: the last one fits, or is the smallest."""
+    """What the mean gives, and exploring at each sigma: the last one fits, or is the smallest.
+
+    If the first fits and gains, the only other is a larger one.
+    """
     search, state, moments = beginning(config)
     algorithm: Any = config.algorithm_config
     mu = state.mu
@@ -123,6 +142,8 @@ def tried(config: RunConfig) -> Iterator[Tried]:
             each = _explored(runner, mu, sigma, directions, moments, config)
             yield each
             if each.fits(base):
+                if not step and each.gains(base):
+                    yield _explored(runner, mu, sigma / _STEP, directions, moments, config)
                 return
     finally:
         runner.close()

@@ -17,7 +17,7 @@ from learner.commands import options
 from learner.commands.run import RunCommand
 from learner.run import config as configs
 from learner.run.config import RunConfig, configure
-from learner.run.pilot import Tried, piloted, tried
+from learner.run.pilot import Tried, choice, piloted, tried
 from learner.run.setup import problem
 
 TASK = '''
@@ -101,6 +101,34 @@ def test_what_fits() -> None:
     assert replace(each, lost=1.0).fits(replace(base, lost=0.5)), "unless it falls anyway"
     assert not replace(each, returned=None).fits(base)
     assert each.fits(replace(base, returned=None))
+
+
+def test_it_explores_further_where_there_is_nothing_to_lose() -> None:
+    base = Tried(sigma=0.0, returned=1.0, lost=0.0)
+    usual = Tried(sigma=0.1, returned=2.0, lost=0.0, signal=1.0)
+    far = Tried(sigma=0.3, returned=3.0, lost=0.0, signal=1.3)
+    assert usual.gains(base)
+    assert choice([base, usual, far]) == 0.3
+    assert choice([base, usual, replace(far, returned=1.9)]) == 0.1, "it returns less"
+    assert choice([base, usual, replace(far, signal=1.2)]) == 0.1, "it tells hardly more"
+    assert choice([base, usual, replace(far, returned=None)]) == 0.1
+    assert choice([base, usual]) == 0.1
+    assert choice([base, usual, replace(far, sigma=0.03), replace(far, sigma=0.01)]) == 0.01
+
+
+SPARSE = TASK.replace("MOST", "1e9").replace(
+    'return -np.abs(sim.qpos[:, 0] - sim.own["goal"]) - 5.0 * sim.own["lost"]',
+    "return (sim.qpos[:, 0] > 0.02).astype(float)",
+)
+
+
+def test_a_reward_that_the_first_policy_does_not_see_is_looked_for_further(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.py"
+    path.write_text(SPARSE)
+    config = configure(f"{path}:Reach")
+    found = list(tried(config))
+    assert [each.sigma for each in found] == pytest.approx([0.0, 0.1, 0.1 * 10**0.5])
+    assert piloted(config).pilot_sigma == found[-1].sigma
 
 
 def test_its_lines() -> None:
