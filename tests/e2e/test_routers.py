@@ -8,6 +8,9 @@ import pytest
 from processes import SMALL, Farm
 
 from farm.commands import certificates
+from farm.net import keys
+from farm.net.session import connect
+from farm.net.tls import find
 from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
@@ -19,6 +22,10 @@ def learns(farm: Farm, reference: dict[str, Any]) -> Callable[..., None]:
 
     def run(learner: list[str], worker: list[str]) -> None:
         farm.start("worker", "--processes", "2", *worker)
+        certificate = find(Path(learner[-1]), "learner") if "--tls" in learner else None
+        with connect((worker[1],), 60.0, lambda: False, certificate) as session:
+            while len(session.tokens(keys.worker_token("farm", "**"), 1.0)) < 2:  # ten generations are over soon
+                pass
         farm.call("learner", "--name", "r", "--generations", "10", *SMALL, *learner)
         summary = farm.summary("r")
         assert summary["workers"] == 2
