@@ -10,8 +10,9 @@ where r_0 is the mean return of mu, and r that of the perturbed policies: explor
 it tells about directions. And if mu mostly lasts, hardly more rollouts may end early or fail than with it: a robot that
 stands must not learn from its falls. The directions e_k are the same for each sigma.
 
-Where the configured sigma already returns more than mu, there is nothing to lose, as with a reward that only some see:
-then three times as much is tried too, and taken if it returns more again and its signal is a quarter larger.
+If the configured sigma costs little, three times as much is tried too, and taken if the perturbed policies return more
+with it and its signal is larger by a tenth: with a reward that the first policies hardly see, only those that go far
+find it.
 
 It is simulated by this process, so that its result depends on no worker: a run has it before it exists.
 """
@@ -47,7 +48,7 @@ _SIGMAS: Final = 6  # that are tried at most
 _COST: Final = 6.0  # signals that exploring may cost
 _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond those of the mean
 _LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
-_CLEARLY: Final = 1.25
+_CLEARLY: Final = 1.1
 _MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts
 _NORMALISING: Final = 2  # rounds in which the normaliser settles to what exploring at a sigma observes
 
@@ -125,7 +126,7 @@ def begun(config: RunConfig, folder: RunFolder) -> RunConfig:
 def tried(config: RunConfig) -> Iterator[Tried]:
     """What the mean gives, and exploring at each sigma: the last one fits, or is the smallest.
 
-    If the first fits and gains, the only other is a larger one.
+    If the first fits, the only other is a larger one.
     """
     search, state, moments = beginning(config)
     algorithm: Any = config.algorithm_config
@@ -142,7 +143,7 @@ def tried(config: RunConfig) -> Iterator[Tried]:
             each = _explored(runner, mu, sigma, directions, moments, config)
             yield each
             if each.fits(base):
-                if not step and each.gains(base):
+                if not step:
                     yield _explored(runner, mu, sigma / _STEP, directions, moments, config)
                 return
     finally:

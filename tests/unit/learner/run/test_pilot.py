@@ -69,7 +69,7 @@ def test_it_explores_little_where_much_is_fatal(tmp_path: Path) -> None:
     careful = tmp_path / "careful"
     careful.mkdir()
     assert sigma_of(reach(careful, 0.05)) < 0.4 * wide
-    assert wide == 0.1
+    assert wide == pytest.approx(0.1 * 10**0.5)
 
 
 def test_it_is_the_same_each_time_and_ends_where_exploring_is_cheap(tmp_path: Path) -> None:
@@ -103,14 +103,13 @@ def test_what_fits() -> None:
     assert each.fits(replace(base, returned=None))
 
 
-def test_it_explores_further_where_there_is_nothing_to_lose() -> None:
+def test_it_explores_further_where_that_returns_and_tells_more() -> None:
     base = Tried(sigma=0.0, returned=1.0, lost=0.0)
     usual = Tried(sigma=0.1, returned=2.0, lost=0.0, signal=1.0)
     far = Tried(sigma=0.3, returned=3.0, lost=0.0, signal=1.3)
-    assert usual.gains(base)
     assert choice([base, usual, far]) == 0.3
     assert choice([base, usual, replace(far, returned=1.9)]) == 0.1, "it returns less"
-    assert choice([base, usual, replace(far, signal=1.2)]) == 0.1, "it tells hardly more"
+    assert choice([base, usual, replace(far, signal=1.05)]) == 0.1, "it tells hardly more"
     assert choice([base, usual, replace(far, returned=None)]) == 0.1
     assert choice([base, usual]) == 0.1
     assert choice([base, usual, replace(far, sigma=0.03), replace(far, sigma=0.01)]) == 0.01
