@@ -57,6 +57,11 @@ TESTED: Final = {
     "Acrobot": f"{SUITE}:Acrobot",
     "Reach": f"{SUITE}:Reach",
 }
+HELD: Final = {
+    **{name: f"{SUITE}:{name}" for name in ("Point", "Upright", "Fish", "Hop")},
+    **{name: f"gym:{name}" for name in ("Swimmer-v5", "InvertedDoublePendulum-v5", "Pusher-v5")},
+}
+"""On which no setting was chosen, and no rule of the pilot."""
 TRAINED: Final = {"Swingup": f"{SUITE}:Swingup", "Cheetah": f"{SUITE}:Cheetah"}
 STARTS: Final = 100
 SEED: Final = 1  # of the starts of the score; `farm tune` and `farm run` use another for theirs
@@ -258,7 +263,7 @@ def main() -> None:
             for method in arguments.methods.split(",")
         ]
         with ProcessPoolExecutor(arguments.processes) as pool:
-            tasks = TESTED | TRAINED
+            tasks = TESTED | TRAINED | HELD
             waiting = {
                 pool.submit(METHODS[method], tasks.get(task, task), seed, rollouts): (task, method, seed, rollouts)
                 for task, method, seed, rollouts in cells

@@ -167,3 +167,76 @@ class Reach(Suite):
 
     def reward(self, sim, action):
         return exp(-((self._apart(sim) / 0.05) ** 2).sum(axis=1))
+
+
+class Point(Suite):
+    """A mass in the plane goes to the middle, wherever it begins."""
+
+    name = "point_mass"
+    steps, substeps = 100, 1
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row] = [0.2, -0.1] if rng is None else rng.uniform(-0.25, 0.25, 2)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos, sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return exp(-((sim.qpos / 0.05) ** 2).sum(axis=1))
+
+
+class Upright(Suite):
+    """A pendulum whose motor cannot lift it at once stands upright."""
+
+    name = "pendulum"
+    steps, substeps = 250, 1
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row] = np.pi if rng is None else np.pi + rng.uniform(-1.0, 1.0)
+
+    def observe(self, sim):
+        return np.concatenate([sin(sim.qpos), cos(sim.qpos), 0.2 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.5 * (1.0 + cos(sim.qpos[:, 0]))
+
+
+class Fish(Suite):
+    """A fish in water turns its back up."""
+
+    name = "fish"
+    steps, substeps = 150, 10
+
+    def reset(self, sim, row, rng):
+        turn = np.array([0.0, 1.0, 0.0, 0.0]) if rng is None else rng.standard_normal(4)
+        sim.qpos[row, 3:7] = turn / np.sqrt((turn**2).sum())
+
+    def _up(self, sim):
+        return sim.body("torso").xmat.reshape(len(sim), 9)[:, 6:]
+
+    def observe(self, sim):
+        return np.concatenate([self._up(sim), sim.qpos[:, 7:], sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.5 * (1.0 + self._up(sim)[:, 2])
+
+
+class Hop(Suite):
+    """A planar hopper with a foot hops forward."""
+
+    name = "hopper"
+    steps, substeps = 200, 4
+    ending = "fell"
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 3:] += rng.uniform(-0.1, 0.1, 4)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, 1:], sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.2 + 0.8 * np.clip(sim.qvel[:, 0] / 2.0, -0.25, 1.0)
+
+    def ended(self, sim):
+        return (sim.body("torso").xpos[:, 2] < 0.5) | (abs(sim.qpos[:, 2]) > 1.2)
