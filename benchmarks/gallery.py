@@ -50,6 +50,8 @@ class Piece:
     """What else is to be installed."""
     folder: str = "tasks"
     """Of examples/."""
+    start: int | None = None
+    """Of the film, as `farm evaluate` counts perturbed starts; None: the nominal one."""
 
     @property
     def name(self) -> str:
@@ -68,7 +70,9 @@ PIECES: Final = (
     Piece(
         "go1.py:Walk", "A Unitree Go1 trots at a commanded speed.", "--generations 60", needs=_ROBOT, folder="robots"
     ),
-    Piece("crazyflie.py:Hover", "A Crazyflie recovers from a tumble, and hovers.", needs=_ROBOT, folder="robots"),
+    Piece(
+        "crazyflie.py:Hover", "A Crazyflie recovers from a tumble, and hovers.", needs=_ROBOT, folder="robots", start=3
+    ),
     Piece("ur5e.py:Push", "A UR5e pushes a puck to its goal.", needs=_ROBOT, folder="robots"),
     Piece("pendulum.py:Pendulum", "A motor that is too weak to lift a pendulum swings it up.", "--generations 150"),
     Piece("cart.py:Cart", "A cart balances a pole of random mass."),
@@ -107,7 +111,7 @@ def main() -> None:
         if piece.name in arguments.only.split(","):
             run = arguments.runs / f"{piece.name}-s{arguments.seed}"
             rows[piece.task] = measured(piece, run, arguments.seed)
-            film(run, films / f"{piece.name}.gif", load(run))
+            film(run, films / f"{piece.name}.gif", load(run), piece.start)
             file.write_text("".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows))
     (arguments.docs / "gallery.md").write_text(page(rows), "utf-8")
 
@@ -124,11 +128,12 @@ def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
     return row | {name: round(score, 3) for name, score in scores.items()}
 
 
-def film(run: Path, path: Path, policy: LoadedPolicy) -> None:
-    """The last policy's rollout from the nominal start, in a small file."""
+def film(run: Path, path: Path, policy: LoadedPolicy, start: int | None = None) -> None:
+    """The run's policy from the nominal start, or a perturbed one, in a small file."""
     task = policy.problem.task
     speed = task.steps * task.period / SECONDS
-    _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"))
+    which = [] if start is None else ["--seed", str(start)]
+    _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"), *which)
     frames: list[Image.Image] = []
     durations: list[int] = []  # for how long [ms]; equal frames are one
     with Image.open(path) as large:

