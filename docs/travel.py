@@ -120,7 +120,7 @@ def play(stage: Stage) -> list[Line]:
                 caption=f"farm worker --connect tls/laptop:7447 --tls worker-{name} --processes 1 --accept-code",
             )
         for name in ("left", "right"):
-            stage.until(name, "joined farm")
+            stage.until(name, "joined as")
         source = stage.folder / "pole.py"
         for run, (old, new) in (("first", ("", "")), ("second", REWARD)):
             text = source.read_text().replace(old, new, 1) if old else source.read_text()

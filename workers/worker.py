@@ -47,7 +47,8 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
         worker = Worker(config, session)
         try:
             worker.join()
-            log.info("joined farm %s as %s", config.farm, worker.id)
+            named = "" if config.farm == WorkerConfig.farm else f" farm {config.farm}"
+            log.info("joined%s as %s", named, worker.id)
             if config.accept_code:
                 log.warning("--accept-code: learners of farm %s run their code here, as this user", config.farm)
             while not stopped():

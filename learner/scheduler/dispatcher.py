@@ -359,7 +359,7 @@ class Dispatcher:
             where = f"than {others} for job {job} of round {self._header.round}"
             self._expel(host, f"host {host} gave different numbers {where}")
         self.notices.ignored.update(verdict for verdict in verdicts if verdict not in ("new", "tried"))
-        if "unasked" in verdicts:
+        if "unasked" in verdicts and message.worker in self.workers:  # not of one that was lost meanwhile
             self.notices.once(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
         self._members.did(message.worker, len(message.returns), now)
         for kind, count in message.warned.items():

@@ -56,7 +56,7 @@ def hire(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> Any:
     words = ("worker", "--connect", endpoint, "--tls", str(certs / "own"), "--name", name, "--processes", "1", *flags)
     worker = farm.start(*words)
     warned = "--accept-code: learners of farm farm run their code here, as this user"
-    assert any((warned if "--accept-code" in flags else "joined farm") in line for line in worker.stdout)
+    assert any((warned if "--accept-code" in flags else "joined as") in line for line in worker.stdout)
     return worker
 
 
@@ -156,7 +156,7 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
             for name, host in zip(("left", "right"), network.hosts[1:], strict=True)
         ]
         for worker in workers:
-            assert any("joined farm" in line for line in worker.stdout or ())
+            assert any("joined as" in line for line in worker.stdout or ())
         for name, text in (("first", made.POLE), ("second", made.POLE.replace("np.cos", "-np.cos"))):
             task.write_text(text)
             words = ("--task", "pole.py:Pole", "--name", name, "--generations", "20", "--pairs", "20", "--no-record")

@@ -94,11 +94,11 @@ def test_tasks_of_the_job_script_join_leave_and_are_replaced(
         path = farm.folder / f"farm-workers-{job}-{task}.log"
         return path.read_text() if path.exists() else ""
 
-    farm.wait_for(lambda: log(0).count("joined farm") == 2)
+    farm.wait_for(lambda: log(0).count("joined as") == 2)
     assert not log(1), "the node's cores are used"
     slurm("scancel", f"{job}_0")
     farm.wait_for(lambda: "SIGTERM: leaving" in log(0))
-    farm.wait_for(lambda: log(1).count("joined farm") == 2)
+    farm.wait_for(lambda: log(1).count("joined as") == 2)
     farm.call(
         "learner", "--connect", endpoint, "--tls", str(certs / "learner"), "--name", "r", *SMALL, "--generations", "5"
     )
