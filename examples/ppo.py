@@ -10,17 +10,10 @@ import argparse
 import json
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import farm
-
-try:
-    import torch
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import VecNormalize
-except ImportError:
-    sys.exit("this example needs stable-baselines3: pip install stable-baselines3")
 
 STARTS = 100
 PENDULUM = Path(__file__).parent / "tasks" / "pendulum.py"
@@ -28,6 +21,12 @@ PENDULUM = Path(__file__).parent / "tasks" / "pendulum.py"
 
 def learnt(task: str, steps: int) -> float:
     """The mean return of PPO's policy after control steps: the sum of rewards from each start."""
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    torch.set_num_threads(1)  # small networks are slower with more
     envs = VecNormalize(make_vec_env(lambda: farm.environment(task), n_envs=8, seed=0))
     model = PPO("MlpPolicy", envs, n_steps=256, batch_size=256, seed=0, device="cpu")
     model.learn(steps)
@@ -50,7 +49,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--out", type=Path, default=Path("runs/beside-ppo"))
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # small networks are slower with more
+    if find_spec("stable_baselines3") is None:
+        sys.exit("this example needs stable-baselines3: pip install stable-baselines3")
 
     began = time.monotonic()
     config = farm.configure(arguments.task, generations=10_000, stop_after_steps=arguments.steps)

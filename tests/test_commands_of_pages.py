@@ -32,13 +32,16 @@ STANDS_FOR = {
     "FILE.py:CLASS": "pendulum.py:Pendulum", "--allow-file FILE": "--allow-file pendulum.py", "RUN FILE": "RUN p.npz",
     "gym:NAME": "gym:Swimmer-v5", "worker-NAME": "worker-lab-1", "--object NAME": "--object bar",
     "TABLE ENVIRONMENT": "ars Hopper-v5", "thesis NAME": "thesis fig-4.1", "tasks NAME": "tasks finger-gait",
+    "walker.py:Flat": "pendulum.py:Pendulum", "walker.py:Hills": "pendulum.py:Pendulum",
+    "walker.py:Stairs": "pendulum.py:Pendulum", "--task TASK": "--task finger-gait",
     "check TASK": "check finger-gait", "tune TASK": "tune finger-gait", "COMMAND": "run", "RUN": "runs/first",
     "seed S ...": "seed 1", "...": "", "[": "", "]": "",
 }  # fmt: skip
 """What a page leaves to its reader, in this order; one letter is a number."""
 RUN = "runs/first"
 ARGUMENTS = {
-    "evaluate": [RUN], "replay": [RUN], "play": [RUN], "chain": [RUN], "export": [RUN, "p.npz"], "compare": [RUN, RUN],
+    "evaluate": [RUN], "stress": [RUN],
+    "replay": [RUN], "play": [RUN], "chain": [RUN], "export": [RUN, "p.npz"], "compare": [RUN, RUN],
     "check": ["finger-gait"], "new-task": ["mine"], "certificates": ["new", "certs"],
 }  # fmt: skip
 VALUES = {
@@ -107,7 +110,8 @@ def reader(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         read_by_script(parser)
         raise Accepted
 
-    shutil.copytree(ROOT / "examples/tasks", folder / "examples/tasks", dirs_exist_ok=True)
+    for kind in ("tasks", "robots"):
+        shutil.copytree(ROOT / "examples" / kind, folder / "examples" / kind, dirs_exist_ok=True)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(settings, "parse", read)
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", read_all)

