@@ -30,14 +30,16 @@ def learnt(task: str, steps: int) -> float:
     envs = VecNormalize(make_vec_env(lambda: farm.environment(task), n_envs=8, seed=0))
     model = PPO("MlpPolicy", envs, n_steps=256, batch_size=256, seed=0, device="cpu")
     model.learn(steps)
-    env, total = farm.environment(task), 0.0
+    env = farm.environment(task)
+    total = 0.0
     for seed in range(STARTS):
         x, _ = env.reset(seed=seed)
         over = False
         while not over:
             action, _ = model.predict(envs.normalize_obs(x), deterministic=True)
             x, reward, terminated, truncated, _ = env.step(action)
-            total, over = total + reward, terminated or truncated
+            total = total + reward
+            over = terminated or truncated
     return total / STARTS
 
 

@@ -104,7 +104,8 @@ def unpacked(bundle: bytes) -> tuple[bytes, dict[str, bytes]]:
         raise ValueError("no bundle of files")
     files = {}
     for name, size in table:
-        files[name], content = content[:size], content[size:]
+        files[name] = content[:size]
+        content = content[size:]
     return files.pop(""), files
 
 

@@ -211,6 +211,6 @@ def test_the_gallery_shows_the_recorded_scores(tmp_path: Path) -> None:
     assert page.count("](pictures/gallery/") == 12
     assert sum(film.stat().st_size for film in (docs / "pictures/gallery").iterdir()) < 6e6
     sizes = [each.stat().st_size for part in ("pictures", "results") for each in (docs / part).rglob("*.*")]
-    assert sum(sizes) < 9e6
+    assert sum(sizes) < 8e6
     for row in map(json.loads, (docs / table).read_text().splitlines()):
         assert row["learnt"] > max(row["constant"], row["still"]), row["task"]

@@ -80,7 +80,8 @@ def test_the_task_in_the_readme_is_the_one_that_new_task_writes() -> None:
 
 
 def test_the_pendulum_of_the_examples_is_the_one_that_new_task_writes() -> None:
-    template, example = ROOT / "learner/tools/tasks/task_template.py.txt", ROOT / "examples/tasks/pendulum.py"
+    template = ROOT / "learner/tools/tasks/task_template.py.txt"
+    example = ROOT / "examples/tasks/pendulum.py"
     assert example.read_text("utf-8") == template.read_text("utf-8")
 
 

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 
 from benchmarks.thesis.claims import features_for
 from benchmarks.thesis.experiment import Chain, Curves, Data, Experiment, Friction, KernelError, Panel, Transfer
-from benchmarks.thesis.series import known_mean
+from benchmarks.thesis.series import Series, known_mean
 from farm.arrays import FloatArray
 from learner.run.config import RunConfig
 from learner.run.config import flat as settings
@@ -43,6 +43,9 @@ _PANELS: Final[dict[Panel, tuple[str, str]]] = {
 
 _RETURNS: Final = ("return", "mean policy")
 
+_OVERFLOWED: Final = -1e9
+"""A mean return below which one of at most 1000 returns overflowed; those were recorded as -1e12."""
+
 _FALLEN: Final = -1000.0  # a mean return below which other values are invisible on a linear axis
 
 
@@ -60,8 +63,16 @@ def draw(experiment: Experiment, data: Data, folder: Path) -> tuple[Path, Path]:
 
 
 def shortened(svg: str) -> str:
-    """An SVG's coordinates [pt] without the digits that nobody sees, a third of the file; its texts stay."""
-    return re.sub(r"<[^>]*>", lambda tag: re.sub(r"[1-9]\d*\.\d{3,}", lambda of: f"{float(of[0]):.2f}", tag[0]), svg)
+    """An SVG's coordinates [pt] without the digits that nobody sees, and no indentation: half of the file.
+
+    Its texts stay.
+    """
+    lines = re.sub(r" *\n *", "\n", svg)
+    return re.sub(r"<[^>]*>", lambda tag: re.sub(r"[1-9]\d*\.\d{3,}", _in_hundredths, tag[0]), lines)
+
+
+def _in_hundredths(number: re.Match[str]) -> str:
+    return f"{float(number[0]):.2f}".rstrip("0").rstrip(".")
 
 
 def _canvas(panels: int, caption: str) -> tuple[Canvas, list[Axes]]:
@@ -86,6 +97,8 @@ def _caption(experiment: Experiment, data: Data) -> str:
             if _run_away(experiment.figure, data)
             else "; line: mean of the trials still running, shaded: standard deviation"
         )
+        if any(_overflowed(series) for series in data.series.values()):
+            text += "; below the axis returns overflow"
     text += "."
     broken = [f"{label}: {', '.join(s.failures())}" for label, s in data.series.items() if s.failures()]
     return text[0].upper() + text[1:] + (f" Not finished: {'; '.join(broken)}." if broken else "")
@@ -142,12 +155,19 @@ def _run_away(figure: Curves, data: Data) -> bool:
     return figure.scale == "symlog" and any(np.nanmin(series.columns["return_mean"]) < _FALLEN for series in curves)
 
 
+def _overflowed(series: Series) -> bool:
+    """Whether a mean return of a trial has one in it that overflowed."""
+    means = (series.columns[column] for column in ("return_mean", "mean_policy_return"))
+    return any(bool((values < _OVERFLOWED).any()) for values in means)
+
+
 def _scale(axis: Axes, panel: Panel, low: float, high: float, *, run_away: bool) -> None:
     if panel in _RETURNS and run_away:
         axis.set_yscale("symlog", linthresh=10)
         few = SymmetricalLogLocator(base=10, linthresh=10)
         few.set_params(numticks=6)
         axis.yaxis.set_major_locator(few)
+        axis.set_ylim(max(axis.get_ylim()[0], _OVERFLOWED), None)
     if panel in ("sigma", "sigma_2", "action"):
         axis.set_yscale("log")
     if panel == "success":

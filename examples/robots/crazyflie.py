@@ -19,7 +19,9 @@ GOAL = np.array([0.0, 0.0, 1.5])
 class Hover(farm.Task):
     """Start anywhere within 0.5 m of the goal, tilted and turning; be there and level as soon as possible."""
 
-    package, root, xml = "crazyflow", "drones", "cf2x_L250.xml"
+    package = "crazyflow"
+    root = "drones"
+    xml = "cf2x_L250.xml"
     steps, substeps = 200, 10  # 4 s at 50 Hz
     ending = "crashed"
     actions = farm.Offsets([WEIGHT / 4.0] * 4, 0.06)  # [N]
@@ -32,7 +34,10 @@ class Hover(farm.Task):
         """The package's drone, free to move, with a thrust at each propeller, over a floor."""
         text = super().mjcf().partition("<!-- Drone version optimized")[0] + "</worldbody>"
         floor = '<geom name="floor" type="plane" size="0 0 1" rgba="0.85 0.85 0.85 1"/>'
-        text = text.replace("<worldbody>", f"<worldbody>{floor}").replace('<site name="CoM" />', "<freejoint/>")
+        look = '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
+        sun = '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0" castshadow="false"/>'
+        text = text.replace("<worldbody>", f"{look}<worldbody>{sun}{floor}")
+        text = text.replace('<site name="CoM" />', "<freejoint/>")
         motors = "".join(
             f'<motor site="motor{i}" gear="0 0 1 0 0 {DRAG * (-1) ** i}" ctrlrange="0 0.15"/>' for i in range(4)
         )

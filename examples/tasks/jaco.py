@@ -11,7 +11,8 @@ from farm import Task
 class Jaco(Task):
     """Keep the wrist at the ball."""
 
-    package, root = "dm_control", "third_party"
+    package = "dm_control"
+    root = "third_party"
     xml = """<mujoco>
       <include file="kinova/jaco_arm.xml"/>
       <compiler meshdir="kinova/meshes_decimated"/>

@@ -95,7 +95,8 @@ class Painter:
           RunError: MuJoCo cannot draw on this machine.
         """
         scene = Scene(model, start, mocap)
-        self._view, self._marks = View(scene, camera, poses), Marks(scene, channels)
+        self._view = View(scene, camera, poses)
+        self._marks = Marks(scene, channels)
         self._painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
         self._model = lit(model, self._view.camera.distance, size)
         self._free = aimed(mujoco.MjvCamera(), self._view.camera)

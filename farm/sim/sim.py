@@ -146,7 +146,9 @@ class Sim:
         self.which = np.zeros(count, dtype=int) if which is None else which
         if several:
             self.engine.assign(self.which)  # type: ignore[attr-defined]  # it has several models
-        self._seeds, self._prepared, self._keys = seeds or [None] * count, self._ids, None
+        self._seeds = seeds or [None] * count
+        self._prepared = self._ids
+        self._keys = None
         self.own, self.t, self._now = {}, 0, {}
         self._live, self._stepped = True, False
         for name in self._expanded:  # before the reset: what it takes from the model is nominal too
@@ -174,7 +176,9 @@ class Sim:
         self._live = False
         if not shared:
             return
-        self._ids, self._rows, self._prepared = np.arange(len(sources)), slice(len(sources)), sources
+        self._ids = np.arange(len(sources))
+        self._rows = slice(len(sources))
+        self._prepared = sources
         self.engine.copy(sources)
         for values in self._expanded.values():
             values[: len(sources)] = values[sources]

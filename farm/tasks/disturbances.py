@@ -21,7 +21,8 @@ _ARROW: Final = 0.3  # length of the strongest push where it is drawn [m]
 _STREAM: Final = "farm.Robust "  # before the names of streams, so that they are no task's
 _LINEAR: Final = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _MUSCLE: Final = int(mujoco.mjtGain.mjGAIN_MUSCLE)
-_OF_LINEAR, _OF_MUSCLE = slice(0, 3), slice(2, 4)  # parameters that a force is proportional to; of a muscle, its peak
+_OF_LINEAR = slice(0, 3)  # parameters that a force is proportional to
+_OF_MUSCLE = slice(2, 4)  # its peak force
 
 
 def of(task: Task) -> Robust | None:
@@ -44,7 +45,8 @@ def check(task: Task) -> None:
         return
     if not isinstance(declared, Robust):
         raise ConfigError(f"task {name}: robust is {declared!r:.60}; expected a farm.Robust")
-    robust, duration = declared.scaled(task.config.robust), task.steps * task.period
+    robust = declared.scaled(task.config.robust)
+    duration = task.steps * task.period
     try:
         for cause in ("observation_delay", "action_delay"):
             if getattr(robust, cause)[1] >= duration:
@@ -68,7 +70,8 @@ def _check_model(robust: Robust, model: mujoco.MjModel) -> None:
         if not model.nu:
             raise ConfigError("robust: motors differ, but the model has no actuator")
         kinds = zip(model.actuator_gaintype.tolist(), model.actuator_biastype.tolist(), strict=True)
-        none, affine = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+        none = int(mujoco.mjtBias.mjBIAS_NONE)
+        affine = int(mujoco.mjtBias.mjBIAS_AFFINE)
         for actuator, (gain, bias) in enumerate(kinds):
             if gain != _MUSCLE and not (gain in _LINEAR and bias in (none, affine)):
                 raise ConfigError(
@@ -118,11 +121,14 @@ class Disturbances:
     """The conditions of a batch of B rollouts, of which n are still going: their rows are given with each call."""
 
     def __init__(self, robust: Robust, task: Task) -> None:
-        self._robust, self._task, self._causes = robust, task, robust.causes
+        self._robust = robust
+        self._task = task
+        self._causes = robust.causes
         self._sizes: dict[str, FloatArray] | None = None  # of errors, (d,) each
         self._bias = np.zeros((0, 0))  # (B, d)
         self._drawn: dict[str, FloatArray] = {}
-        self._seen, self._done = _Late(), _Late()
+        self._seen = _Late()
+        self._done = _Late()
         self._body: IntArray = np.zeros(0, dtype=int)
         self._force = np.zeros((0, 0, 3))  # (B, pushes, 3)
         self._begins: IntArray = np.zeros((0, 0), dtype=int)
@@ -148,7 +154,8 @@ class Disturbances:
 
     def start(self, sim: Sim) -> None:
         """Remember what each rollout has drawn, after all are prepared."""
-        robust, period = self._robust, self._task.period
+        robust = self._robust
+        period = self._task.period
         for cause in _drawn(robust):
             values = self._uniform(sim, cause, (sim.model.nu,) if cause == "motors" else ())
             self._drawn[cause] = values.mean(axis=1) if cause == "motors" else values
@@ -232,7 +239,8 @@ class Disturbances:
 
     def _draw_pushes(self, sim: Sim) -> None:
         """Force, direction and first control step of each push."""
-        robust, steps = self._robust, self._task.steps
+        robust = self._robust
+        steps = self._task.steps
         count = (robust.pushes,)
         size = self._uniform(sim, "push", count)
         angle = np.pi * sim.noise(count, _STREAM + "direction", "uniform", 0)
@@ -273,5 +281,6 @@ class _Late:
         length = len(self._past)
         self._past[t % length, rows] = values
         back = t - self._whole[rows]
-        newer, older = self._past[back % length, rows], self._past[(back - 1) % length, rows]
+        newer = self._past[back % length, rows]
+        older = self._past[(back - 1) % length, rows]
         return newer + self._part[rows] * (older - newer)

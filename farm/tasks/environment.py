@@ -37,7 +37,8 @@ class _Interface:
                 f"task {type(task).__name__} scores whole rollouts (score), so a control step has "
                 "no reward of its own: an environment needs reward(self, sim, action)"
             )
-        self.task, self.spec = task, specification(task)
+        self.task = task
+        self.spec = specification(task)
         self.success = self.spec.success or type(task).success is not Task.success
         self.observations = Box(-np.inf, np.inf, (self.spec.observation,), np.float64)
         bounds = [(each.low, each.high) for each in actions.described(task, self.spec.action)]
@@ -76,7 +77,8 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(f"render_mode is {render_mode!r:.40}; expected 'rgb_array' or None")
         self._is = _Interface(task, 1)
-        self.observation_space, self.action_space = self._is.observations, self._is.actions
+        self.observation_space = self._is.observations
+        self.action_space = self._is.actions
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._is.spec.period))}
         self._going = False
@@ -110,7 +112,8 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
         self._is.episodes.step(self._is.taken(action, 1))
-        terminated, truncated = bool(last.terminated[0]), bool(last.truncated[0])
+        terminated = bool(last.terminated[0])
+        truncated = bool(last.truncated[0])
         self._going = not (terminated or truncated)
         reward_terms = dict(zip(self._is.spec.terms, last.terms[0].tolist(), strict=True))
         info: Infos = {"reward_terms": reward_terms, "failed": bool(last.failed[0])}
@@ -202,7 +205,8 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         """One control step of all; those that were over begin anew. A TaskError before `reset`."""
         if self._over is None:
             raise TaskError("no episode is on its way: call reset()")
-        last, anew = self._is.episodes.last, np.flatnonzero(self._over)
+        last = self._is.episodes.last
+        anew = np.flatnonzero(self._over)
         self._is.episodes.step(self._is.taken(actions, self.num_envs))
         if len(anew):
             starts = [self._is.start(None, self._rngs[i]) for i in anew.tolist()]
@@ -214,7 +218,8 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         said: Infos = {"reward_terms": _of(terms, stepped), "failed": last.failed.copy()}
         if self._is.success:
             said["is_success"] = last.success.copy()
-        infos, rewards = _of(said, stepped), last.terms.sum(axis=-1)
+        infos = _of(said, stepped)
+        rewards = last.terms.sum(axis=-1)
         ends = last.terminated.copy(), last.truncated.copy()
         return last.observation.copy(), rewards, *ends, infos
 

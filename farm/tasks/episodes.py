@@ -28,7 +28,9 @@ class Episodes:
     def __init__(self, task: Task, count: int, observation: int, terms: int) -> None:
         """Make room for `count` rows, with sizes of an observation and of the reward's terms."""
         quiet()
-        self._task, self._groups, self._idle = task, list[_Group](), list[Sim]()
+        self._task = task
+        self._groups = list[_Group]()
+        self._idle = list[Sim]()
         self._of: list[_Group | None] = [None] * count
         self._ready = False
         flags = (np.zeros(count, dtype=bool) for _ in range(4))
@@ -145,11 +147,13 @@ class _Watched(Batch):
 
     def tell(self, last: Last, rows: IntArray, at: IntArray) -> None:
         """Say in `rows` what the last step gave those at `at`, (n,) each."""
-        over, t = self.sim.t >= self.task.steps, self.sim.t - 1
+        over = self.sim.t >= self.task.steps
+        t = self.sim.t - 1
         done = np.ones(len(self.which), dtype=bool)
         done[self.active] = over
         assert self.seen is not None
-        last.observation[rows], last.failed[rows] = self.seen[at], self._failed[at]
+        last.observation[rows] = self.seen[at]
+        last.failed[rows] = self._failed[at]
         last.terms[rows] = 0.0 if self.terms is None or t < 0 else self.terms[at, t]
         last.terminated[rows] = (self._ended | self._failed)[at]
         last.truncated[rows] = done[at] & ~last.terminated[rows]
@@ -167,7 +171,9 @@ class _Group:
     """Rows that began together."""
 
     def __init__(self, task: Task, sim: Sim, rows: IntArray, seeds: Sequence[Seed]) -> None:
-        self._task, self.sim, self._seeds = task, sim, seeds
+        self._task = task
+        self.sim = sim
+        self._seeds = seeds
         self.rows = rows
         """Which of the rows these are, (n,)"""
         self._done: list[FloatArray] = []  # actions so far

@@ -112,7 +112,8 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
 
 def choice(found: Sequence[Tried]) -> float:
     """The sigma that is taken of those that `tried` gives: the last one, unless it is larger and gains nothing."""
-    first, last = found[1], found[-1]
+    first = found[1]
+    last = found[-1]
     return first.sigma if last.sigma > first.sigma and not last.gains(first) else last.sigma
 
 

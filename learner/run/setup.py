@@ -312,10 +312,12 @@ def _check_sizes(config: RunConfig, origin: Origin, files: Files | None) -> None
     Raises:
       ConfigError: it cannot; names both sizes.
     """
-    plugin, there = plugins.find("tasks", config.task), origin.problem
+    plugin = plugins.find("tasks", config.task)
+    there = origin.problem
     here = specification(build_task(plugin, settings.to_dict(config.task_config), files))
     for what in ("observation", "action"):
-        new, old = getattr(here, what), getattr(there.spec, what)
+        new = getattr(here, what)
+        old = getattr(there.spec, what)
         if new != old:
             raise ConfigError(
                 f"--init-from {config.init_from}: in its task {there.task_name} an {what} has "
@@ -331,7 +333,8 @@ def handed_over(config: RunConfig) -> str:
     origin = origin_of(config)
     if origin is None or not origin.other_task:
         return ""
-    old, new = origin.problem, beginning(config)[0]
+    old = origin.problem
+    new = beginning(config)[0]
     names = [each.task_name for each in (old, new)]
     if names[0] == names[1]:
         names = [origin.config.task, config.task]

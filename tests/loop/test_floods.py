@@ -80,7 +80,8 @@ def test_a_machine_that_floods_is_cut_off(
 def test_a_viewer_that_floods_is_cut_off_and_the_run_goes_on(
     certs: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
 ) -> None:
-    task, place = pole(tmp_path / "mine"), placed(certs)
+    task = pole(tmp_path / "mine")
+    place = placed(certs)
     config = farm.configure(f"{task}:Pole", generations=10_000, pairs=15)
     with ExitStack() as stack:
         run = stack.enter_context(open_run(config, tmp_path / "run", place))

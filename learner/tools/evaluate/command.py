@@ -85,7 +85,8 @@ def tables(figures: Mapping[str, Any], width: int) -> Iterator[Table]:
     while columns:
         table = compact()
         table.add_column(max_width=_LABEL, overflow="fold")
-        room, shown = width - left - _GAP, list[list[str]]()
+        room = width - left - _GAP
+        shown = list[list[str]]()
         while columns:
             name, cells = columns[0]
             number = max(map(len, cells.values()))

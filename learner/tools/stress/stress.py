@@ -72,7 +72,8 @@ def stressed(policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], c
     Raises:
       ConfigError: there are no conditions, or at some strength they do not fit the task.
     """
-    task, jobs = policy.problem.task, Jobs.mean("none", starts(count, seed))
+    task = policy.problem.task
+    jobs = Jobs.mean("none", starts(count, seed))
     declared = task.robust is not None
     if not robust.causes:
         raise ConfigError("there are no conditions: the ranges of farm.Robust are all empty")
@@ -157,7 +158,8 @@ def sensible(policy: LoadedPolicy, seed: int, body: str = "") -> Robust:
 
 def _spread(policy: LoadedPolicy, seed: int) -> FloatArray:
     """Standard deviations of what the policy observes in rollouts without any of the conditions, (d,)."""
-    runner, count = policy.runner, 16
+    runner = policy.runner
+    count = 16
     theta = np.repeat(policy.mu[None], count, axis=0)
     rollouts, _ = loop.run(
         runner.task, runner.policy, runner.sim, theta, starts(count, seed), runner.spec, Kept(moments=True)

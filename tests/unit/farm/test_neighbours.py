@@ -106,7 +106,8 @@ def test_a_changed_neighbour_changes_the_digest_and_the_numbers(tmp_path: Path) 
 
 
 def test_another_machine_needs_the_same_neighbours(tmp_path: Path) -> None:
-    path, copy = three(tmp_path), three(tmp_path / "copy")
+    path = three(tmp_path)
+    copy = three(tmp_path / "copy")
     plugin = plugins.find("tasks", f"{path}:Pole")
     spec = spec_of(path, task_config={})
     assert served(spec, (copy,))[0].config.pace == 2.0

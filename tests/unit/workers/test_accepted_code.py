@@ -227,7 +227,8 @@ def test_neighbours_come_with_it(safe: Stage, certs: Path, tmp_path: Path) -> No
     (tmp_path / "parts.py").write_text("SIZE = 3.0\n")
     text = f"__neighbours__ = ('gaits', 'parts')\nimport gaits\n{POLE}"
     file = pole(tmp_path, text.replace("return np", "return gaits.level(sim.t) * np"))
-    author, worker = Author(safe, file), hire(safe, certs)
+    author = Author(safe, file)
+    worker = hire(safe, certs)
     author.send(worker.id, 3)
     results = safe.results()
     assert {path.name for path in kept(file)} == {"pole.py", "gaits.py", "parts.py"}

@@ -42,11 +42,13 @@ def test_noise_does_not_depend_on_the_batch_and_pairs_share_it():
 
 
 def test_a_task_that_draws_no_noise_has_the_numbers_it_had():
-    runner, quiet = new_runner(), new_runner(Noisy)
+    runner = new_runner()
+    quiet = new_runner(Noisy)
     quiet.task.observe = runner.task.observe  # type: ignore[method-assign]
     quiet.task.act = runner.task.act  # type: ignore[method-assign]
     theta = thetas(runner, 7, 4.0)
-    one, other = runner.rollouts(theta, SEEDS), quiet.rollouts(theta, SEEDS)
+    one = runner.rollouts(theta, SEEDS)
+    other = quiet.rollouts(theta, SEEDS)
     assert one.frames["qpos"].tobytes() == other.frames["qpos"].tobytes()
 
 

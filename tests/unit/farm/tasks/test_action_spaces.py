@@ -168,7 +168,8 @@ def test_damped_least_squares_is_that_of_linear_algebra():
     from farm.tasks.actions.moves import _least_squares
 
     rng = np.random.default_rng(0)
-    jacobian, error = rng.normal(size=(5, 3, 7)), rng.normal(size=(5, 3))
+    jacobian = rng.normal(size=(5, 3, 7))
+    error = rng.normal(size=(5, 3))
     for j, e, found in zip(jacobian, error, _least_squares(jacobian, error, 0.1), strict=True):
         expected = j.T @ np.linalg.solve(j @ j.T + 0.01 * np.eye(3), e)
         assert np.allclose(found, expected, rtol=1e-10)
@@ -298,9 +299,11 @@ def test_an_environment_shows_and_takes_what_the_space_does():
 
 def test_sensors_have_errors_and_the_spaces_own_phase_has_none():
     task = legs(RHYTHM, robust=farm.Robust(noise=0.1, observation_delay=(0.02, 0.02)))
-    noisy, exact = batch(task, [(7,)]), batch(legs(RHYTHM), [(7,)])
+    noisy = batch(task, [(7,)])
+    exact = batch(legs(RHYTHM), [(7,)])
     for k in range(4):
-        x, expected = noisy.observe()[0], exact.observe()[0]
+        x = noisy.observe()[0]
+        expected = exact.observe()[0]
         assert (x[:8] != expected[:8]).any()
         assert np.array_equal(x[8:], expected[8:])
         for running in (noisy, exact):

@@ -62,7 +62,10 @@ class Broken(Pole):
 def episode(env, policy, theta, seed):
     """Rewards, terms and what the last step said."""
     x, _ = env.reset(seed=seed)
-    acting, rewards, terms, observations = Acting(policy, theta[None]), [], [], [x]
+    acting = Acting(policy, theta[None])
+    rewards = []
+    terms = []
+    observations = [x]
     while True:
         x, reward, terminated, truncated, info = env.step(acting.act(x[None])[0])
         rewards.append(reward)
@@ -101,8 +104,10 @@ def test_the_last_observation_is_that_of_the_state_that_ended_it():
         def observe(self, sim):
             return np.array(sim.qpos)
 
-    env, runner = farm.environment(Seen), new_runner(Seen)
-    policy, parameters = runner.policy, thetas(runner, 20, scale=0.3)
+    env = farm.environment(Seen)
+    runner = new_runner(Seen)
+    policy = runner.policy
+    parameters = thetas(runner, 20, scale=0.3)
     ended = 0
     for i, theta in enumerate(parameters):
         *_, observations, terminated, _ = episode(env, policy, theta, i)
@@ -135,7 +140,8 @@ def test_a_start_that_cannot_be_observed_is_an_error():
 @pytest.mark.parametrize("kind", [Pole, Late, Broken])
 def test_a_vector_gives_the_numbers_of_each_alone(kind):
     """Also of those that end early and begin anew while others go on."""
-    count, steps = 5, 60
+    count = 5
+    steps = 60
     vector = farm.environment(kind, num_envs=count)
     singles = [farm.environment(kind) for _ in range(count)]
     assert vector.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
@@ -143,7 +149,8 @@ def test_a_vector_gives_the_numbers_of_each_alone(kind):
     for i, env in enumerate(singles):
         assert env.reset(seed=3 + i)[0].tobytes() == starts[i].tobytes()
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (steps, count, 1))
-    over, restarts = np.zeros(count, dtype=bool), 0
+    over = np.zeros(count, dtype=bool)
+    restarts = 0
     for action in actions:
         x, reward, terminated, truncated, info = vector.step(action)
         for i, env in enumerate(singles):

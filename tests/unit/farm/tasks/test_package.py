@@ -18,7 +18,9 @@ PARTS = """<mujoco><worldbody><body><joint name="a"/><geom size="0.1"/></body></
 class Packaged(Task):
     """Its robot is elsewhere, and gets a floor here."""
 
-    package, root, xml = "robots_of_a_test", "models", "robot.xml"
+    package = "robots_of_a_test"
+    root = "models"
+    xml = "robot.xml"
 
     def mjcf(self) -> str:
         """With a floor."""

@@ -77,7 +77,8 @@ class Free(farm.Task):
 
     def reset(self, sim, row, rng):
         """It has an angle of its own."""
-        sim.qpos[row, 0], sim.qvel[row, 0] = 0.2, -0.3
+        sim.qpos[row, 0] = 0.2
+        sim.qvel[row, 0] = -0.3
 
     def act(self, sim, action):
         """The actuators' controls, as they are."""
@@ -146,7 +147,8 @@ def first_force(kind, conditions, controls):
 def test_masses_payload_and_friction():
     conditions = farm.Robust(mass=(0.5, 2.0), payload=(1.0, 3.0), friction=(0.4, 0.6), body="block")
     batch = batch_of(Free, conditions)
-    drawn, sim = batch.start["robust/conditions"], batch.sim
+    drawn = batch.start["robust/conditions"]
+    sim = batch.sim
     assert [channel.labels for channel in specification(task_with(conditions)).channels] == [
         ("mass", "payload", "friction")
     ]
@@ -234,7 +236,8 @@ def test_what_is_recorded_and_normalised_is_what_the_policy_saw():
     spec = specification(task)
     config = LinearConfig()
     policy = Linear(config, spec, Linear.draw(config, spec, np.random.default_rng(0)))
-    sim, seeds = Sim(task.engine(BatchEngine)), [None, (1, 2, 3, 4)]
+    sim = Sim(task.engine(BatchEngine))
+    seeds = [None, (1, 2, 3, 4)]
     theta = np.zeros((2, policy.size))
     rollouts, trouble = loop.run(task, policy, sim, theta, seeds, spec, Kept(moments=True, observations=True))
     assert not trouble.errors
@@ -366,7 +369,8 @@ class Several(Pole):
 
 def test_conditions_of_several_models_do_not_depend_on_the_batch():
     runner = new_runner(Several)
-    theta, seeds = thetas(runner, 7, 4.0), [None, *((i, 2, 3, 4) for i in range(6))]
+    theta = thetas(runner, 7, 4.0)
+    seeds = [None, *((i, 2, 3, 4) for i in range(6))]
     together = runner.rollouts(theta, seeds)
     assert set(together.which.tolist()) == {0, 1}
     for row in range(7):
