@@ -14,7 +14,7 @@ from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, TaskError
 from farm.settings import Settings, setting
 from farm.sim.channels import Camera, Channel, Measure, Quantity
-from farm.tasks.actions.space import ActionSpace
+from farm.tasks.actions.space import ActionSpace, rescaled
 
 if TYPE_CHECKING:
     import mujoco
@@ -452,10 +452,3 @@ class Task:
     def spec(self) -> TaskSpec | None:
         """The task's specification; None: it is found by one control step (`farm.tasks.probe`)."""
         return None
-
-
-def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Scale raw actions (B, A) to the limits: -1 is the lowest, 1 the highest; clipped beyond, nan is the middle."""
-    part = np.minimum(np.maximum(action, -1.0), 1.0)
-    part[np.isnan(part)] = 0.0
-    return low + (high - low) * (0.5 * (part + 1.0))

@@ -15,7 +15,7 @@ from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import ConfigError, TaskError
 from farm.seeds import SEEDS, trial
 from farm.sim.rendering import Painter
-from farm.tasks.actions import described as actions
+from farm.tasks.actions import numbers
 from farm.tasks.base import Task
 from farm.tasks.episodes import Episodes
 from farm.tasks.loop import scores
@@ -41,7 +41,7 @@ class _Interface:
         self.spec = specification(task)
         self.success = self.spec.success or type(task).success is not Task.success
         self.observations = Box(-np.inf, np.inf, (self.spec.observation,), np.float64)
-        bounds = [(each.low, each.high) for each in actions.described(task, self.spec.action)]
+        bounds = [(each.low, each.high) for each in numbers.described(task, self.spec.action)]
         known = [each if np.isfinite(each).all() else (-1.0, 1.0) for each in bounds]
         self.actions = Box(*np.array(known).T, dtype=np.float64)
         self.episodes = Episodes(task, count, self.spec.observation, len(self.spec.terms))

@@ -21,7 +21,8 @@ from farm.errors import ConfigError
 from farm.sim.channels import Quantity
 from farm.sim.interfaces import Engine, MakeEngine
 from farm.sim.sim import Sim
-from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec, rescaled
+from farm.tasks.actions.space import rescaled
+from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec
 from farm.tasks.gymnasium_batched import Batched, batched
 from farm.tasks.gymnasium_engine import NOMINAL, EnvironmentEngine, leaves, make, simulated
 

@@ -115,14 +115,6 @@ def _explained(call: Callable[P, T]) -> Callable[P, T]:
     return method
 
 
-def seen(task: Task, sim: Sim) -> FloatArray:
-    """What the policy sees, (B, d): the task's observation, and what its action space adds."""
-    x = task.observe(sim)
-    if task.space and np.ndim(x) == 2:
-        return task.space.see(sim, x)
-    return x
-
-
 class Batch:
     """Rollouts of one task that are stepped together, independent of how actions are chosen."""
 

@@ -16,7 +16,7 @@ from farm.sim.engines import BatchEngine
 from farm.sim.scene import MODEL, quiet
 from farm.sim.sim import Sim
 from farm.tasks import disturbances
-from farm.tasks.actions import described as actions
+from farm.tasks.actions import numbers
 from farm.tasks.actions.space import ActionSpace
 from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
@@ -64,10 +64,10 @@ def _check_quantities(task: Task, what: str) -> None:
         raise ConfigError(
             f"task {type(task).__name__}: {what} is a class; expected an object: {quantities.__name__}(...)"
         )
-    if what == "actions" and (task.space or actions.is_size(quantities)):
+    if what == "actions" and (task.space or numbers.is_size(quantities)):
         return
     if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
-        number = f"a farm.ActionSpace, a number from 1 to {actions.LIMIT} or " if what == "actions" else ""
+        number = f"a farm.ActionSpace, a number from 1 to {numbers.LIMIT} or " if what == "actions" else ""
         raise ConfigError(
             f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of farm.Quantity"
         )
@@ -146,7 +146,7 @@ def _check_class(task: Task) -> None:
     for geom in (geom for channel in task.channels for geom in channel.geoms):
         if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
             raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
-    actions.check(task)
+    numbers.check(task)
     for method in _METHODS:
         signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
         try:

@@ -15,7 +15,7 @@ from farm.sim.channels import Camera
 from farm.sim.framing import View
 from farm.sim.scene import MODEL, Scene
 from farm.sim.trajectory import Trajectory
-from farm.tasks.actions.described import described
+from farm.tasks.actions.numbers import described
 from farm.tasks.base import TaskSpec
 from farm.tasks.standard import start
 from learner.recording.blueprint import Eye

@@ -48,7 +48,7 @@ _SIGMAS: Final = 6  # that are tried at most
 _COST: Final = 6.0  # signals that exploring may cost
 _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond those of the mean
 _LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
-_CLEARLY: Final = 1.1
+_CLEARLY: Final = 1.1  # times the signal before
 _MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts
 _NORMALISING: Final = 2  # rounds in which the normaliser settles to what exploring at a sigma observes
 

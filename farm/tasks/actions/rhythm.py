@@ -179,6 +179,6 @@ class Rhythm(ActionSpace):
 
 
 def _between(ends: tuple[float, float], part: FloatArray) -> FloatArray:
-    """From the first end at -1 to the second at 1."""
+    """From the first end at -1 to the second at 1, (B,) of numbers within them (B,)."""
     low, high = ends
     return low + (high - low) * (0.5 * (part + 1.0))

@@ -101,8 +101,7 @@ class Actuators(ActionSpace):
 
     def controls(self, sim: "Sim", action: FloatArray) -> FloatArray:  # noqa: ARG002
         """Controls (B, nu) of actions (B, nu)."""
-        low, high = self.limits
-        return low + (high - low) * (0.5 * (clipped(action) + 1.0))
+        return rescaled(action, *self.limits)
 
 
 class Around(ActionSpace):
@@ -132,6 +131,11 @@ def clipped(action: FloatArray) -> FloatArray:
     part = np.minimum(np.maximum(action, -1.0), 1.0)
     part[np.isnan(part)] = 0.0
     return part
+
+
+def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Raw actions (B, A) scaled to limits (A,): -1 is the lowest, 1 the highest; clipped beyond, nan is the middle."""
+    return low + (high - low) * (0.5 * (clipped(action) + 1.0))
 
 
 def unit(names: Sequence[str]) -> tuple[Quantity, ...]:

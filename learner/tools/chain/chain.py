@@ -17,7 +17,7 @@ from farm.errors import ConfigError
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.base import Task
-from farm.tasks.loop import Acting, Batch, again, seen
+from farm.tasks.loop import Acting, Batch, again
 from farm.tasks.rollouts import Rollouts, Seed
 from learner.tools.replay.loaded import LoadedPolicy
 
@@ -59,7 +59,9 @@ class _Link:
     ) -> tuple[FloatArray, Mapping[str, AnyArray]]:
         """Controls (n, nu) and written states (n, ...) of the rollouts `going` (n,); right for those whose turn is this
         policy's, `turn` (n,)."""  # noqa: D205, D209
-        x = seen(self.task, sim)
+        x = self.task.observe(sim)
+        if self.task.space:
+            x = self.task.space.see(sim, x)
         action = np.zeros((len(sim), self.policy.problem.spec.action))
         if turn.any():
             action[turn] = acting.act(x[turn], going[turn])

@@ -10,7 +10,7 @@ from farm import archives
 from farm.errors import ConfigError, brief
 from farm.sim import quantities
 from farm.sim.channels import Quantity
-from farm.tasks.actions.described import described
+from farm.tasks.actions.numbers import described
 from farm.tasks.base import Task
 from learner.tools.replay.loaded import LoadedPolicy
 

@@ -12,7 +12,7 @@ from farm.errors import ConfigError
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks import loop
-from farm.tasks.actions.described import described
+from farm.tasks.actions.numbers import described
 from farm.tasks.base import Task
 from farm.tasks.loop import Batch
 from farm.tasks.probe import specification

@@ -11,7 +11,7 @@ from farm.sim.channels import Quantity
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks import loop
-from farm.tasks.actions import described as actions
+from farm.tasks.actions import numbers
 from farm.tasks.base import Task
 from farm.tasks.probe import specification
 
@@ -132,7 +132,7 @@ def test_what_is_no_size(value: object) -> None:
     ],
 )
 def test_the_names_of_its_numbers(task: Task, names: list[str]) -> None:
-    described = actions.described(task, task.action_size)
+    described = numbers.described(task, task.action_size)
     assert [each.name for each in described] == names
     bounded = type(task).act is Task.act
     assert np.isfinite([described[0].low, described[0].high]).all() == bounded
