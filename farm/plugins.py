@@ -6,6 +6,7 @@ pendulum.py:Pendulum   a class in a file, named by its path
 """
 
 import ast
+import difflib
 import hashlib
 import importlib
 import importlib.util
@@ -193,9 +194,14 @@ def _from_package(kind: str, name: str, variant: str) -> Plugin:
                     f"{_one(kind)} {name!r} of {_release(point)} cannot be imported: {described(error)}"
                 ) from error
             return Plugin(kind, f"{name}:{variant}" if variant else name, target, variant, _release(point))
-    listing = ", ".join(names(kind))
-    files = "" if kind == "commands" else f", or FILE.py:CLASS{_beside(name)}"
-    raise ConfigError(f"unknown {_one(kind)} {name[:80]!r}; known are {listing}{files}")
+    known = names(kind)
+    files = "" if kind == "commands" else ", or FILE.py:CLASS"
+    near = difflib.get_close_matches(name[:80], known, 1)
+    if near:
+        files += f"; did you mean {near[0]}?"
+    elif files:
+        files += _beside(name)
+    raise ConfigError(f"unknown {_one(kind)} {name[:80]!r}; known are {', '.join(known)}{files}")
 
 
 def _beside(name: str) -> str:

@@ -67,7 +67,7 @@ class PlainDisplay(Display):
         """Write the line."""
         p, success = report.progress, ""
         if p.success_rate is not None:
-            success = f" {'success' if p.mean_policy_success else '-':7}  success {p.success_rate:4.0%}"
+            success = f" {'succeeds' if p.mean_policy_success else '-':8}  success {p.success_rate:4.0%}"
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
             f"  return {figure(p.return_mean):>8}{_failed(p)}  mean policy {_mean_policy(p):>8}"

@@ -107,7 +107,9 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
             raise Interrupted("the pilot was stopped; nothing has begun")
         log.info("  %s", each.line)
         found.append(each)
-    return replace(config, pilot_sigma=choice(found))
+    sigma = choice(found)
+    log.info("  the run begins with sigma %.3g", sigma)
+    return replace(config, pilot_sigma=sigma)
 
 
 def choice(found: Sequence[Tried]) -> float:

@@ -112,7 +112,8 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
     low, high = problem.task.limits
     bounds = f" from {low} to {high}" if len(low) else ""
     yield f"observation {spec.observation}, actions {spec.action}, controls {len(low)}{bounds}"
-    yield f"{spec.steps} control steps of {spec.period:g} s; reward of {', '.join(spec.terms)}"
+    terms = "" if spec.terms == ("reward",) else f"; reward of {', '.join(spec.terms)}"
+    yield f"{spec.steps} control steps of {spec.period:g} s{terms}"
     channels = ", ".join(channel.name for channel in spec.channels)
     yield f"success: {'yes' if spec.success else 'none'}; channels: {channels or 'none'}"
     yield f"policy {config.policy} with {problem.policy.size} parameters"

@@ -63,6 +63,8 @@ def test_every_built_in_one_is_there(kind: str, name: str) -> None:
         ("policies", "pid", r"unknown policy 'pid'; known are direct, .*, or FILE\.py:CLASS"),
         ("backends", "gpu", r"unknown backend 'gpu'; known are cpu, warp, or FILE"),
         ("commands", "fly", r"unknown command 'fly'; known are run, .*certificates$"),
+        ("commands", "rnu", "unknown command 'rnu'; .*; did you mean run\\?$"),
+        ("tasks", "finger-giat", "unknown task 'finger-giat'; .*CLASS; did you mean finger-gait\\?$"),
         ("tasks", "gym", "task 'gym': expected gym:NAME"),
         ("tasks", "gym:", "task 'gym:': expected gym:NAME"),
         ("tasks", "finger-gait:bar", "task 'finger-gait:bar': expected finger-gait$"),
