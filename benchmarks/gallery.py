@@ -48,6 +48,8 @@ class Piece:
     """Of `farm run`, beside the task."""
     needs: str = ""
     """What else is to be installed."""
+    title: str = ""
+    """Of its section; empty: the module's name."""
     folder: str = "tasks"
     """Of examples/."""
     start: int | None = None
@@ -73,7 +75,7 @@ PIECES: Final = (
     Piece(
         "crazyflie.py:Hover", "A Crazyflie recovers from a tumble, and hovers.", needs=_ROBOT, folder="robots", start=3
     ),
-    Piece("ur5e.py:Push", "A UR5e pushes a puck to its goal.", needs=_ROBOT, folder="robots"),
+    Piece("ur5e.py:Push", "A UR5e pushes a puck to its goal.", needs=_ROBOT, title="UR5e", folder="robots"),
     Piece("pendulum.py:Pendulum", "A motor that is too weak to lift a pendulum swings it up.", "--generations 150"),
     Piece("cart.py:Cart", "A cart balances a pole of random mass."),
     Piece("arm.py:Arm", "An arm follows a ball; the circle and its speed are random.", "--generations 300"),
@@ -160,7 +162,7 @@ def page(rows: dict[str, Any]) -> str:
         if (row := rows.get(piece.task)) is None:
             continue
         scores = ", ".join(f"{name} {_short(row[name])}" for name in ("learnt", "constant", "still"))
-        title = piece.name.replace("_", " ").capitalize()
+        title = piece.title or piece.name.replace("_", " ").capitalize()
         lines += ["", f"## {title}", "", f"![{piece.what}](pictures/gallery/{piece.name}.gif)", ""]
         cost = f"after {row['rollouts']} rollouts, {row['seconds']} s. {piece.needs}".rstrip()
         lines += [f"{piece.what} **{scores}** {cost}", ""]
